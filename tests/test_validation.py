@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from types import UnionType
@@ -215,19 +214,6 @@ def test_studies_take_quantities(quantity: str, value: Any, plain: float, key: C
     for wrong in (3 * u.kg, np.nan, "x"):
         with refused("value" if wrong is np.nan else quantity):
             mauvecl.Study().paper().at(quantity, wrong)
-
-
-def test_quantities_give_the_same_results() -> None:
-    star, mauve = mauvecl.Source.from_library("G2V").at_magnitude(7.4 * u.mag), mauvecl.Instrument.load("mauvesim")
-    assert star == mauvecl.Source.from_library("G2V").at_magnitude(7.4)
-    assert star.flaring(24 * u.percent, 10 * u.kK) == star.flaring(0.24, 10_000)
-    assert mauvecl.expect(star, mauve, exposure=1 * u.min) == mauvecl.expect(star, mauve, exposure=60)
-    assert mauve.throughput(0.3 * u.um) == pytest.approx(float(mauve.throughput(300.0)))
-    assert mauve.with_(temperature_c=13 * u.deg_C) == mauve.with_(temperature_c=13.0)
-    assert pickle.loads(pickle.dumps(mauve)) == mauve
-    assert mauvecl.Uniform(283.15 * u.K, 300 * u.K).low == pytest.approx(10.0)
-    energy = mauvecl.EnergyScale.of_star(star, 32.6156 * u.lyr).erg_per_s
-    assert energy == pytest.approx(mauvecl.EnergyScale.of_star(star, 10.0).erg_per_s, rel=1e-4)
 
 
 def error_of(call: Callable[[], Any]) -> InputError | None:

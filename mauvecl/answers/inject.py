@@ -137,27 +137,6 @@ DIFFERS = 4.0
 LEAST_CHANCE = 1e-5
 
 
-def limit_columns(of: str, *, known: bool) -> tuple[Column, ...]:
-    """Return the columns of limits of a kind of size, for intervals by name; the ideal one unless all is known."""
-    unit, columns = SIZE_UNITS[of], list[Column]()
-    size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
-    for name, power in POWERS.items():
-        limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
-        detail = power != 0.5
-        own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=detail)
-        columns += [column.of(itemgetter(name)) for column in (limit, *own)]
-    text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
-    ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
-    return (
-        Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
-               number(".4g", "all")),
-        *columns,
-        Column("never", "", "", "share of flares for which no template fits into what is observed", "no template fits",
-               percent(".3g"), detail=True),
-        *(() if known else (ideal,)),
-    )  # fmt: skip
-
-
 SEARCH_COLUMNS = (
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
     *interval_columns("threshold_{}", "threshold.{}", heading=INTERVAL, format=interval(".3f")),
@@ -203,8 +182,23 @@ class StarCompleteness(InCell):
 
     @property
     def limit_columns(self) -> tuple[Column, ...]:
-        """Columns of `limits`."""
-        return limit_columns(self.sizes.of, known=bool(np.isnan(self.ideal_share)))
+        """Columns of `limits`; the ideal one unless everything but the noise is known."""
+        of, unit, columns = self.sizes.of, SIZE_UNITS[self.sizes.of], list[Column]()
+        size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
+        for name, power in POWERS.items():
+            limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
+            own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=power != 0.5)
+            columns += [column.of(itemgetter(name)) for column in (limit, *own)]
+        text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
+        ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
+        return (
+            Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike",
+                   "half-width (s)", number(".4g", "all")),
+            *columns,
+            Column("never", "", "", "share of flares for which no template fits into what is observed",
+                   "no template fits", percent(".3g"), detail=True),
+            *(() if np.isnan(self.ideal_share) else (ideal,)),
+        )  # fmt: skip
 
     @property
     def limits(self) -> QTable:

@@ -239,9 +239,10 @@ MOST_FLARES = 4
 MANY_FITS = 1000
 
 
-def _few(answer: MeasureAnswer, kind: type = object) -> tuple[Any, ...]:
-    """Return the first flares, those whose fitted model is of a kind."""
-    return (First([flare for flare in answer.flares if isinstance(flare.fitted, kind)], MOST_FLARES, "flares"),)
+def _few(answer: MeasureAnswer, *, single: bool = False) -> tuple[Any, ...]:
+    """Return the first flares, of all models or of those with a single temperature."""
+    flares = [flare for flare in answer.flares if not single or flare.model != "two-temperatures"]
+    return (First(flares, MOST_FLARES, "flares"),)
 
 
 @picture_of("MeasureAnswer", "fit", given=_few)
@@ -278,13 +279,11 @@ def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Pane
     return Picture([row], (3.4 * len(flares), 3.6), notes=(note_of(flares),), below=True)
 
 
-def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
-    from mauvecl.fits.flare_model import FlareModel
-
-    return _few(answer, FlareModel)
+#: The first flares whose model has a single temperature.
+SINGLE = partial(_few, single=True)
 
 
-@picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
+@picture_of("MeasureAnswer", "contours", given=SINGLE, when=lambda answer: bool(SINGLE(answer)[0]))
 def contours(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
 
