@@ -298,8 +298,11 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
             f"a joint fit needs a stare with a single flare, but it has {len(events)}", key="measure.joint_fit"
         )
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
-    single = [(name, one) for name, one in models_of(case.one_frame).items() if isinstance(one, FlareModel)]
-    name, model = single[-1] if single else ("blackbody", model_of(case.one_frame))
+    models = models_of(case.one_frame)
+    single = {name: one for name, one in models.items() if isinstance(one, FlareModel)}
+    # Where only two temperatures are fitted, the model of one of them, with its lines.
+    single = single or {"blackbody": one.single for one in models.values() if isinstance(one, TwoTemperatures)}
+    name, model = [*single.items()][-1]
     unknown = case.unknowns_of_fits(quiet, stare)
     processes = study.processes.additive_only
 
