@@ -87,6 +87,7 @@ class TableOf:
     when: str | Callable[[Any], object] = lambda answer: True
     # Metadata: paths of attributes of the answer, whose last names are the keys, or a function of the answer.
     about: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
+    cached: bool = True  # whether the answer keeps the table, which may be large
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -101,8 +102,9 @@ class TableOf:
         if answer is None:
             return self
         table: QTable = self._made(answer)
-        # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
-        vars(answer)[self.name] = table
+        if self.cached:
+            # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
+            vars(answer)[self.name] = table
         return table
 
     def _made(self, answer: Answer) -> Any:

@@ -299,10 +299,10 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
         )
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
     models = models_of(case.one_frame)
-    single = {name: one for name, one in models.items() if isinstance(one, FlareModel)}
+    single = [(name, one) for name, one in models.items() if isinstance(one, FlareModel)]
     # Where only two temperatures are fitted, the model of one of them, with its lines.
-    single = single or {"blackbody": one.single for one in models.values() if isinstance(one, TwoTemperatures)}
-    name, model = [*single.items()][-1]
+    single += [("blackbody", one.single) for one in models.values() if isinstance(one, TwoTemperatures) and not single]
+    name, model = single[-1]
     unknown = case.unknowns_of_fits(quiet, stare)
     processes = study.processes.additive_only
 
