@@ -52,7 +52,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("power -= float(np.sum((rows @ light) ** 2))", "power -= 0.0"),
     ),
     "paper's conventions without its instrument": (
-        "test_paper_and_ideal_change_the_conventions_alone",
+        "test_defaults_are_realistic_unlike_those_of_the_paper",
         ('update={"instrument": FORMERLY_MAUVE})', "update={})"),
     ),
     "an ideal answer of Python with the unknowns": (
@@ -520,8 +520,8 @@ MUTATIONS: dict[str, Mutation] = {
     "errors of changes with everything known": (
         "test_error_of_change_is_the_scatter_of_fits",
         (
-            "error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))",
-            "error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (None, None))",
+            "(visits.error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))",
+            "(visits.error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (None, None))",
         ),
     ),
     "one visit against a known mean": (
@@ -548,12 +548,12 @@ MUTATIONS: dict[str, Mutation] = {
         ("variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))", "pass"),
     ),
     "coverage of upper ends alone": (
-        "test_intervals_on_either_side_of_the_truth_do_not_cover[low-inf]",
+        "test_expected_regions_close_and_intervals_beside_the_truth_do_not_cover",
         ("(found.low[k] <= self.truth) & (self.truth <= found.high[k])", "self.truth <= found.high[k]"),
     ),
     "whole ranges for their halves": (
         "test_correct_model_covers_and_simple_model_is_rejected",
-        ("return np.asarray((high - low) / 2)\n\n\ndef _not_m", "return np.asarray(high - low)\n\n\ndef _not_m"),
+        ("return np.asarray((high - low) / 2 if", "return np.asarray(high - low if"),
     ),
     "exposures of a frame": (
         "test_exposure_inverts_snr[450.0-7-pixel]",

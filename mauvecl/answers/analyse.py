@@ -177,11 +177,6 @@ class EventRow:
         return self.event.energy.unclear and not self.analysis.survey.weighted
 
     @property
-    def rates(self) -> tuple[float, float]:
-        """False alarms per star-day, in light curves of the fitted process and in those of measured residuals."""
-        return self.analysis.false_alarms(self.event)
-
-    @property
     def fitted_s(self) -> tuple[float, float, float, float, float]:
         """Equivalent duration of the whole flare and the ends of its 68 and 95 % intervals; NaN if it is no flare."""
         energy = self.event.energy
@@ -267,12 +262,12 @@ EVENTS = (
            "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)", number(".3g"), detail=True),
     Column("components", lambda row: len(row.event.energy.flares), "", "flares fitted together", kind=int),
     Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
-    Column("rate_normal", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
-           "light curves of the fitted process"),
-    Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent "
-           "frames"),
-    Column("probability", lambda row: float(-np.expm1(-max(row.rates) * row.analysis.days)), "", "probability of such "
-           "an event from noise anywhere in these frames, by the larger rate", "from noise",
+    Column("rate_normal", lambda row: row.analysis.false_alarms(row.event)[0], "1 / d",
+           "false alarms per star-day above this statistic in light curves of the fitted process"),
+    Column("rate_measured", lambda row: row.analysis.false_alarms(row.event)[1], "1 / d",
+           "the same with residuals resampled from quiescent frames"),
+    Column("probability", lambda row: float(-np.expm1(-max(row.analysis.false_alarms(row.event)) * row.analysis.days)),
+           "", "probability of such an event from noise anywhere in these frames, by the larger rate", "from noise",
            lambda p: f"{p:.1e}" if p < 0.01 else f"{p:.2g}", detail=True),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
@@ -515,11 +510,7 @@ class AnalyseAnswer(Answer):
 
 @by_keywords("frames, as the share of the work that is done")
 def analyse(
-    study: Study,
-    engine: Engine | Pool | None = None,
-    progress: Progress = None,
-    *,
-    frames: Frames | None = None,
+    study: Study, engine: Engine | Pool | None = None, progress: Progress = None, *, frames: Frames | None = None
 ) -> AnalyseAnswer:
     """Find the flares in observed frames, with false-alarm rates from the noise as measured.
 

@@ -223,10 +223,25 @@ class Answer(Drawable, ContentEquality):
     @cached_property
     def neighbours(self) -> QTable | None:
         """Neighbours of the stars that the answer observes, or None."""
-        observed = self.observed if self.study.has_neighbours and "instrument" in self.uses else ()
-        rows = [row for case in observed for row in _neighbour_rows(case)]
-        shares = sorted({row["assumed_share"] for row in rows})
-        about = {"assumed_share": shares[0] if len(shares) == 1 else shares, "study": self.study.text()}
+        rows, shares = list[dict[str, Any]](), set[float]()
+        for case in self.observed if self.study.has_neighbours and "instrument" in self.uses else ():
+            near = case.neighbours
+            if near is None:
+                continue
+            total = float((case.quiet.source_electrons + case.quiet.neighbour_electrons).sum())
+            for star in near.stars:
+                shares.add(case.star.neighbour_share)
+                # Beyond the fibre no spectrum is needed.
+                enters, share, spectrum = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0, ""
+                if enters:
+                    rate, spectrum = rate_of(star, case.instrument, case.study.observation.order), star.spectrum[0]
+                    share = near.share * float(rate.sum()) * case.quiet.frame_s / total
+                rows.append({
+                    "star": case.label, "name": star.name, "separation": star.separation_arcsec, "band": star.band,
+                    "magnitude": float("nan") if star.magnitude is None else star.magnitude, "spectrum": spectrum,
+                    "enters": enters, "share": share,
+                })  # fmt: skip
+        about = {"assumed_share": shares.pop() if len(shares) == 1 else sorted(shares), "study": self.study.text()}
         return table_of(NEIGHBOUR_COLUMNS, rows, **about) if rows else None
 
     @property
@@ -517,25 +532,6 @@ def write_json(content: Any, path: Path) -> Path:
     """Write plain data as JSON; errors as for `write_table`."""
     write_whole(path, (json_text(content) + "\n").encode())
     return path
-
-
-def _neighbour_rows(case: Case) -> Iterator[dict[str, Any]]:
-    """Yield the neighbours of a case's star by the names of columns."""
-    x, near = case.quiet, case.neighbours
-    if near is None:
-        return
-    total = float((x.source_electrons + x.neighbour_electrons).sum())
-    for star in near.stars:
-        # Beyond the fibre no spectrum is needed.
-        enters, share, spectrum = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0, ""
-        if enters:
-            rate, spectrum = rate_of(star, case.instrument, case.study.observation.order), star.spectrum[0]
-            share = near.share * float(rate.sum()) * x.frame_s / total
-        yield {
-            "star": case.label, "name": star.name, "separation": star.separation_arcsec, "band": star.band,
-            "magnitude": float("nan") if star.magnitude is None else star.magnitude, "spectrum": spectrum,
-            "enters": enters, "share": share, "assumed_share": case.star.neighbour_share,
-        }  # fmt: skip
 
 
 NEIGHBOUR_COLUMNS = (

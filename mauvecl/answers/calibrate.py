@@ -22,16 +22,7 @@ from mauvecl.host.exposure.expectation import expect
 from mauvecl.host.instrument import shipped_names
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
-from mauvecl.observations.detector import (
-    CalibrationFrames,
-    DarkFit,
-    NoiseModel,
-    PhotonTransfer,
-    assumed_dark,
-    fit_dark,
-    fit_photon_transfer,
-    measured_variance,
-)
+from mauvecl.observations import detector
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, fit_throughput
@@ -99,12 +90,14 @@ THROUGHPUT_COLUMNS = (
     Column("wavelength", "throughput.wavelength_nm", "nm", "middle of the pixel", "nm", ".1f"),
     Column("throughput", "fitted_throughput", "", "electrons per photon", "throughput", ".4f"),
     Column("error", lambda answer: answer.fitted_throughput * answer.throughput.error, "", "its standard error"),
-    Column("nominal", "nominal_throughput", "", "throughput of the instrument that was given"),
+    Column("nominal", lambda answer: answer.nominal.throughput(answer.throughput.wavelength_nm), "",
+           "throughput of the instrument that was given"),
     Column("ratio", lambda answer: np.exp(answer.throughput.log_factor), "", "fitted over nominal throughput",
            "over nominal", ".4f"),
     Column("relative_error", "throughput.error", "", "relative standard error, with that of the gain", "error",
            percent(".2f")),
-    Column("relative_error_counts", "relative_error_counts", "",
+    Column("relative_error_counts",
+           lambda fit: np.sqrt(np.maximum(fit.throughput.error**2 - fit.transfer.relative_gain_error**2, 0.0)), "",
            "relative standard error of DN per photon, which the gain does not change"),
 )  # fmt: skip
 DARK_COLUMNS = (
@@ -133,9 +126,9 @@ class CalibrateAnswer(Answer):
     study: Study
     # The instrument from which the fit starts, whose values remain where the observations determine none.
     nominal: Instrument
-    observations: tuple[CalibrationFrames, ...]
-    dark: DarkFit
-    transfer: PhotonTransfer
+    observations: tuple[detector.CalibrationFrames, ...]
+    dark: detector.DarkFit
+    transfer: detector.PhotonTransfer
     throughput: ThroughputFit
 
     #: One row per value of the instrument.
@@ -154,7 +147,7 @@ class CalibrateAnswer(Answer):
     transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, about=())
 
     @property
-    def stars(self) -> list[CalibrationFrames]:
+    def stars(self) -> list[detector.CalibrationFrames]:
         """Observations of standard stars."""
         return [observation for observation in self.observations if observation.star is not None]
 
@@ -181,26 +174,17 @@ class CalibrateAnswer(Answer):
 
     @property
     def _fits(self) -> list[dict[str, Any]]:
-        fits: dict[str, ThroughputFit | DarkFit | PhotonTransfer] = {
+        fits: dict[str, ThroughputFit | detector.DarkFit | detector.PhotonTransfer] = {
             "throughput": self.throughput, "dark current": self.dark, "photon transfer": self.transfer
         }  # fmt: skip
         return [{"name": name, "chi2": fit.chi2, "dof": float(fit.dof), "p_value": fit.p_value}
                 for name, fit in fits.items() if fit.dof > 0]  # fmt: skip
 
     @cached_property
-    def nominal_throughput(self) -> NDArray[np.float64]:
-        """Throughput of the instrument that was given, at each pixel."""
-        return self.nominal.throughput(self.throughput.wavelength_nm)
-
-    @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:
         """Throughput at each pixel."""
-        return np.asarray(np.exp(self.throughput.log_factor) * self.nominal_throughput)
-
-    @property
-    def relative_error_counts(self) -> NDArray[np.float64]:
-        """Relative standard error of DN per photon at each pixel."""
-        return np.sqrt(np.maximum(self.throughput.error**2 - self.transfer.relative_gain_error**2, 0.0))
+        fit = self.throughput
+        return np.asarray(np.exp(fit.log_factor) * self.nominal.throughput(fit.wavelength_nm))
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -289,11 +273,6 @@ class CalibrateAnswer(Answer):
         with tempfile.TemporaryDirectory() as folder:
             zipfile.ZipFile(io.BytesIO(self.instrument_zip())).extractall(folder)
             return Instrument.load(Path(folder) / "instrument.toml")
-
-    @property
-    def name(self) -> str:
-        """Name of the fitted instrument."""
-        return f"{self.nominal.name}-calibrated"
 
     @property
     def notice(self) -> str:
@@ -430,7 +409,8 @@ class CalibrateAnswer(Answer):
 
         given = self.study.observation.instrument
         extends = given if given in shipped_names() else str(Path(given).resolve())
-        values: dict[str, Any] = {"version": FILE_VERSION, "extends": extends, "name": self.name, "notice": self.notice}
+        values: dict[str, Any] = {"version": FILE_VERSION, "extends": extends}
+        values |= {"name": f"{self.nominal.name}-calibrated", "notice": self.notice}
         values |= {key: {"value": value, "tag": "C", "source": self.source} for key, value in self.changes.items()}
         values |= {"throughput_factor": "throughput-factor.ecsv", "throughput_errors": "throughput-errors.ecsv",
                    "pixel_map": "pixel-map.ecsv"}  # fmt: skip
@@ -475,14 +455,14 @@ def calibrate(
     nominal, observations = _observations(study, frames, stars)
     lit = [observation for observation in observations if observation.star is not None]
     without = [observation for observation in observations if observation.star is None]
-    dark = assumed_dark(nominal, nominal.wavelength_nm.size)
+    dark = detector.assumed_dark(nominal, nominal.wavelength_nm.size)
     if without:
-        dark = fit_dark(without, nominal, NoiseModel.nominal(nominal))
-    transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
+        dark = detector.fit_dark(without, nominal, detector.NoiseModel.nominal(nominal))
+    transfer = detector.fit_photon_transfer(_variances(observations, dark, nominal), nominal)
     if without:
-        dark = fit_dark(without, nominal, transfer.noise)
+        dark = detector.fit_dark(without, nominal, transfer.noise)
         error = float(np.sqrt(dark.shared[0, 0]))
-        transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
+        transfer = detector.fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
     throughput = fit_throughput(
         lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
         light_error=asked.light_error, spectrum_error=asked.spectrum_error,
@@ -492,7 +472,7 @@ def calibrate(
 
 def _observations(
     study: Study, frames: tuple[Frames, ...] | None, stars: tuple[Source | None, ...] | None
-) -> tuple[Instrument, tuple[CalibrationFrames, ...]]:
+) -> tuple[Instrument, tuple[detector.CalibrationFrames, ...]]:
     """Return the instrument from which the fit starts and the observations; parameters as for `calibrate`."""
     asked = study.calibrate
     if not any(observation.library or observation.spectrum for observation in asked.observations):
@@ -508,7 +488,7 @@ def _observations(
     )
     sources = stars or tuple(observation.source() for observation in asked.observations)
     observations = tuple(
-        CalibrationFrames.of(given, nominal, star, source.temperature_c)
+        detector.CalibrationFrames.of(given, nominal, star, source.temperature_c)
         for given, star, source in zip(read, sources, asked.observations, strict=True)
     )
     for k, observation in enumerate(observations):
@@ -520,7 +500,7 @@ def _observations(
 
 
 def _variances(
-    observations: tuple[CalibrationFrames, ...], dark: DarkFit, nominal: Instrument
+    observations: tuple[detector.CalibrationFrames, ...], dark: detector.DarkFit, nominal: Instrument
 ) -> list[NDArray[np.float64]]:
     """Measure the variances of all observations, of dark frames apart for each temperature."""
     variances = []
@@ -533,5 +513,5 @@ def _variances(
             same = replace(observation, raw_dn=observation.raw_dn[part], temperature_c=observation.temperature_c[part])
             mean = dark.mean_dn(same)
             light = np.zeros(mean.size) if observation.star is None else same.raw_dn.mean(axis=0) - mean
-            variances.append(measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
+            variances.append(detector.measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
     return variances

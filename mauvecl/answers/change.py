@@ -11,21 +11,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.orbit.visibility import Visibility
-from mauvecl.observations.visits import (
-    INDICES,
-    Change,
-    IndexValue,
-    Recovery,
-    Smallest,
-    covered_indices,
-    error_of_change,
-    error_of_index,
-    flux_per_dn,
-    pixels_of,
-    recover_periods,
-    smallest_change,
-    visit_times_d,
-)
+from mauvecl.observations import visits
 from mauvecl.schema.columns import Column, View, formatted, interval_columns, number, percent
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.plan import targets_of
@@ -48,11 +34,11 @@ AMPLITUDES = (0.4, 4.0)
 class ChangeRow(InCell):
     """One change of one star."""
 
-    change: Change
+    change: visits.Change
     # error, error_known: standard error of one visit, with unknowns marginalised over and with everything known.
     error: float
     error_known: float
-    smallest: Smallest  # in the unit of the change
+    smallest: visits.Smallest  # in the unit of the change
     ideal: float  # smallest difference of one visit if everything but the noise is known
     magnitude: float | None  # of the star
     saturated: tuple[int, int]  # pixels near saturation, and all that the change concerns
@@ -74,7 +60,7 @@ class ChangeRow(InCell):
 class IndexRow(InCell):
     """One line index of one star, with its errors in one exposure."""
 
-    value: IndexValue
+    value: visits.IndexValue
     error: float
     error_known: float
     wavelength_nm: NDArray[np.float64]  # of the pixels
@@ -91,9 +77,9 @@ class IndexRow(InCell):
 class PeriodRow(InCell):
     """Recovered periods of one change of one star."""
 
-    change: Change
+    change: visits.Change
     error: float
-    recovery: Recovery
+    recovery: visits.Recovery
 
     def shares(self, end: str) -> NDArray[np.float64]:
         """Return the recovered shares or the ends of their intervals, shape (n_amplitude, n_period)."""
@@ -201,11 +187,6 @@ class ChangeAnswer(Answer):
         return (*self.USES, "orbit", "seed") if self.periods else self.USES
 
     @property
-    def many(self) -> int:
-        """Number of stars at other magnitudes: all with a magnitude, in every cell of the sweep."""
-        return len(self.along) // (MAGNITUDES.size * len(self.study.change.of))
-
-    @property
     def visits(self) -> str:
         """Number and exposure of the visits, as sentences say them."""
         visits = self.study.change.visits
@@ -239,7 +220,7 @@ class ChangeAnswer(Answer):
         lines = collect_messages(self.inputs)
         hidden = dict.fromkeys(f"{row.title}: {row.change.name}" for row in self.changes if row.hidden)
         lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
-        left = [name for name in INDICES if name not in {row.value.index.name for row in self.indices}]
+        left = [name for name in visits.INDICES if name not in {row.value.index.name for row in self.indices}]
         if left:
             lines.append(f"The pixels do not cover the line indices {', '.join(left)}.")
         lines.append(
@@ -268,11 +249,16 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
     asked = study.change
     file = asked.light()
     prepared = cases(study)
-    times = None
+    recovery = None
     if asked.periods:
         o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
         seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
-        times = visit_times_d(seen.windows(0), asked.visits, study.observation.exposure_s, study.run.seed)
+        # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
+        recovery = visits.recover_periods(
+            visits.visit_times_d(seen.windows(0), asked.visits, study.observation.exposure_s, study.run.seed),
+            np.geomspace(asked.shortest_d, asked.longest_d, asked.steps), np.geomspace(*AMPLITUDES, asked.steps),
+            fap=asked.period_fap, trials=asked.trials, seed=study.run.seed,
+        )  # fmt: skip
     rows, indices, along, periods = [], [], list[ChangeRow](), []
     for case in reported(prepared, len(prepared), progress):
         own = _changes(case, file)
@@ -280,12 +266,7 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
         indices += _indices(case)
         for step in () if case.star.magnitude is None else case.star.magnitude + MAGNITUDES:
             along += _changes(case.with_value("magnitude", float(step)), file)
-        if times is not None:
-            recovery = recover_periods(
-                times, np.geomspace(asked.shortest_d, asked.longest_d, asked.steps),
-                np.geomspace(*AMPLITUDES, asked.steps), fap=asked.period_fap, trials=asked.trials, seed=study.run.seed,
-            )  # fmt: skip
-            # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
+        if recovery is not None:
             periods += [PeriodRow(row.label, row.at, row.change, row.error, recovery)
                         for row in own if not np.isnan(row.error)]  # fmt: skip
     return ChangeAnswer(study, rows, indices, along, periods, [case.quiet for case in prepared])
@@ -294,15 +275,15 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
 def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
     """Return the smallest detectable changes of a case's star."""
     study, quiet, unknown = case.study, case.quiet, case.unknowns()
-    unit = smallest_change(1.0, study.change.visits, study.run.fap, study.limit.power)
+    unit = visits.smallest_change(1.0, study.change.visits, study.run.fap, study.limit.power)
     rows = []
     for name in study.change.of:
         order, band = study.observation.order, study.change.band
-        change = Change.named(name, case.source, quiet, case.instrument, order, file, band)
-        error, known_error = (error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
-        smallest = Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
+        change = visits.Change.named(name, case.source, quiet, case.instrument, order, file, band)
+        error, known_error = (visits.error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
+        smallest = visits.Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
         ideal = change.size(known_error * unit.one)
-        lost, own = pixels_of(change.counts_dn, quiet), (change.size(error), change.size(known_error))
+        lost, own = visits.pixels_of(change.counts_dn, quiet), (change.size(error), change.size(known_error))
         rows.append(ChangeRow(case.label, case.at, change, *own, smallest, ideal, case.star.magnitude, lost))
     return rows
 
@@ -310,12 +291,12 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
 def _indices(case: Case) -> list[IndexRow]:
     quiet, unknown = case.quiet, case.unknowns()
     rows = []
-    for index in covered_indices(quiet):
-        value = IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
-        error, known_error = (error_of_index(value.weights, quiet, nuisances) for nuisances in (unknown, None))
-        lost = pixels_of(value.weights, quiet)
+    for index in visits.covered_indices(quiet):
+        value = visits.IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
+        error, known_error = (visits.error_of_index(value.weights, quiet, nuisances) for nuisances in (unknown, None))
+        lost = visits.pixels_of(value.weights, quiet)
         if lost[0]:
             value = replace(value, value=np.nan, equivalent_width_nm=np.nan)
-        flux = flux_per_dn(quiet, case.instrument) * quiet.signal_dn
+        flux = visits.flux_per_dn(quiet, case.instrument) * quiet.signal_dn
         rows.append(IndexRow(case.label, case.at, value, error, known_error, quiet.wavelength_nm, flux, lost))
     return rows

@@ -20,7 +20,7 @@ from scipy.interpolate import PchipInterpolator
 
 from mauvecl.detection.distributions import CONFIDENCE, Gaussian, Interval
 from mauvecl.detection.names import MIN_IN_TAIL
-from mauvecl.detection.nuisances import Nuisances, join_names
+from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, ThroughputMode, values_of
 from mauvecl.schema.columns import Column, First, chance_text, number
@@ -60,20 +60,17 @@ def unknown_cost(
         return Cost(of, 0.0, 0.0, 0.0)
     weights = matched.plain_weights(plain, flare)
     known_snr = float(weights @ delta)
-    spread = scatter(unknown, usual=chosen.usual) * np.abs(unknown.spectra @ weights)
+    # Amplitudes have the standard deviations that are drawn by default, or else those of the prior.
+    drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if chosen.usual}
+    spreads = zip(unknown.names, unknown.sd, strict=True)
+    sd = np.array([drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in spreads])
+    spread = sd * np.abs(unknown.spectra @ weights)
     try:
         marginal = matched.weights_per_dn(Setting(quiet, used, comparison, nuisances=unknown), flare)
     except InputError:
         # The flare has the spectrum of an unknown.
         marginal = np.zeros_like(weights)
     return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
-
-
-def scatter(unknown: Nuisances, *, usual: bool) -> NDArray[np.float64]:
-    """Return the standard deviations of nuisance amplitudes, shape (k,): as drawn by default, or else of the prior."""
-    drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if usual}
-    spreads = zip(unknown.names, unknown.sd, strict=True)
-    return np.array([drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in spreads])
 
 
 def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
@@ -95,8 +92,8 @@ def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
     """Return a sentence on what statistics are marginalised over and which unknowns are drawn, or none."""
     if nuisances.none:
         return []
-    texts = [PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES]
-    drawn = f"; drawn: {'; '.join(texts)}" if nuisances.usual else ""
+    texts = "; ".join(PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES)
+    drawn = f"; drawn: {texts}" if nuisances.usual else ""
     return [f"Statistics are marginalised over {spoken(nuisances)}{drawn}."]
 
 
@@ -158,14 +155,11 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     except InputError as error:
         # Too few pixels are left.
         return [Message(f"The usual unknowns cannot be taken into account for {of}: {error}.", BOTH_CHANCES)]
-    if math.isnan(unknown):
-        return []
-    text = (
+    return [] if math.isnan(unknown) else [Message(
         f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
         f"{chance_text(chances[case, flare])}, with the usual unknowns of {chance_text(unknown)} (closed forms; "
-        f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice())}."
-    )
-    return [Message(text, BOTH_CHANCES)]
+        f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice())}.", BOTH_CHANCES,
+    )]  # fmt: skip
 
 
 def _matched_chance(case: Case, flare: int) -> float:
@@ -194,11 +188,6 @@ class DrawnStudies:
     labels: tuple[str, ...]
     values: Float  # shape (n_draw, n_name)
     studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
-
-    @property
-    def by_name(self) -> dict[str, Float]:
-        """Drawn values of each unknown."""
-        return dict(zip(self.names, self.values.T, strict=True))
 
 
 def drawn(study: Study) -> DrawnStudies:
@@ -316,14 +305,6 @@ def describe_shares(shares: Mapping[str, float]) -> str:
     first = First(shares.items(), MAX_NAMED, "unknowns")
     note = f" ({first.note})" if first.note else ""
     return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
-
-
-def draw_columns(draws: DrawnStudies) -> tuple[Column, ...]:
-    """Return the columns of the drawn values of unknowns, for rows with `draws`."""
-    return tuple(
-        Column(name, description=f"drawn {label}").of(lambda row: row.draws.by_name)
-        for name, label in zip(draws.names, draws.labels, strict=True)
-    )
 
 
 class InterpolatedForm:

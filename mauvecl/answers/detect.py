@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -13,26 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.answers.answer import (
-    IF_KNOWN,
-    Answer,
-    InCell,
-    TableOf,
-    metadata_of,
-    name_of_instrument,
-    reported,
-    share_columns,
-)
-from mauvecl.answers.closed_forms import (
-    IDEAL,
-    Cost,
-    chance_with_unknowns,
-    cost_lines,
-    ideal_chances,
-    marginal_lines,
-    spoken,
-    unknown_cost,
-)
+from mauvecl.answers import closed_forms as forms
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported, share_columns
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
@@ -89,7 +70,7 @@ def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
     place = [column.name for column in COLUMNS].index("high") + 1
-    ideal = () if answer.study.nuisances.none else (IDEAL,)
+    ideal = () if answer.study.nuisances.none else (forms.IDEAL,)
     share = share_columns(answer.study, "detection.quiet.target_share")
     return (*share, amplitude, *COLUMNS[1:place], *ideal, *COLUMNS[place:])
 
@@ -98,9 +79,8 @@ def _rows_of(star: StarDetection, fap: float) -> QTable:
     """Return the table of a star's detection with the ideal probabilities, if it has any."""
     table = star.detection.table(fap)[[column.name for column in COLUMNS[1:]]]
     if star.ideal is not None:
-        after = table.colnames.index("high") + 1
-        table.add_column(star.ideal.ravel(), name=IDEAL.name, index=after)
-        table[IDEAL.name].info.description = IDEAL.description
+        table.add_column(star.ideal.ravel(), name=forms.IDEAL.name, index=table.colnames.index("high") + 1)
+        table[forms.IDEAL.name].info.description = forms.IDEAL.description
     return table
 
 
@@ -253,7 +233,7 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
         detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
         statistics = [detection.statistic(name) for name in detection.statistics]
         return StarDetection(
-            case.label, case.at, case.amplitudes, detection, ideal_chances(case, case.flares, statistics)
+            case.label, case.at, case.amplitudes, detection, forms.ideal_chances(case, case.flares, statistics)
         )
 
     if isinstance(engine, Pool):
@@ -266,21 +246,17 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
             paper = _paper(prepared)
         stars.append(star)
     answer = DetectAnswer(study, stars, paper=paper)
-    costs = [text for case, star in zip(prepared, stars, strict=True) for text in _template_costs(case, star)]
-    last = [*_few_terms(stars), *marginal_lines(study.nuisances)]
-    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
-    last += chance_with_unknowns(prepared) or _cost_of_unknowns(prepared)
-    answer.messages = list(dict.fromkeys([*_messages(answer, prepared), *campaigns, *costs, *last]))
+    answer.messages = list(dict.fromkeys(_messages(answer, prepared, campaigns)))
     return answer
 
 
-def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
-    """Return messages on lost pixels, on thresholds, and of the expectations."""
-    run, detections = answer.study.run, [(star.title, star.detection) for star in answer.stars]
+def _messages(answer: DetectAnswer, prepared: Sequence[Case], campaigns: Sequence[str]) -> list[str]:
+    """Return messages on lost pixels, on thresholds, of the expectations, on campaigns, templates and unknowns."""
+    study, run, detections = answer.study, answer.study.run, [(star.title, star.detection) for star in answer.stars]
     messages: list[str] = [message.about(title) for title, one in detections for message in one.messages]
     messages += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
     messages += [message.about(title) for title, one in detections for message in one.lowered]
-    messages += collect_messages([x for case in prepared for x in case.expectations], answer.study.processes)
+    messages += collect_messages([x for case in prepared for x in case.expectations], study.processes)
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         text = (
@@ -288,18 +264,17 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case]) -> list[str]:
             f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than 100 beyond them."
         )
         messages.append(Message(text, "sampled"))
-    return messages
-
-
-def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
-    """Return the sentence on the S/N that the faintest flare loses to unknowns."""
-    choice, comparison = prepared[0].study.nuisances, prepared[0].study.run.comparison()
-    costs = list[Cost]()
-    for case in prepared:
+    messages += campaigns
+    for case, star in zip(prepared, answer.stars, strict=True):
+        messages += _template_costs(case, star)
+    messages += [*_few_terms(answer.stars), *forms.marginal_lines(study.nuisances)]
+    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
+    chance, costs = forms.chance_with_unknowns(prepared), list[forms.Cost]()
+    for case in prepared if not chance else ():
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
             name = f"{case.label}, flare of {100 * amplitude:g} %"
-            costs.append(unknown_cost(name, case.quiet, flare, choice, comparison))
-    return cost_lines(costs, choice)
+            costs.append(forms.unknown_cost(name, case.quiet, flare, study.nuisances, run.comparison()))
+    return [*messages, *chance, *forms.cost_lines(costs, study.nuisances)]
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
@@ -394,7 +369,7 @@ def _paper(prepared: Sequence[Case]) -> list[str]:
 
 #: Default unknowns, which include those of the table in METHODS.
 SHOWN: dict[str, NuisanceChoice] = {
-    spoken(choice): choice
+    forms.spoken(choice): choice
     for choice in (
         NuisanceChoice(usual=False, dark=0.1),
         NuisanceChoice(usual=False, light=0.01),
@@ -426,7 +401,7 @@ class UnknownAnswer(Answer):
     USES = ("instrument", "sky", "flare", "nuisances", "seed")
 
     study: Study
-    costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
+    costs: dict[tuple[str, float], dict[str, forms.Cost]]  # by (star, amplitude), then by unknown
     messages: list[str]
     inputs: list[Expectation]  # the stars without a flare
 
@@ -434,10 +409,10 @@ class UnknownAnswer(Answer):
     table = TableOf(
         "unknowns", UNKNOWN_COLUMNS, "_rows",
         title="What unknowns cost: S/N of the matched statistic, by closed forms",
-        about=lambda answer: metadata_of(answer, "study.run.fap", "study.limit.power") | {"study": answer.study.toml()},
+        about=("study.run.fap", "study.limit.power", "study"),
     )  # fmt: skip
 
-    def of_star(self, star: str) -> tuple[float, dict[str, Cost]]:
+    def of_star(self, star: str) -> tuple[float, dict[str, forms.Cost]]:
         """Return the amplitude of the first flare of a star, and its costs by unknown."""
         return next((amplitude, costs) for (name, amplitude), costs in self.costs.items() if name == star)
 
@@ -447,8 +422,7 @@ class UnknownAnswer(Answer):
         `unknown` is None for everything known. S/N grows with the amplitude; the flare's own photon noise is left out.
         """
         amplitude, costs = self.of_star(star)
-        cost = next(iter(costs.values())) if unknown is None else costs[unknown]
-        snr = cost.known if unknown is None else cost.marginal
+        snr = next(iter(costs.values())).known if unknown is None else costs[unknown].marginal
         needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
         return float(amplitude * needed / snr) if snr > 0 else float("inf")
 
@@ -464,11 +438,13 @@ class UnknownAnswer(Answer):
 def unknown_table(study: Study) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
     prepared, comparison = cases(study, swept=False), study.run.comparison()
-    costs = dict[tuple[str, float], dict[str, Cost]]()
+    costs = dict[tuple[str, float], dict[str, forms.Cost]]()
     for case in prepared:
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
-            of = partial(unknown_cost, case.label, case.quiet, flare, comparison=comparison)
-            costs[case.label, amplitude] = {unknown: of(nuisances=choice) for unknown, choice in SHOWN.items()}
+            of = case.label, case.quiet, flare
+            costs[case.label, amplitude] = {
+                name: forms.unknown_cost(*of, choice, comparison) for name, choice in SHOWN.items()
+            }
     quiet = [case.quiet for case in prepared]
     return UnknownAnswer(study, costs, collect_messages(quiet), quiet)
 

@@ -6,6 +6,7 @@ deviation of the observed one in 68.27 % of all spectra, and the false-alarm pro
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -179,51 +180,38 @@ class GaussianAnswer(Answer):
         return self.signal.inputs
 
     @property
-    def _largest_errors(self) -> list[dict[str, Any]]:
-        rows, stars = [], self.signal.stars
+    def _largest_errors(self) -> Iterator[dict[str, Any]]:
+        stars, rare = self.signal.stars, special.ndtr(-5.0)
         for k, star in enumerate(stars):
             # Each star has as many rows as the others.
             elements, tested, flares = (
                 table[k * len(table) // len(stars) : (k + 1) * len(table) // len(stars)]
                 for table in (self.elements, self.thresholds, self.detection.table)
             )
-            rows.append(vars(star) | _of_signal(star.result, elements) | _of_thresholds(tested, flares))
-        return rows
-
-
-def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
-    """Return the largest errors of a star's S/N, and of the intervals that follow from it."""
-    sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
-    worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
-    x, rare = result.expectation, special.ndtr(-5.0)
-    return {
-        "best_snr": float(elements["expected"].max()),
-        "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
-        "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
-        "coverage_low": float(elements["coverage"].min()),
-        "coverage_high": float(elements["coverage"].max()),
-        "five_sigma_above": float((beyond(x, 5.0) / rare).max()),
-        "five_sigma_below": float((beyond(x, -5.0) / rare).min()),
-    }
+            sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
+            worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
+            off = tested[tested["differs"]]
+            wrong: Any = off[_most_wrong(off["ratio"])] if len(off) else {"ratio": 1.0, "statistic": "", "why": ""}
+            missed = flares["probability"] - flares["closed_form_probability"]
+            # The interval includes the error of the threshold.
+            is_sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
+            missed = np.where(is_sure, missed, 0.0)
+            yield vars(star) | {
+                "best_snr": float(elements["expected"].max()),
+                "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
+                "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
+                "coverage_low": float(elements["coverage"].min()),
+                "coverage_high": float(elements["coverage"].max()),
+                "five_sigma_above": float((beyond(star.result.expectation, 5.0) / rare).max()),
+                "five_sigma_below": float((beyond(star.result.expectation, -5.0) / rare).min()),
+                "fap_ratio": float(wrong["ratio"]), "statistic": str(wrong["statistic"]), "why": str(wrong["why"]),
+                "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
+            }  # fmt: skip
 
 
 def _most_wrong(ratios: Any) -> int:
     """Return the index of the ratio that is furthest from 1, up or down."""
     return int(np.argmax(np.abs(np.log(np.maximum(ratios, SMALLEST_RATIO)))))
-
-
-def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
-    """Return the largest errors of a star's false-alarm and detection probabilities."""
-    off = tested[tested["differs"]]
-    wrong: Any = off[_most_wrong(off["ratio"])] if len(off) else {"ratio": 1.0, "statistic": "", "why": ""}
-    missed = flares["probability"] - flares["closed_form_probability"]
-    # The interval includes the error of the threshold.
-    sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
-    missed = np.where(sure, missed, 0.0)
-    return {
-        "fap_ratio": float(wrong["ratio"]), "statistic": str(wrong["statistic"]), "why": str(wrong["why"]),
-        "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
-    }  # fmt: skip
 
 
 @by_keywords("stars, each of which is drawn for its S/N and then for its flares")

@@ -137,39 +137,6 @@ DIFFERS = 4.0
 LEAST_CHANCE = 1e-5
 
 
-def limit_columns(of: str, *, known: bool) -> tuple[Column, ...]:
-    """Return the columns of limits of a kind of size, for intervals by name; the ideal one unless all is known."""
-    unit, columns = SIZE_UNITS[of], list[Column]()
-    size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
-    for name, power in POWERS.items():
-        limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
-        detail = power != 0.5
-        own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=detail)
-        columns += [column.of(itemgetter(name)) for column in (limit, *own)]
-    text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
-    ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
-    return (
-        Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
-               number(".4g", "all")),
-        *columns,
-        Column("never", "", "", "share of flares for which no template fits into what is observed", "no template fits",
-               percent(".3g"), detail=True),
-        *(() if known else (ideal,)),
-    )  # fmt: skip
-
-
-def cell_columns(of: str) -> tuple[Column, ...]:
-    """Return the columns of the table of completeness over half-width and a kind of size."""
-    return (
-        Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of the injected flares"),
-        Column("size", "sizes", SIZE_UNITS[of], f"{of} of the injected flares"),
-        Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
-        Column("completeness", "", "", "share of injected flares that the search finds"),
-        *interval_columns("completeness_{}"),
-        Column("injections", "count", "", "number of injected flares"),
-    )
-
-
 SEARCH_COLUMNS = (
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
     *interval_columns("threshold_{}", "threshold.{}", heading=INTERVAL, format=interval(".3f")),
@@ -215,8 +182,23 @@ class StarCompleteness(InCell):
 
     @property
     def limit_columns(self) -> tuple[Column, ...]:
-        """Columns of `limits`."""
-        return limit_columns(self.sizes.of, known=bool(np.isnan(self.ideal_share)))
+        """Columns of `limits`; the ideal one unless everything but the noise is known."""
+        of, unit, columns = self.sizes.of, SIZE_UNITS[self.sizes.of], list[Column]()
+        size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
+        for name, power in POWERS.items():
+            limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
+            own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=power != 0.5)
+            columns += [column.of(itemgetter(name)) for column in (limit, *own)]
+        text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
+        ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
+        return (
+            Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike",
+                   "half-width (s)", number(".4g", "all")),
+            *columns,
+            Column("never", "", "", "share of flares for which no template fits into what is observed",
+                   "no template fits", percent(".3g"), detail=True),
+            *(() if np.isnan(self.ideal_share) else (ideal,)),
+        )  # fmt: skip
 
     @property
     def limits(self) -> QTable:
@@ -231,7 +213,15 @@ class StarCompleteness(InCell):
     @property
     def cells(self) -> QTable:
         """Completeness at each half-width and size, and how well the flares are recovered."""
-        columns = [column.of(attrgetter("injected")) for column in cell_columns(self.sizes.of)]
+        own = (
+            Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of injected flares"),
+            Column("size", "sizes", SIZE_UNITS[self.sizes.of], f"{self.sizes.of} of the injected flares"),
+            Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
+            Column("completeness", "", "", "share of injected flares that the search finds"),
+            *interval_columns("completeness_{}"),
+            Column("injections", "count", "", "number of injected flares"),
+        )
+        columns = [column.of(attrgetter("injected")) for column in own]
         if self.fitted is not None:
             columns += [column.of(attrgetter("fitted")) for column in ACCURACY_COLUMNS]
         return table_of(columns, [self])

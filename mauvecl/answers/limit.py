@@ -6,15 +6,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from operator import attrgetter
+from operator import itemgetter
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, first_of, share_columns
-from mauvecl.answers.closed_forms import Cost, cost_lines, describe_shares, draw_columns, marginal_lines, unknown_cost
-from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Report, Unknown, settle, single_flares
+from mauvecl.answers import closed_forms as forms
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_columns
+from mauvecl.answers.limit_search import LimitSearch, Point, Report, settle
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
@@ -31,8 +32,6 @@ from mauvecl.study.cases import (
     amplitude_column,
     cases,
     collect_messages,
-    full_label,
-    place_columns,
     star_column,
     star_label,
     worst_first,
@@ -56,7 +55,7 @@ def what_matters(study: Study) -> QTable:
     QTable
         One row per star, flare, statistic and assumption; for each limit, the assumption that changes it most first.
     """
-    rows, flares = [], [single for case in cases(study, swept=False) for single in single_flares(case)]
+    rows, flares = [], _single_flares(cases(study, swept=False))
     for single, statistic in product(flares, study.run.statistics):
         rows += sorted(_moves(single, statistic), key=lambda row: -row["span"])
     columns = assumption_columns(study.limit.of)
@@ -65,6 +64,13 @@ def what_matters(study: Study) -> QTable:
         if column.format == LIMIT:
             table[column.name].info.format = LIMIT
     return table
+
+
+def _single_flares(prepared: Sequence[Case]) -> list[Case]:
+    """Return a case for each flare of which a limit is computed: one of each case if its amplitude is the limit."""
+    if prepared[0].study.limit.of == "amplitude":
+        return list(prepared)
+    return [case.with_value("amplitude", amplitude) for case in prepared for amplitude in case.amplitudes]
 
 
 #: Format of limits.
@@ -114,11 +120,25 @@ def _moves(case: Case, statistic: str) -> Iterator[dict[str, Any]]:
 STEPS = 100
 
 
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """Effect of unknown instrument values on a limit."""
+
+    draws: forms.DrawnStudies
+    limits: NDArray[np.float64]  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
+    shares: dict[str, float]  # share of the limits' variance that each unknown explains, largest first
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Central 95 % of the limits."""
+        low, high = np.nanquantile(self.limits, (0.025, 0.975))
+        return float(low), float(high)
+
+
 @dataclass(frozen=True)
-class Limit:
+class Limit(InCell):
     """Limit of a quantity."""
 
-    star: str
     amplitude: float  # amplitude of the flare; NaN if the amplitude is the limit
     of: str
     statistic: str
@@ -128,28 +148,11 @@ class Limit:
     ideal: float  # the same if everything but the noise were known; NaN if it is, or if there is none
     check: Point  # detection probability at the value, simulated again with another seed
     points: tuple[Point, ...]  # simulations of the search
-    question: LimitSearch = field(compare=False, repr=False)  # the closed form
-    at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values
-    unknown: Unknown | None = None  # for limits averaged over unknown instrument values
-    messages: tuple[str, ...] = ()  # saturation at the limit, without and with the flare
-    cost: Cost | None = None  # loss of S/N to unknowns at the limit
-    # The star at the limit, without the flare.
-    quiet: Expectation | None = field(default=None, compare=False, repr=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # The loader of a case cannot be pickled.
-        return vars(self) | {"curve": self.curve, "question": None}
-
-    @cached_property
-    def curve(self) -> tuple[tuple[float, float], ...]:
-        """The closed form around the limit."""
-        return self.question.curve(self.value.value)
-
-    @property
-    def agrees(self) -> bool:
-        """True if the 95 % interval of the second simulation contains the power."""
-        p = self.check.probability
-        return p.low <= self.power <= p.high
+    curve: tuple[tuple[float, float], ...] = field(compare=False, repr=False)  # the closed form around the limit
+    unknown: Unknown | None  # for limits averaged over unknown instrument values
+    messages: tuple[str, ...]  # saturation at the limit, without and with the flare
+    cost: forms.Cost  # loss of S/N to unknowns at the limit
+    quiet: Expectation = field(compare=False, repr=False)  # the star at the limit, without the flare
 
     @property
     def verdict(self) -> str:
@@ -160,7 +163,7 @@ class Limit:
         which happens by chance for one limit in six.
         """
         p = self.check.probability
-        if self.agrees:
+        if p.low <= self.power <= p.high:
             return "confirms it"
         if self.of == "exposure" and p.low > self.power:
             return "exceeds it"
@@ -214,8 +217,11 @@ def _unknown_columns(digits: str) -> tuple[Column, ...]:
 
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     draws = next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
-    limit = Column(answer.study.limit.of, "unknown.limits", description="closed-form limit")
-    return (*answer.flare_columns, *(column.of(attrgetter("unknown")) for column in draw_columns(draws)), limit)
+    values = (
+        Column(name, itemgetter(k), description=f"drawn {label}").of(lambda row: row.unknown.draws.values.T)
+        for k, (name, label) in enumerate(zip(draws.names, draws.labels, strict=True))
+    )
+    return (*answer.flare_columns, *values, Column(answer.study.limit.of, "unknown.limits", "", "closed-form limit"))
 
 
 @dataclass(eq=False)
@@ -241,10 +247,6 @@ class LimitAnswer(Answer):
         when=lambda answer: answer.assumptions is not None,
     )  # fmt: skip
 
-    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
-        """Return columns after those of the star and of swept quantities other than the amplitude."""
-        return (*place_columns(self.study.sweep, "amplitude", star="star"), *columns)
-
     @property
     def flare_columns(self) -> tuple[Column, ...]:
         """Columns of flare and statistic."""
@@ -261,7 +263,7 @@ class LimitAnswer(Answer):
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
         least = first_of(len(self.limits), "limits")
         return (
-            f"{self.instrument_name} would see {flare} on {full_label(limit.star, limit.at)}{within} with a "
+            f"{self.instrument_name} would see {flare} on {limit.title}{within} with a "
             f"chance of {100 * asked.power:g} % {before} {number(limit.value.value)} "
             f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
         )
@@ -278,8 +280,8 @@ class LimitAnswer(Answer):
         views = [View(title, shown, table_of(shown, self.limits))]
         if draws:
             heading = "matters most, share of the variance"
-            shares = Column("shares", lambda row: describe_shares(row.unknown.shares), heading=heading)
-            shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], shares)
+            column = Column("shares", lambda row: forms.describe_shares(row.unknown.shares), heading=heading)
+            shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], column)
             what = "what is unknown of the instrument: the limits of each, and what explains their scatter"
             views.append(View(f"Averaged over {draws} draws of {what}", shown, table_of(shown, self.limits)))
         return [*views, *super().views]
@@ -287,16 +289,17 @@ class LimitAnswer(Answer):
     @cached_property
     def inputs(self) -> list[Expectation]:
         """Each star at its limits."""
-        return [limit.quiet for limit in self.limits if limit.quiet is not None]
+        return [limit.quiet for limit in self.limits]
 
     @property
     def messages(self) -> list[str]:
         """Messages about failed limits, the stars, and unknowns."""
         at_limits = [text for limit in self.limits for text in limit.messages]
         stars = worst_first([*at_limits, *collect_messages(self.inputs, self.study.processes)])
-        costs = [limit.cost for limit in self.limits if limit.cost is not None]
+        costs = [limit.cost for limit in self.limits]
         failed = [Message(f"NO LIMIT: {text}.", "no limit") for text in self.failed]
-        return [*failed, *stars, *marginal_lines(self.study.nuisances), *cost_lines(costs, self.study.nuisances)]
+        unknown = [*forms.marginal_lines(self.study.nuisances), *forms.cost_lines(costs, self.study.nuisances)]
+        return [*failed, *stars, *unknown]
 
 
 def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = None) -> Limit:
@@ -308,10 +311,12 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
     """
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    kind = MarginalLimitSearch if study.unknowns.draws else LimitSearch
-    question = kind(case, statistic, engine, report)
+    draws = forms.drawn(study) if study.unknowns.draws else None
+    each = [LimitSearch(replace(case, study=one), statistic, engine) for one in draws.studies] if draws else []
+    question = LimitSearch(case, statistic, engine, report, each)
     # The root of the nominal instrument is near and found quickly.
-    theory = question.root(near=LimitSearch(case, statistic).root() if study.unknowns.draws else None)
+    theory = question.root(near=LimitSearch(case, statistic).root() if each else None)
+    roots = np.array([draw.root_or_nan(theory) for draw in each])
     value = settle(question, theory)
     simulated = tuple(question.points)
     # Users are unlikely to choose a seed with this distance from another.
@@ -325,12 +330,12 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
     where = f"{star_label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
     amplitude = float("nan") if question.of == "amplitude" else case.amplitudes[0]
     return Limit(
-        star_label(named, quiet), amplitude, question.of, statistic, question.power, value, closed_form=theory,
+        star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
-        check=check, points=simulated, question=kind(case, statistic), at=case.at,
-        unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
+        check=check, points=simulated, curve=question.curve(value.value),
+        unknown=Unknown(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
-        cost=unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
+        cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
     )  # fmt: skip
 
 
@@ -347,8 +352,7 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
             f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested",
             key="sweep",
         )
-    flares = [single for case in cases(study) for single in single_flares(case)]
-    asked = list(product(flares, study.run.statistics))
+    asked = list(product(_single_flares(cases(study)), study.run.statistics))
     steps, lock = [0] * len(asked), Lock()
 
     def report(number: int, done: int) -> None:

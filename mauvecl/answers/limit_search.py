@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.answers.closed_forms import DrawnStudies, average, drawn, shares
+from mauvecl.answers.closed_forms import average
 from mauvecl.detection.distributions import Interval, smallest_integer
 from mauvecl.detection.requests import STATISTICS, check_shape, fall_between
 from mauvecl.detection.statistics import LinearStatistic
@@ -26,9 +26,7 @@ if TYPE_CHECKING:
 
 #: Function that is called with the number of simulations after each of them.
 Report = Callable[[int], None] | None
-#: Steps of the search for the root of the closed form, from where a flare is hardest to see.
-STEPS = {"magnitude": -0.5, "amplitude": 2.0, "exposure": 2.0}
-#: Ends of that search, hardest and easiest.
+#: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
 SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (None, 1e6)}
 #: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
 MOST_EVALUATIONS = 8
@@ -43,26 +41,18 @@ class Point:
     seed: int
 
 
-@dataclass(frozen=True, eq=False)
-class Unknown:
-    """Effect of unknown instrument values on a limit."""
-
-    draws: DrawnStudies
-    limits: NDArray[np.float64]  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
-    shares: dict[str, float]  # share of the limits' variance that each unknown explains, largest first
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """Central 95 % of the limits."""
-        low, high = np.nanquantile(self.limits, (0.025, 0.975))
-        return float(low), float(high)
-
-
 class LimitSearch:
-    """Detection probability of a case's first flare by one statistic, as a function of the limit's quantity."""
+    """Detection probability of a case's first flare by one statistic, as a function of the limit's quantity.
 
-    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None, report: Report = None) -> None:
+    It is the mean over other searches if there are any: those of draws of unknown instrument values.
+    """
+
+    def __init__(
+        self, case: Case, statistic: str, engine: Engine | Pool | None = None, report: Report = None,
+        draws: Sequence[LimitSearch] = (),
+    ) -> None:  # fmt: skip
         self.case, self.statistic, self.engine = case.with_value("amplitude", case.amplitudes[0]), statistic, engine
+        self.draws = draws
         self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
         self.points: list[Point] = []
         self._report = report
@@ -94,6 +84,8 @@ class LimitSearch:
 
     def theory(self, value: float) -> float:
         """Return the detection probability for Gaussian noise; 0 if every pixel saturates."""
+        if self.draws:
+            return float(np.mean([draw.theory(value) for draw in self.draws]))
         quiet, flare = self.scaled(value)
         setting, statistic = self.case.setting(quiet, flare), STATISTICS[self.statistic]
         if not setting.used.any():
@@ -104,7 +96,20 @@ class LimitSearch:
         return statistic.detection_forms(setting, flare, self.fap).probability
 
     def simulated(self, value: float, seed: int) -> Interval:
-        """Simulate the detection probability and return it with its interval."""
+        """Simulate the detection probability, report the number of simulations, and return it with its interval.
+
+        Each draw of unknown values has its own reference and threshold.
+        """
+        if self.draws:
+            probability = average([draw.simulated(value, seed) for draw in self.draws])
+        else:
+            probability = self._detected(value, seed)
+        self.points.append(Point(value, probability, seed))
+        if self._report is not None:
+            self._report(len(self.points))
+        return probability
+
+    def _detected(self, value: float, seed: int) -> Interval:
         assert self.engine is not None
         quiet, flare = self.pair(value)
         detection = self.engine.detect(
@@ -118,14 +123,7 @@ class LimitSearch:
         # Raises InputError where no threshold has the false-alarm probability.
         detection.threshold(self.fap, self.statistic)
         (probability,) = detection.detection_probability(self.fap, self.statistic)
-        return self._added(Point(value, probability, seed))
-
-    def _added(self, point: Point) -> Interval:
-        """Add a simulated point, report the number of points, and return its probability."""
-        self.points.append(point)
-        if self._report is not None:
-            self._report(len(self.points))
-        return point.probability
+        return probability
 
     def curve(self, value: float) -> tuple[tuple[float, float], ...]:
         """Return the closed form around a value; exposures are whole frames."""
@@ -146,13 +144,16 @@ class LimitSearch:
             if self.theory(ends[0]) < self.power <= self.theory(ends[1]):
                 return crossing(*ends, rtol=1e-5)
         hardest, easiest = SEARCH[self.of]
-        value = self.frame_s if hardest is None else hardest
-        if self.theory(value) >= self.power:
+        first = hardest or self.frame_s
+        if self.of == "magnitude":
+            values = np.arange(first, easiest - 0.1, -0.5).tolist()
+        else:
+            values = (first * 2.0 ** np.arange(np.ceil(np.log2(easiest / first)) + 1)).tolist()
+        if self.theory(first) >= self.power:
             if self.of == "exposure":
-                return value
-            raise self._beyond(value, "already exceeds")
-        while (easiest - value) * (_nearer(self.of, value) - value) > 0:
-            before, value = value, _nearer(self.of, value)
+                return first
+            raise self._beyond(first, "already exceeds")
+        for before, value in pairwise(values):
             if self.theory(value) < self.power:
                 continue
             if self.of == "exposure":
@@ -184,29 +185,25 @@ class LimitSearch:
         return InputError(
             f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at "
             f"{self.of} = {value:g}; a limit must lie between {low:g} and {high:g}"
-            f"{self.saturation_clause(value)}{self.sign_clause(value)}",
+            f"{self.clauses(value)}",
             key="limit.of",
         )
 
-    def sign_clause(self, value: float) -> str:
-        """Return the clause of an error message on a weighted sum that the flare lowers at a value."""
+    def clauses(self, value: float) -> str:
+        """Return the clauses of an error message on saturation, and on a weighted sum that the flare lowers."""
         quiet, flare = self.scaled(value)
+        text = quiet.saturation_clause or flare.saturation_clause.replace(" saturate ", " saturate with the flare ")
         setting, statistic = self.case.setting(quiet, flare), STATISTICS[self.statistic]
         if not isinstance(statistic, LinearStatistic) or not setting.used.any() or flare.saturated[setting.used].all():
-            return ""
+            return text
         shape = flare if statistic.shaped else None
         falls = fall_between(*(statistic.closed_form(setting, x, shape) for x in (quiet, flare)))
-        if not falls:
-            return ""
-        return (
-            f"; WRONG SIGN: there {self.statistic} falls by {falls:.3g} standard deviations with the flare, and only "
-            "higher values are alarms"
-        )
-
-    def saturation_clause(self, value: float) -> str:
-        """Return the clause of an error message on saturation at a value, of the star or else of the flare."""
-        quiet, flare = self.scaled(value)
-        return quiet.saturation_clause or flare.saturation_clause.replace(" saturate ", " saturate with the flare ")
+        if falls:
+            text += (
+                f"; WRONG SIGN: there {self.statistic} falls by {falls:.3g} standard deviations with the flare, and "
+                "only higher values are alarms"
+            )
+        return text
 
     def slope(self, value: float) -> float:
         """Return the slope of the closed form's probit, per unit of `_coordinate`."""
@@ -214,40 +211,6 @@ class LimitSearch:
         values = (_value(self.of, at - width), _value(self.of, at + width))
         below, above = (special.ndtri(np.clip(self.theory(v), 1e-9, 1 - 1e-9)) for v in values)
         return float((above - below) / (2 * width))
-
-
-class MarginalLimitSearch(LimitSearch):
-    """Detection probability averaged over draws of unknown instrument values."""
-
-    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None, report: Report = None) -> None:
-        super().__init__(case, statistic, engine, report)
-        self.draws = drawn(case.study)
-        self.each = [LimitSearch(replace(case, study=study), statistic, engine) for study in self.draws.studies]
-
-    def theory(self, value: float) -> float:
-        """Return the mean over draws."""
-        return float(np.mean([draw.theory(value) for draw in self.each]))
-
-    def simulated(self, value: float, seed: int) -> Interval:
-        """Return the mean over draws, each with its own reference and threshold."""
-        return self._added(Point(value, average([draw.simulated(value, seed) for draw in self.each]), seed))
-
-    def unknown(self, near: float) -> Unknown:
-        """Return the closed-form limit of each draw, and the share of its variance that each unknown explains."""
-        roots = np.array([draw.root_or_nan(near) for draw in self.each])
-        return Unknown(self.draws, roots, shares(self.draws, roots))
-
-
-def single_flares(case: Case) -> list[Case]:
-    """Return a case for each flare of which a limit is computed: one if the limit is that of the amplitude."""
-    if case.study.limit.of == "amplitude":
-        return [case]
-    return [case.with_value("amplitude", amplitude) for amplitude in case.amplitudes]
-
-
-def _nearer(of: str, value: float) -> float:
-    """Return the next value towards easier detection."""
-    return value + STEPS[of] if of == "magnitude" else value * STEPS[of]
 
 
 def _coordinate(of: str, value: float) -> float:
@@ -280,7 +243,7 @@ def _settle(question: LimitSearch, start: float) -> Interval:
     if not slope > 0:
         raise InputError(
             f"the detection probability must rise towards an easier {of}, but does not at {start:g}"
-            f"{question.saturation_clause(start)}{question.sign_clause(start)}",
+            f"{question.clauses(start)}",
             key="limit.of",
         )
     at, n = _coordinate(of, start), question.case.study.run.realisations
@@ -296,7 +259,7 @@ def _settle(question: LimitSearch, start: float) -> Interval:
         at += float(np.clip(move, -0.75, 0.75))
     raise InputError(
         f"the limit of {of} must settle within {MOST_EVALUATIONS} simulations, but did not near {_value(of, at):g}"
-        f"{question.saturation_clause(_value(of, at))}",
+        f"{question.clauses(_value(of, at))}",
         key="limit.of",
     )
 

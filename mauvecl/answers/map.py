@@ -10,18 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf
-from mauvecl.answers.closed_forms import (
-    IDEAL,
-    average,
-    cost_lines,
-    describe_shares,
-    drawn,
-    ideal_chances,
-    marginal_lines,
-    shares,
-    unknown_cost,
-)
 from mauvecl.answers.limit_search import SEARCH, LimitSearch
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
@@ -45,7 +35,6 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.questions import MapQuestion
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")
@@ -70,7 +59,7 @@ def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
         quantity_column(x, lambda answer: np.array(answer.x)),
         quantity_column(y, lambda answer: np.array(answer.y)[:, None]),
         *COLUMNS,
-        *(() if answer.study.nuisances.none else (IDEAL,)),
+        *(() if answer.study.nuisances.none else (forms.IDEAL,)),
     )
 
 
@@ -123,7 +112,7 @@ class MapAnswer(Answer):
         """Map of each statistic, with a row per value of y and a column per value of x."""
         draws = f"{self.study.unknowns.draws} draws of what is unknown"
         lines = [
-            View(f"{statistic}, averaged over {draws}: its scatter is from {describe_shares(parts)}.")
+            View(f"{statistic}, averaged over {draws}: its scatter is from {forms.describe_shares(parts)}.")
             for statistic, parts in self.shares.items()
         ]
         axes = ", ".join(axis.quantity for axis in self.study.map.axes[::-1])
@@ -161,7 +150,7 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
         question = study.map.model_copy(update={"x": magnitudes_of(case)})
         study = study.model_copy(update={"map": question})
         case = replace(case, study=case.study.model_copy(update={"map": question}))
-    unknown = drawn(case.study) if study.unknowns.draws else None
+    unknown = forms.drawn(case.study) if study.unknowns.draws else None
     draws = [case] if unknown is None else [replace(case, study=draw) for draw in unknown.studies]
     x, y = study.map.axes
     cells = Cells(x.points(), y.points(), engine or Engine(), len(draws), progress)
@@ -171,7 +160,7 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
         values = _averaged(maps)
         for s, statistic in enumerate(study.run.statistics):
             means = [float(np.nanmean(drawn_map["probability"][s])) for drawn_map in maps]
-            parts[statistic] = shares(unknown, np.array(means))
+            parts[statistic] = forms.shares(unknown, np.array(means))
     quiet, star, names = cells.quiet[0], study.star[0], {x.quantity, y.quantity}
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
@@ -208,7 +197,13 @@ def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
             )
             messages.append(Message(text, "wrong sign"))
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
-    return [*messages, *marginal_lines(study.nuisances), *_cost(case, cells.x, cells.y)]
+    # What unknowns cost in the middle of the map.
+    middle = cells.x[len(cells.x) // 2], cells.y[len(cells.y) // 2]
+    there, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
+    at = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
+    name, comparison = f"the cell of {at}", study.run.comparison()
+    cost = forms.unknown_cost(name, there.quiet, there.flares[0], study.nuisances, comparison)
+    return [*messages, *forms.marginal_lines(study.nuisances), *forms.cost_lines([cost], study.nuisances)]
 
 
 def magnitudes_of(case: Case) -> Axis:
@@ -227,7 +222,12 @@ def magnitudes_of(case: Case) -> Axis:
             limit = LimitQuestion(of="magnitude", power=power)
             one = replace(case, study=case.study.model_copy(update={"limit": limit}))
             search = LimitSearch(one.with_value(question.y.quantity, value), statistic)
-            saturating.append(_saturating(search.scaled(MIDDLE)[0], MIDDLE))
+            quiet = search.scaled(MIDDLE)[0]
+            star = quiet.gain_dn_per_electron * quiet.source_electrons
+            room = quiet.ceiling_dn - (quiet.mean_raw_dn - star)
+            # Pixels that their dark current alone saturates have no room, whatever the magnitude.
+            brightest = np.max(star[room > 0] / room[room > 0], initial=0.0)
+            saturating.append(MIDDLE + (2.5 * float(np.log10(brightest)) if brightest > 0 else 0.0))
             try:
                 ends.append(search.root())
             except InputError:
@@ -241,24 +241,6 @@ def magnitudes_of(case: Case) -> Axis:
     high = max(high, low + 1)
     start, stop = (round(float(end * step), 2) for end in (low, high))
     return Axis(quantity="magnitude", start=start, stop=stop, steps=int(high - low) + 1)
-
-
-def _saturating(quiet: Expectation, magnitude: float) -> float:
-    """Return the magnitude at which a star's brightest pixel saturates, given its expectation at a magnitude."""
-    star = quiet.gain_dn_per_electron * quiet.source_electrons
-    room = quiet.ceiling_dn - (quiet.mean_raw_dn - star)
-    # Pixels that their dark current alone saturates have no room, whatever the magnitude.
-    free = room > 0
-    return magnitude + 2.5 * float(np.log10(np.max(star[free] / room[free]))) if free.any() else magnitude
-
-
-def _cost(case: Case, x: Values, y: Values) -> list[str]:
-    """Return the sentence on the cost of unknowns in the middle of the map."""
-    middle, study = (x[len(x) // 2], y[len(y) // 2]), case.study
-    there, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
-    at = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
-    cost = unknown_cost(f"the cell of {at}", there.quiet, there.flares[0], study.nuisances, study.run.comparison())
-    return cost_lines([cost], study.nuisances)
 
 
 def _shown(value: float | str) -> str:
@@ -305,7 +287,12 @@ class Cells:
                         raise
             return quiet, len(cells), of_kind(collect_messages(flares), SATURATED)
 
-        for quiet, count, texts in map_in_order(self.engine, filled, _groups(case.study.map, self.x, self.y)):
+        # Cells (i, j) in groups that share a quiescent star.
+        flare_x, flare_y = (axis.quantity in OF_FLARE for axis in case.study.map.axes)
+        groups = defaultdict[tuple[int, int], list[tuple[int, int]]](list)
+        for j, i in np.ndindex(len(self.y), len(self.x)):
+            groups[0 if flare_x else i, 0 if flare_y else j].append((i, j))
+        for quiet, count, texts in map_in_order(self.engine, filled, list(groups.values())):
             self.quiet.append(quiet)
             self.saturated.extend(texts)
             self.done += count
@@ -319,18 +306,10 @@ def _averaged(maps: list[Arrays]) -> Arrays:
     values = {name: np.mean([cells[name] for cells in maps], axis=0) for name in NUMBERS}
     values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
     for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
-        p = average([Interval(*(float(cells[name][at]) for name in ("probability", "low", "high"))) for cells in maps])
+        of_draws = [tuple(float(cells[name][at]) for name in ("probability", "low", "high")) for cells in maps]
+        p = forms.average([Interval(*ends) for ends in of_draws])
         values["low"][at], values["high"][at] = p.low, p.high
     return values
-
-
-def _groups(question: MapQuestion, x: Values, y: Values) -> list[list[tuple[int, int]]]:
-    """Return the cells (i, j) in groups that share a quiescent star."""
-    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in question.axes)
-    groups = defaultdict[tuple[int, int], list[tuple[int, int]]](list)
-    for j, i in np.ndindex(len(y), len(x)):
-        groups[0 if flare_x else i, 0 if flare_y else j].append((i, j))
-    return list(groups.values())
 
 
 def _cell(case: Case, x: float | str, y: float | str) -> Case:
@@ -345,7 +324,7 @@ def _fill(
     """Compute cells that share the quiescent star of a case, and return the weighted sums that their flares lower."""
     run, lowered = case.study.run, []
     result = engine.detect(case.quiet, flares, seed=run.seed, **case.detect_options())
-    ideal = ideal_chances(case, flares, [result.statistic(name) for name in run.statistics])
+    ideal = forms.ideal_chances(case, flares, [result.statistic(name) for name in run.statistics])
     for s, statistic in enumerate(run.statistics):
         probabilities = result.detection_probability(run.fap, statistic)
         for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):

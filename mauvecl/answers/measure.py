@@ -14,13 +14,8 @@ import scipy
 from astropy.table import QTable
 from numpy.typing import NDArray
 
+from mauvecl.answers import measurements
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported
-from mauvecl.answers.measurements import (
-    ExpectedMeasurement,
-    expected_measurements,
-    fit_model,
-    matched_filter,
-)
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson, clopper_pearson_ends
 from mauvecl.detection.nuisances import fitted_amplitudes, join_names
@@ -37,7 +32,6 @@ from mauvecl.study.questions import check_sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.measured_stares import MeasuredStare
     from mauvecl.detection.snr import Arrays
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.cases import Use
@@ -53,7 +47,7 @@ REJECTED = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredFlare(ExpectedMeasurement):
+class MeasuredFlare(measurements.ExpectedMeasurement):
     """Model fitted to simulated exposures of a flare."""
 
     found: Measurement  # fits to simulated exposures
@@ -91,6 +85,12 @@ class MeasuredFlare(ExpectedMeasurement):
         """Median of the estimates of detected flares less the truth, shape (n_derived,); NaN if none is detected."""
         estimates = self.found.estimates[self.selected]
         return (np.median(estimates, axis=0) if len(estimates) else np.nan) - self.truth
+
+    @property
+    def scatter(self) -> Float:
+        """Half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
+        low, high = np.quantile(self.found.estimates, [0.15865, 0.84135], axis=0)
+        return np.asarray((high - low) / 2 if len(self.found.estimates) > 1 else np.full_like(low, np.nan))
 
     @cached_property
     def rejected(self) -> Interval:
@@ -132,7 +132,7 @@ COLUMNS = (
     Column("median", lambda row: np.median(row.found.estimates, axis=0), "", "median of the estimates"),
     Column("bias", lambda row: np.median(row.found.estimates, axis=0) - row.truth, "",
            "median of the estimates less the truth", "bias", number(".4g"), detail=True),
-    Column("scatter", lambda row: _scatter(row.found.estimates), "", "half of the central 68.27 % of the estimates",
+    Column("scatter", "", "", "half of the central 68.27 % of the estimates",
            "scatter", number(".4g"), detail=True),
     *_coverage_columns(LEVELS[0], "", "of all"),
     *_coverage_columns(LEVELS[1], "", "of all", "in 95 %"),
@@ -189,7 +189,7 @@ JOINT_COLUMNS = (
 )  # fmt: skip
 
 
-def _bin_columns(stare: MeasuredStare) -> list[Column]:
+def _bin_columns(stare: measurements.MeasuredStare) -> list[Column]:
     """Return the columns of measurements along a stare."""
     assert stare.drawn is not None
     columns = [column.of(attrgetter("drawn")) for column in stare.drawn.columns]
@@ -209,7 +209,7 @@ class MeasureAnswer(Answer):
     flares: list[MeasuredFlare]  # all models of each flare of each star and cell of the sweep
     messages: list[str]
     # One stare per star and cell, if the study requests bins of a stare or a joint fit.
-    stares: list[MeasuredStare] = field(default_factory=list)
+    stares: list[measurements.MeasuredStare] = field(default_factory=list)
 
     #: Errors, bias and coverage; one row per star, cell, flare, model and quantity.
     table = TableOf("measure", _quantity_columns, "flares", place=True, key="rows")
@@ -231,7 +231,7 @@ class MeasureAnswer(Answer):
         return (*self.USES, "stare") if self.stares else self.USES
 
     @property
-    def binned(self) -> list[MeasuredStare]:
+    def binned(self) -> list[measurements.MeasuredStare]:
         """Stares in which some bin has the requested S/N."""
         return [stare for stare in self.stares if stare.drawn is not None]
 
@@ -281,12 +281,7 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
     asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
     measured = reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress)
     flares = list(chain.from_iterable(measured))
-    stares = []
-    if study.measure.along_stare:
-        # Single exposures do not need the modules of stares.
-        from mauvecl.answers.measured_stares import measured_stare
-
-        stares = [measured_stare(case, engine) for case in prepared]
+    stares = [measurements.measured_stare(case, engine) for case in prepared] if study.measure.along_stare else []
     messages = collect_messages(expectations)
     messages += [stare.unmeasured for stare in stares if stare.unmeasured]
     messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
@@ -296,17 +291,17 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
 def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine | Pool) -> list[MeasuredFlare]:
     """Fit all models to simulated exposures of a flare."""
     study, quiet = case.study, case.quiet
-    expected = expected_measurements(case, amplitude, flare)
+    expected = measurements.expected_measurements(case, amplitude, flare)
     models, unknown = [forecast.fitted for forecast in expected], expected[0].unknown
     skipped = study.measure.skipped_nm
-    weights = matched_filter(quiet, flare, case.unknowns(), None, skipped)[0]
+    weights = measurements.matched_filter(quiet, flare, case.unknowns(), None, skipped)[0]
 
     def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)
         excess = raw - quiet.recorded_dn
         arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
         for k, model in enumerate(models):
-            measurement = fit_model(raw, quiet, model, unknown, skipped)
+            measurement = measurements.fit_model(raw, quiet, model, unknown, skipped)
             arrays |= {f"{k} {key}": value for key, value in measurement.arrays().items()}
         return arrays
 
@@ -327,14 +322,6 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         found = Measurement.joined(batches)
         measured.append(MeasuredFlare(**vars(forecast), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
-
-
-def _scatter(estimates: Float) -> Float:
-    """Return half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
-    if len(estimates) < 2:
-        return np.full(estimates.shape[1], np.nan)
-    low, high = np.quantile(estimates, [0.15865, 0.84135], axis=0)
-    return np.asarray((high - low) / 2)
 
 
 def _not_marginalised(case: Case) -> list[str]:

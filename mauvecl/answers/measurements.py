@@ -1,4 +1,4 @@
-"""Measurements of flares that are expected or simulated, in single exposures."""
+"""Measurements of flares that are expected or simulated, in single exposures and along a stare."""
 
 from __future__ import annotations
 
@@ -13,30 +13,21 @@ from mauvecl.answers.answer import InCell
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, Reduction, usable_variance, variance_of
 from mauvecl.fits.profile import Profile
-from mauvecl.fits.spectrum import (
-    Forecast,
-    Measurement,
-    TwoTemperatures,
-    fit,
-    fit_two_temperatures,
-    forecast_model,
-)
+from mauvecl.fits.spectrum import Forecast, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
 from mauvecl.host.arrays import true_runs
+from mauvecl.host.stars import flare_spectra as spectra
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare_spectra import (
-    PARSEC_CM,
-    SUN_CM,
-    BalmerFlare,
-    Blackbody,
-    EmissionLine,
-    FlareWithLines,
-    TwoBlackbodies,
-)
+from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import fitted_models
 
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.device.engine import Engine
+    from mauvecl.fits.time_course import CoolingCourse, MeasuredBins
+    from mauvecl.flares.frames import Components, StareExpectation
+    from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
@@ -56,12 +47,12 @@ class Truth:
         added = added - light.flux_at_telescope(nm)
         # Ratio of the flux at the telescope to that of the flare's spectrum.
         self._scale = float(np.trapezoid(added, nm) / np.trapezoid(light.flux(nm), nm))
-        continuum = light.continuum if isinstance(light, FlareWithLines) else light
+        continuum = light.continuum if isinstance(light, spectra.FlareWithLines) else light
         self._values = dict.fromkeys(("temperature", "second temperature", "second area", "amplitude", "jump"), np.nan)
-        two, kelvin = continuum if isinstance(continuum, TwoBlackbodies) else None, continuum.temperature_k
+        two, kelvin = continuum if isinstance(continuum, spectra.TwoBlackbodies) else None, continuum.temperature_k
         if kelvin is not None:
             # Flux of the blackbodies without recombination.
-            body, at = continuum if two else Blackbody(kelvin), quiet.wavelength_nm
+            body, at = continuum if two else spectra.Blackbody(kelvin), quiet.wavelength_nm
             hot = self._scale * photons(at, body.flux(at), band)
             self._values |= {"temperature": kelvin, "amplitude": hot / photons(at, quiet.flux_flam, band)}
         if kelvin is not None and two is not None:
@@ -69,8 +60,8 @@ class Truth:
             (low, area), (high, hot_area) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
             self._values |= {"temperature": low, "second temperature": high, "second area": hot_area / area}
         if continuum.surface:
-            self._values["jump"] = continuum.jump if isinstance(continuum, BalmerFlare) else 1.0
-        self._far = np.nan if star.distance_pc is None else star.distance_pc * PARSEC_CM
+            self._values["jump"] = continuum.jump if isinstance(continuum, spectra.BalmerFlare) else 1.0
+        self._far = np.nan if star.distance_pc is None else star.distance_pc * spectra.PARSEC_CM
         self._area = np.pi * self._far**2 * self._scale if continuum.surface else np.nan
         self._area *= 1.0 if two is None else 1.0 + two.second_area
 
@@ -85,25 +76,25 @@ class Truth:
             return factor[first] * self._flux(rest)
         if first == "line":
             return self._line(rest)
-        radius = np.nan if self._star.radius_rsun is None else self._star.radius_rsun * SUN_CM
+        radius = np.nan if self._star.radius_rsun is None else self._star.radius_rsun * spectra.SUN_CM
         return self._area if name == "area" else float(self._area / (np.pi * radius**2))
 
     def _flux(self, where: str) -> float:
         if where == "bolometric":
-            lines = self._light.fluxes_cgs.values() if isinstance(self._light, FlareWithLines) else ()
+            lines = self._light.fluxes_cgs.values() if isinstance(self._light, spectra.FlareWithLines) else ()
             return self._scale * self._light.bolometric_flux() + sum(lines)
         low, high = (float(end) for end in where.removesuffix(" nm").split("-"))
         nm = self._light.grid(np.linspace(low, high, 4001))
         return 10.0 * float(np.trapezoid(self._scale * self._light.flux(nm) + self._light.flux_at_telescope(nm), nm))
 
     def _line(self, name: str) -> float:
-        if not isinstance(self._light, FlareWithLines):
+        if not isinstance(self._light, spectra.FlareWithLines):
             return 0.0 if self._light.surface else np.nan
         relative = self._scale * self._light.continuum_flux
         lines = [(line, relative * share) for line, share in self._light.fractions.items()]
         lines += self._light.fluxes_cgs.items()
-        wanted = EmissionLine.named(name).name
-        return next((flux for line, flux in lines if EmissionLine.named(line).name == wanted), 0.0)
+        wanted = spectra.EmissionLine.named(name).name
+        return next((flux for line, flux in lines if spectra.EmissionLine.named(line).name == wanted), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,15 +203,6 @@ def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
     return {name: TwoTemperatures(model) if name == "two-temperatures" else model for name, model in models.items()}
 
 
-def last_of_one_temperature(models: dict[str, FlareModel | TwoTemperatures]) -> tuple[str, FlareModel]:
-    """Return the name and the model of the last one with a single temperature, or that of a blackbody."""
-    single = [(name, model) for name, model in models.items() if isinstance(model, FlareModel)]
-    if single:
-        return single[-1]
-    (two,) = (model for model in models.values() if isinstance(model, TwoTemperatures))
-    return "blackbody", two.single
-
-
 def expected_measurements(
     case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel | TwoTemperatures] | None = None
 ) -> list[ExpectedMeasurement]:
@@ -277,3 +259,95 @@ def matched_filter(
         weights = weights - (rows @ delta) @ rows
     power = float(weights @ delta)
     return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Fit of shape and spectrum to all frames, with the drawn flare."""
+
+    found: Measurement
+    truth: Float  # shape (n_derived,)
+    true: CoolingCourse
+    fitted: CoolingCourse
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredStare(InCell):
+    """Flares of a simulated stare, measured in bins of frames with one model, and by a joint fit."""
+
+    model: str
+    staring: StareExpectation
+    events: tuple[Event, ...]
+    drawn: MeasuredBins | None
+    perfect: MeasuredBins | None  # the same bins without noise
+    joint: JointFit | None
+    unmeasured: str = ""  # why no bin reaches the S/N
+
+
+def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
+    """Draw the stare of a case, and measure its flares with the last model of a single temperature."""
+    # Single exposures do not need the modules of stares.
+    from mauvecl.device.stares import Stares
+    from mauvecl.fits.time_course import fit_bins, measure_along
+    from mauvecl.flares.stare_scene import StaresRequest
+
+    study, asked = case.study, case.study.measure
+    staring, events = case.stare_expectation, case.events
+    if asked.joint_fit and len(events) != 1:
+        raise InputError(
+            f"a joint fit needs a stare with a single flare, but it has {len(events)}", key="measure.joint_fit"
+        )
+    quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
+    models = models_of(case.one_frame)
+    single = [(name, one) for name, one in models.items() if isinstance(one, FlareModel)]
+    # Where only two temperatures are fitted, the model of one of them, with its lines.
+    single += [("blackbody", one.single) for one in models.values() if isinstance(one, TwoTemperatures) and not single]
+    name, model = single[-1]
+    unknown = case.unknowns_of_fits(quiet, stare)
+    processes = study.processes.additive_only
+
+    def draw(components: Components) -> Float:
+        request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
+                                processes=processes)  # fmt: skip
+        reduced = engine.stares if isinstance(engine, Pool) else Stares(engine.open_device).reduced
+        return np.asarray(reduced(request)["values"][0], np.float64)
+
+    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
+    depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
+    raw = kept(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
+    where = case.label, case.at, name, staring, tuple(events)
+    joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
+    if asked.snr_per_bin is None:
+        return MeasuredStare(*where, None, None, joint)
+    try:
+        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare,
+                             skipped_nm=asked.skipped_nm)  # fmt: skip
+    except InputError as error:
+        sentence = f"No flare of {case.label} is measured along the stare: {error}."
+        return MeasuredStare(*where, None, None, joint, sentence)
+    perfect = fit_bins(
+        staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count, skipped_nm=asked.skipped_nm
+    )
+    return MeasuredStare(*where, bins, perfect, joint)
+
+
+def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
+    """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
+    from mauvecl.fits.time_course import cooling_course, cooling_event, fit_cooling
+    from mauvecl.flares.settings import Cooling
+
+    staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
+    quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm
+    measurement = fit_cooling(
+        raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
+        cooling=isinstance(event.temperature, Cooling), stare=stare, skipped_nm=skipped,
+    )  # fmt: skip
+    true, fitted = (
+        cooling_course(flare_event, measurement, raw, quiet, model, stare, skipped)
+        for flare_event in (event, cooling_event(measurement, event.form))
+    )
+    truth = true.values
+    if not case.study.flare.is_blackbody:
+        # Only the shape is that of the model.
+        truth = np.where(np.arange(truth.size) < 2, truth, np.nan)
+    return JointFit(measurement, truth, true, fitted)

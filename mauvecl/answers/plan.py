@@ -11,20 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers import plan_targets as targets
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_columns
-from mauvecl.answers.plan_targets import (
-    NOTHING,
-    CompletenessOf,
-    OrbitConditions,
-    Planned,
-    TargetObservation,
-    closed_form,
-    errors_of_throughput,
-    inject_target,
-    observe,
-    rates_of,
-    star_of,
-)
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
@@ -98,10 +86,10 @@ STAR_COLUMNS = (
     Column("dec", "observation.target.dec_deg", "deg", "declination"),
     Column("position", "observation.target.source", "", "who says so"),
     Column("spectral_type", lambda row: row.observation.target.spectral_type or ""),
-    Column("spectrum", lambda row: row.observation.star.library or "", "",
+    Column("spectrum", lambda row: row.observation.case.star.library or "", "",
            "embedded spectrum that stands for the star"),
-    Column("V", lambda row: row.observation.star.magnitude or 0.0, "mag"),
-    Column("distance", lambda row: row.observation.star.distance_pc or 0.0, "pc"),
+    Column("V", lambda row: row.observation.case.star.magnitude or 0.0, "mag"),
+    Column("distance", lambda row: row.observation.case.star.distance_pc or 0.0, "pc"),
     Column("sky", lambda row: np.nan if row.observation.sky is None else row.observation.sky, "mag / arcsec2",
            "zodiacal light behind it, median over the days on which it is seen"),
     Column("signal_per_frame", "observation.signal_per_frame", "", "S/N of one frame with a flare of amplitude 1"),
@@ -109,7 +97,7 @@ STAR_COLUMNS = (
            "bolometric energy of a second of equivalent duration"),
     Column("temperature", lambda row: row.observation.quiet.conditions["temperature_c"], "deg_C",
            "of the detector, mean while it is seen"),
-    Column("hits", "observation.hits_per_cm2_s", "1 / (s cm2)",
+    Column("hits", "observation.case.study.processes.particles_per_cm2_s", "1 / (s cm2)",
            "of cosmic rays and trapped protons, mean while it is seen"),
     Column("window", lambda row: row.observation.window_s / 60, "min", "median stretch in which it is seen"),
     Column("saturated", lambda row: int(row.observation.quiet.saturated.sum()), "",
@@ -146,7 +134,7 @@ class PlanAnswer(Answer):
 
     study: Study
     seen: VisibleAnswer
-    planned: tuple[Planned, ...]
+    planned: tuple[targets.Planned, ...]
 
     #: One row per target.
     table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=lambda answer: {
@@ -288,8 +276,11 @@ class PlanAnswer(Answer):
             )
         for why in (target.no_rates for target in planned if target.no_rates):
             lines.append(f"{why[0].upper()}{why[1:]}; its expected flares are not given.")
-        beyond = [f"{target.name} ({target.energy_at(0.5):.2g} erg, {target.published})" for target in planned
-                  if target.completeness is not None and target.extrapolated]  # fmt: skip
+        beyond = []
+        for target in planned:
+            if target.completeness is not None and target.rates is not None:
+                e50, (low, high) = target.energy_at(0.5), target.rates.measured_erg
+                beyond += [] if low <= e50 <= high else [f"{target.name} ({e50:.2g} erg, {target.published})"]
         return [*lines, *([f"Flare rates are extrapolated to E50 of {', '.join(beyond)}."] if beyond else [])]
 
 
@@ -299,7 +290,7 @@ def plan(
     engine: Stares | Pool | None = None,
     progress: Progress = None,
     *,
-    completeness: CompletenessOf | None = None,
+    completeness: targets.CompletenessOf | None = None,
 ) -> PlanAnswer:
     """Plan a campaign on a study's targets: its ``plan`` defines them, its ``orbit`` time and position.
 
@@ -320,12 +311,12 @@ def plan(
     closed = completeness is None and study.plan.completeness == "closed form"
     _refuse(study, closed=closed)
     if completeness is None:
-        completeness = closed_form if closed else partial(inject_target, engine=engine or Stares())
+        completeness = targets.closed_form if closed else partial(targets.inject_target, engine=engine or Stares())
     stars: list[Star] = []
     errors: list[InputError] = []
     for text in study.plan.targets:
         try:
-            stars.append(star_of(text, study.orbit.simbad))
+            stars.append(targets.star_of(text, study.orbit.simbad))
         except InputError as error:
             errors.append(error)
     if errors:
@@ -334,9 +325,9 @@ def plan(
     if progress is not None:
         progress(0, len(stars))
     seen, base = visible(study), Case(study)
-    along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
+    along = targets.conditions_along(seen.visibility.track) if study.plan.along_orbit else None
     named = enumerate(zip(study.plan.targets, stars, strict=True))
-    observed = ((k, observe(base, text, star, seen, k, along)) for k, (text, star) in named)
+    observed = ((k, targets.observe(base, text, star, seen, k, along)) for k, (text, star) in named)
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned_for = partial(_planned, seen, completeness)
     planned = tuple(reported(map_in_order(engine, planned_for, observed), len(stars), progress))
@@ -356,35 +347,35 @@ def _refuse(study: Study, *, closed: bool) -> None:
         )
 
 
-def _planned(seen: VisibleAnswer, completeness: CompletenessOf, item: tuple[int, TargetObservation]) -> Planned:
+def _planned(
+    seen: VisibleAnswer, completeness: targets.CompletenessOf, item: tuple[int, targets.TargetObservation]
+) -> targets.Planned:
     """Return the plan of a target, given its number and observation."""
     study, (k, target), its = seen.study, item, None
     if target.window_s > 0:
-        its = completeness(target) if target.signal_per_frame > 0 else NOTHING
+        its = completeness(target) if target.signal_per_frame > 0 else targets.NOTHING
     exposed, (names, hours) = float(seen.visibility.hours[k]), seen.by_month
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
     # The months in which it is seen for the most hours, in order.
     most = sorted(np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months])
     best = tuple(names[i] for i in most if hours[i, k] > 0)
-    rates, why = rates_of(study.plan.targets[k], target)
+    rates, why = targets.rates_of(study.plan.targets[k], target)
     recovered, ideal = None, float("nan")
     if rates is not None:
         recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
-        if study.nuisances.usual and its not in (None, NOTHING):
-            ideal = recovered_per_day(rates, closed_form(target, known=True)) * days
-    return Planned(target, exposed, observed, its, rates, recovered, best, why, errors_of_throughput(target, rates),
-                   ideal)  # fmt: skip
+        if study.nuisances.usual and its not in (None, targets.NOTHING):
+            ideal = recovered_per_day(rates, targets.closed_form(target, known=True)) * days
+    errors = targets.errors_of_throughput(target, rates)
+    return targets.Planned(target, exposed, observed, its, rates, recovered, best, why, errors, ideal)
 
 
-SUMMARY_TABLE = "plan.ecsv"
 #: Explanation of the columns.
 LEGEND = (
     "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
     "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
     "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
-    "P(>= 1): probability of recovering any. False alarms: expected of "
-    f"noise. Numbers are those of {SUMMARY_TABLE}."
+    "P(>= 1): probability of recovering any. False alarms: expected of noise. Numbers are those of plan.ecsv."
 )
 
 
@@ -394,13 +385,13 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
     record = records(answer.table)[k]
     columns = PlanAnswer.table.columns_of(answer)
     said = {column.name: column.text(record) for column in columns if column.heading}
-    place, seen = observation.target, answer.seen
+    place, star, seen = observation.target, observation.case.star, answer.seen
     lines = [
         ("right ascension, declination", f"{place.ra_deg:.4f}, {place.dec_deg:.4f} deg ({place.source})",
          "stars: ra, dec, position"),
-        ("type; spectrum that stands for it", f"{place.spectral_type}; {observation.star.library}",
+        ("type; spectrum that stands for it", f"{place.spectral_type}; {star.library}",
          "stars: spectral_type, spectrum"),
-        ("V; distance", f"{observation.star.magnitude:g}; {observation.star.distance_pc:g} pc", "stars: V, distance"),
+        ("V; distance", f"{star.magnitude:g}; {star.distance_pc:g} pc", "stars: V, distance"),
         ("seen; observed", f"{said['seen']} h; {said['hours']} h", "plan: seen, hours"),
     ]  # fmt: skip
     if target.seen_h == 0:
@@ -411,7 +402,7 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
         ("best months", said["best_months"], "plan: best_months; months"),
         ("angle from the Sun", f"{away.min():.0f} to {away.max():.0f} deg", "days: elongation"),
         ("detector; hits by particles", f"{observation.quiet.conditions['temperature_c']:.1f} deg C; "
-         f"{observation.hits_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
+         f"{observation.case.study.processes.particles_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
         ("S/N of a frame at amplitude 1", f"{observation.signal_per_frame:.4g}", "stars: signal_per_frame"),
         ("half of flares recovered from", energy(target.energy_at(0.5), " erg"), "plan: E50; energies: recovered"),
         ("90 % of flares recovered from", energy(target.energy_at(0.9), " erg"), "plan: E90; energies: recovered"),

@@ -42,6 +42,12 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 
+def conditions_along(track: Track) -> tuple[Float, Float]:
+    """Return the detector's temperature (deg C) and particle hits (cm-2 s-1) along an orbit, by the assumed models."""
+    light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
+    return Thermal().temperature_c(light, track.times.step_s), Particles().rate_per_cm2_s(track)
+
+
 @dataclass(frozen=True, eq=False)
 class Conditions:
     """Conditions of one target."""
@@ -51,33 +57,20 @@ class Conditions:
     swing: tuple[tuple[float, float], ...]
     hits_per_cm2_s: float  # mean of cosmic rays and trapped protons while the target is visible
 
-
-@dataclass(frozen=True, eq=False)
-class OrbitConditions:
-    """Conditions at every time step of a plan."""
-
-    temperature_c: Float  # shape (n_time,)
-    hits_per_cm2_s: Float  # shape (n_time,)
-
     @classmethod
-    def along(cls, track: Track) -> OrbitConditions:
-        """Compute the conditions along an orbit with the assumed models."""
-        light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
-        return cls(Thermal().temperature_c(light, track.times.step_s), Particles().rate_per_cm2_s(track))
-
-    def of(self, visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
-        """Return the conditions of target `k`, or None if it is never visible."""
-        seen, windows = visibility.seen[:, k], visibility.windows(k)
+    def of(cls, along: tuple[Float, Float], visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
+        """Return the conditions of target `k`, or None if it is never visible; `along` as from `conditions_along`."""
+        seen, windows, (temperature_c, hits) = visibility.seen[:, k], visibility.windows(k), along
         if not seen.any():
             return None
-        mean = float(self.temperature_c[seen].mean())
+        mean = float(temperature_c[seen].mean())
         step = visibility.track.times.step_s
         # The first window if several have the median length.
         typical = int(np.argmin(np.abs(windows.length_s - np.median(windows.length_s))))
         first = round(float(windows.start_s[typical]) / step)
-        orbit = self.temperature_c[first : first + int(np.ceil(orbit_s / step))] - mean
+        orbit = temperature_c[first : first + int(np.ceil(orbit_s / step))] - mean
         swing = tuple((float((n + 0.5) * step), float(value)) for n, value in enumerate(orbit))
-        return Conditions(mean, swing, float(self.hits_per_cm2_s[seen].mean()))
+        return cls(mean, swing, float(hits[seen].mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,19 +84,9 @@ class TargetObservation:
     conditions: Conditions | None = None  # along the orbit; None for the study's
 
     @property
-    def star(self) -> Star:
-        """Library star that represents the target."""
-        return self.case.star
-
-    @property
     def quiet(self) -> Expectation:
         """Expectation of one frame."""
         return self.case.quiet
-
-    @property
-    def hits_per_cm2_s(self) -> float:
-        """Rate of particle hits."""
-        return float(self.case.study.processes.particles_per_cm2_s)
 
     @cached_property
     def signal_per_frame(self) -> float:
@@ -163,14 +146,6 @@ class Planned:
     def published(self) -> str:
         """Energies at which the rates were measured, for sentences; empty if rates are unknown."""
         return "" if self.rates is None else "published for {:.2g} to {:.2g} erg".format(*self.rates.measured_erg)
-
-    @property
-    def extrapolated(self) -> bool:
-        """Whether flares of E50 lie outside the energies at which the rates were measured."""
-        if self.rates is None:
-            return False
-        low, high = self.rates.measured_erg
-        return not low <= self.energy_at(0.5) <= high
 
 
 def closed_form(observation: TargetObservation, *, known: bool = False) -> Completeness:
@@ -250,13 +225,15 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
 
 
 def observe(
-    case: Case, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: OrbitConditions | None = None
+    case: Case, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: tuple[Float, Float] | None = None
 ) -> TargetObservation:
     """Return the observation of target `k`, with the sky behind it and the conditions along the orbit."""
     target, study = seen.targets[k], case.study
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
-    conditions = None if along is None else along.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
+    conditions = None
+    if along is not None:
+        conditions = Conditions.of(along, seen.visibility, k, study.orbit.orbit().elements.period_s)
     lengths, zodiacal = seen.windows[k].length_s, seen.zodiacal[k]
     sky: float | None = None
     window = float(np.median(lengths)) if lengths.size else 0.0
@@ -286,7 +263,20 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
 
     Each orbit of the stare has one window of the target's median length. The checkpoint of a pool keeps the result.
     """
-    study, question = observation.case.study, injection_case(observation).study
+    study, conditions = observation.case.study, observation.conditions
+    orbit_s = study.orbit.orbit().elements.period_s
+    gap = max(orbit_s - observation.window_s, 0.0)
+    changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (),
+                               "along_orbit": False}  # fmt: skip
+    if conditions is not None and study.stare.thermal is None:
+        swing = [(t, value) for t, value in conditions.swing if t < orbit_s]
+        changes["thermal"] = Curve(points=tuple((n * orbit_s + t, value) for n in range(ORBITS) for t, value in swing))
+    injections = InjectionQuestion(
+        of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
+        count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
+    )  # fmt: skip
+    stare, search = study.stare.model_copy(update=changes), study.search.model_copy(update={"nulls": 0})
+    question = observation.case.with_sections(stare=stare, search=search, injections=injections).study
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
 
     def computed() -> Arrays:
@@ -304,24 +294,6 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
         + (", allowing for unknowns that the search leaves in" if arrays["shifted"] else "")
     )
     return Completeness(energy, arrays["probability"], BOLOMETRIC, how)
-
-
-def injection_case(observation: TargetObservation) -> Case:
-    """Return the case for `inject`, with the target's windows and conditions."""
-    study, conditions = observation.case.study, observation.conditions
-    orbit_s = study.orbit.orbit().elements.period_s
-    gap = max(orbit_s - observation.window_s, 0.0)
-    changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (),
-                               "along_orbit": False}  # fmt: skip
-    if conditions is not None and study.stare.thermal is None:
-        swing = [(t, value) for t, value in conditions.swing if t < orbit_s]
-        changes["thermal"] = Curve(points=tuple((n * orbit_s + t, value) for n in range(ORBITS) for t, value in swing))
-    injections = InjectionQuestion(
-        of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
-        count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
-    )  # fmt: skip
-    stare, search = study.stare.model_copy(update=changes), study.search.model_copy(update={"nulls": 0})
-    return observation.case.with_sections(stare=stare, search=search, injections=injections)
 
 
 def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, product
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,10 +75,9 @@ def light_curve_file(star: StarStare, sky: SkyLight, *, seed: int, number: int) 
         primary.header.update({"RADESYS": "ICRS", **position})
     start, stop = star.staring.stare.gtis.T / DAY_S
     gti = [fits.Column("START", "D", "d", array=start), fits.Column("STOP", "D", "d", array=stop)]
-    tables = [_table(star), fits.BinTableHDU.from_columns(gti, name="GTI")]
-    for table in tables:
+    hdus = [primary, _table(star), fits.BinTableHDU.from_columns(gti, name="GTI")]
+    for table in hdus[1:]:
         table.header.update(times)
-    hdus = [primary, *tables]
     for name, values in (("SPECTRUM", star.light.spectrum), ("SPECTRUM_ERR", star.light.spectrum_sd)):
         hdus.append(fits.ImageHDU(np.asarray(values, np.float32), name=name))
         hdus[-1].header["BUNIT"] = ("adu/s", "of a resolution element; rows are frames")
@@ -155,34 +155,18 @@ class FoundFlare(InCell):
 
 
 @dataclass(frozen=True, eq=False)
-class SearchResult:
-    """Result of the search of a stare."""
-
-    threshold: float  # from importance sampling of normal noise
-    flares: list[FoundFlare]  # in descending order of the statistic
-    shifted: bool  # whether the threshold is raised for trends that the search does not remove
-
-
-@dataclass(frozen=True, eq=False)
 class StarStare(InCell):
-    """A stare at one star in one cell of the sweep; `search` is a message if no search is possible."""
+    """A stare at one star in one cell of the sweep."""
 
     staring: StareExpectation
     flares: tuple[StareFlare, ...]
     light: LightCurves
-    search: SearchResult | str | None = None
     # Share of all light that each frame lost in pointing drifts, shape (n_frame,); None unless drifts are drawn.
-    pointing_loss: Float | None = None
-
-    @property
-    def found(self) -> list[FoundFlare]:
-        """Flares that the search found."""
-        return self.search.flares if isinstance(self.search, SearchResult) else []
-
-    @property
-    def saturated_frames(self) -> int:
-        """Number of frames in which a used pixel saturates."""
-        return int(np.count_nonzero(self.staring.quality))
+    pointing_loss: Float | None
+    unsearched: str = ""  # message if no search is possible
+    threshold: float = float("nan")  # of the search, from importance sampling of normal noise; NaN if there is none
+    shifted: bool = False  # whether it is raised for trends that the search does not remove
+    found: Sequence[FoundFlare] = ()  # in descending order of the statistic
 
     @property
     def drifting_frames(self) -> int:
@@ -211,13 +195,12 @@ COLUMNS = (
 )  # fmt: skip
 #: Additional columns if stares are searched.
 SEARCHED_COLUMNS = (
-    Column("threshold", lambda row: row.search.threshold if isinstance(row.search, SearchResult) else np.nan, "",
-           "value of the search's statistic from which on it alarms"),
-    Column("found", lambda row: len(row.found) if isinstance(row.search, SearchResult) else -1, "",
+    Column("threshold", "", "", "value of the search's statistic from which on it alarms"),
+    Column("found", lambda row: -1 if np.isnan(row.threshold) else len(row.found), "",
            "flares found; -1: not searched"),
 )  # fmt: skip
-SATURATED_COLUMN = Column("saturated_frames", "", "", "frames in which the mean of a used pixel reaches saturation",
-                          "saturated")  # fmt: skip
+SATURATED_COLUMN = Column("saturated_frames", lambda row: np.count_nonzero(row.staring.quality), "",
+                          "frames in which the mean of a used pixel reaches saturation", "saturated")  # fmt: skip
 POINTING_COLUMN = Column("drifting_frames", "", "", "frames that lost light in pointing drifts, which are assumptions",
                          "drifting")  # fmt: skip
 #: Columns of the table of flares, for `StareFlare`.
@@ -299,12 +282,6 @@ def band_suffix(name: str, number: int) -> str:
     return "" if number == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
 
 
-def _light_column(kind: str, band: str, number: int) -> Column:
-    attribute, text = LIGHT[kind]
-    name = kind + band_suffix(band, number)
-    return Column(name, lambda star: getattr(star.light, attribute)[:, number], "DN / s", f"{band}: {text}")
-
-
 #: Metadata of the tables.
 SEED = ("study", "study.run.seed")
 
@@ -348,7 +325,7 @@ class StareAnswer(Answer):
         frames, flares = stare.staring.stare.n_frames, len(stare.flares)
         least = first_of(len(self.stares), "stares")
         drawn = f"flare{'' if flares == 1 else 's'} in {frames} frames of {stare.title}"
-        if not isinstance(stare.search, SearchResult):
+        if np.isnan(stare.threshold):
             return f"The stare has {flares} {drawn}, which are not searched for{least}."
         found = len({flare.event for flare in stare.found if flare.event})
         false = sum(not flare.event for flare in stare.found)
@@ -359,8 +336,8 @@ class StareAnswer(Answer):
     def views(self) -> list[View]:
         views = super().views
         for stare in self.stares:
-            if isinstance(stare.search, SearchResult):
-                above = f"{stare.search.threshold:.2f}, {self.study.search.rate_text}"
+            if not np.isnan(stare.threshold):
+                above = f"{stare.threshold:.2f}, {self.study.search.rate_text}"
                 table = table_of(FOUND_COLUMNS, stare.found)
                 views.append(View(f"Found at {stare.title} above an S/N of {above}", FOUND_COLUMNS, table))
         return views
@@ -369,7 +346,9 @@ class StareAnswer(Answer):
         """Return the frames of a star in a cell: time, cadence number, quality, and light in every band."""
         star = self.stares[number]
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
-        columns += [_light_column(kind, band, k) for k, band in enumerate(star.light.bands) for kind in LIGHT]
+        for (k, band), (kind, (attribute, text)) in product(enumerate(star.light.bands), LIGHT.items()):
+            column = Column(kind + band_suffix(band, k), itemgetter(k), "DN / s", f"{band}: {text}")
+            columns.append(column.of(attrgetter(f"light.{attribute}.T")))
         return table_of(columns, [star], star=star.label, **metadata_of(self, *SEED), **star.at)
 
     @property
@@ -401,11 +380,7 @@ class StareAnswer(Answer):
 
 @by_keywords("stares")
 def stare(
-    study: Study,
-    engine: Stares | None = None,
-    progress: Progress = None,
-    *,
-    checkpoint: Checkpoint | None = None,
+    study: Study, engine: Stares | None = None, progress: Progress = None, *, checkpoint: Checkpoint | None = None
 ) -> StareAnswer:
     """Simulate one stare for every star and sweep value of a study; `run.seed` and `stare.number` select it.
 
@@ -431,9 +406,8 @@ def stare(
     messages += dict.fromkeys(
         line for case in prepared for line in unused_lines(case.study.observation.exposure_s, case.stare, case.events)
     )
-    messages += [star.search for star in drawn if isinstance(star.search, str)]
-    searched = [(star.title, star.search) for star in drawn if isinstance(star.search, SearchResult)]
-    messages += [threshold_line(title, search.threshold) for title, search in searched if search.shifted]
+    messages += [star.unsearched for star in drawn if star.unsearched]
+    messages += [threshold_line(star.title, star.threshold) for star in drawn if star.shifted]
     for star in drawn:
         lost, drifts = star.pointing_loss, star.staring.stare.pointing
         if lost is not None and drifts is not None:
@@ -443,8 +417,9 @@ def stare(
                 f"average, with up to {100 * drifts.depth:g} % of the light lost. The search marginalises over the "
                 "level of each frame."
             )
-        if star.saturated_frames:
-            text = f"SATURATED: {star.saturated_frames} frames of the stare at {star.title}; their quality is 1."
+        saturated = np.count_nonzero(star.staring.quality)
+        if saturated:
+            text = f"SATURATED: {saturated} frames of the stare at {star.title}; their quality is 1."
             messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)
 
@@ -456,21 +431,19 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
 
     def draw(components: Any) -> Any:
         what = components, staring.stare, staring.flare
-
-        def computed() -> Arrays:
-            return {"frames": stares.frames(*what, first=q.number, count=1, seed=seed, processes=processes)[0]}
-
-        return kept(checkpoint, ("frames", *what, q.number, seed, processes), computed)["frames"]
+        frames = partial(stares.frames, *what, first=q.number, count=1, seed=seed, processes=processes)
+        depends_on = ("frames", *what, q.number, seed, processes)
+        return kept(checkpoint, depends_on, lambda: {"frames": frames()[0]})["frames"]
 
     light = draw_light_curves(staring, q.bands_nm, draw)
-    searched = _search(case, draw, checkpoint) if q.search else None
+    searched = _search(case, draw, checkpoint) if q.search else {}
     drifting, numbers = staring.stare.pointing is not None, np.array([q.number], np.uint64)
     lost = staring.stare.pointing_losses(numbers, seed)[0] if drifting else None
-    return StarStare(case.label, case.at, staring, _flares(case), light, searched, lost)
+    return StarStare(case.label, case.at, staring, _flares(case), light, lost, **searched)
 
 
-def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResult | str:
-    """Search the stare of a case for flares, or return a message if no search is possible."""
+def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, Any]:
+    """Search the stare of a case for flares, and return what it gives by the fields of `StarStare`."""
     study, staring = case.study, case.stare_expectation
     try:
         survey = survey_star(case)
@@ -482,11 +455,12 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
 
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
     except InputError as error:
-        return Message(f"{case.label} is not searched: {error}.", "not searched")
+        return {"unsearched": Message(f"{case.label} is not searched: {error}.", "not searched")}
     threshold = float(tail["threshold"])
     scale = _log_energy(case, survey.templates.temperatures_k)
     raised = alarms(survey, draw(survey.components), threshold, scale)
-    return SearchResult(threshold, [_found_flare(case, alarm) for alarm in raised], bool(tail["shifted"]))
+    found = [_found_flare(case, alarm) for alarm in raised]
+    return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": found}
 
 
 def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:

@@ -56,10 +56,7 @@ FLARE_LIGHT = tuple(
 )
 ALARMS = ("search.false_alarms", "search.per")
 #: Those of verbs that look from the orbit; targets are given in another way.
-ORBIT = (
-    *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
-    "orbit.limits",
-)
+ORBIT = (*(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")), "orbit.limits")
 TARGETS = ("orbit.targets", "plan.targets")
 #: Flags that `--help` shows of every verb that has them; `--help-all` shows all.
 COMMON = ("star", "magnitude", "exposure", "amplitude", "paper", "output")
@@ -407,11 +404,7 @@ class Question(Protocol[Answered]):
     """Function of a verb, which takes a study or the keywords of one."""
 
     def __call__(
-        self,
-        study: Study | None = None,
-        engine: Any = None,
-        progress: Progress = None,
-        **keywords: Any,
+        self, study: Study | None = None, engine: Any = None, progress: Progress = None, **keywords: Any
     ) -> Answered: ...
 
 
@@ -447,7 +440,14 @@ def by_keywords(parts: str) -> Callable[[Callable[..., Answered]], Question[Answ
         def ask(study: Any = None, *arguments: Any, **keywords: Any) -> Any:
             own = {key: keywords.pop(key) for key in tuple(keywords) if key in checks}
             if study is None or keywords:
-                study = _study_of(VERBS[function.__name__], study and checks["study"](study), keywords)
+                from mauvecl.study.keywords import values_of
+                from mauvecl.study.study import keys_of
+
+                verb, where = VERBS[function.__name__], f"{function.__name__}()"
+                known, given = {entry.name: entry for entry in keys_of(verb.keys)}, study and checks["study"](study)
+                study, messages = verb.study_of(values_of(keywords, known, where), known, given, where)
+                for message in messages:
+                    warnings.warn(message, stacklevel=2)
             return checked(study, *arguments, **own)
 
         study, *others = inspect.signature(function).parameters.values()
@@ -457,15 +457,3 @@ def by_keywords(parts: str) -> Callable[[Callable[..., Answered]], Question[Answ
         return ask
 
     return decorate
-
-
-def _study_of(verb: Verb, study: Study | None, given: Mapping[str, Any]) -> Study:
-    """Return the study that keywords of Python ask for."""
-    from mauvecl.study.keywords import values_of
-    from mauvecl.study.study import keys_of
-
-    keywords, where = {entry.name: entry for entry in keys_of(verb.keys)}, f"{verb.name}()"
-    asked, messages = verb.study_of(values_of(given, keywords, where), keywords, study, where)
-    for message in messages:
-        warnings.warn(message, stacklevel=3)
-    return asked

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,20 +30,13 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
 
 
-class Entry(NamedTuple):
-    """Appointment in a calendar."""
-
-    #: UTC, ISO 8601 to the second; dates without time make an entry of whole days, including the last.
-    start: str
-    stop: str
-    title: str
-    text: str
+#: Appointment: start and stop in UTC, ISO 8601 to the second, or dates of whole days, including the last; title; text.
+Entry = tuple[str, str, str, str]
 
 
-def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
+def calendar_bytes(entries: Iterable[Entry]) -> bytes:
     """Return a calendar as the bytes of an .ics file."""
-    lines = ["BEGIN:VCALENDAR", "VERSION:2.0", f"PRODID:-//mauvecl//mauvecl {VERSION}//EN"]
-    lines.append(f"X-WR-CALNAME:{_text(name)}")
+    lines = ["BEGIN:VCALENDAR", "VERSION:2.0", f"PRODID:-//mauvecl//mauvecl {VERSION}//EN", "X-WR-CALNAME:Mauve"]
     for start, stop, title, text in entries:
         unique = hashlib.sha256("\0".join((start, stop, title)).encode()).hexdigest()[:24]
         # An event of whole days ends at the beginning of the next day.
@@ -268,7 +261,7 @@ class VisibleAnswer(Answer):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Calendar of windows or, if these are not known, of the days on which a target is visible."""
-        return {"visible.ics": partial(calendar_bytes, self.entries(), "Mauve")}
+        return {"visible.ics": partial(calendar_bytes, self.entries())}
 
     def entries(self) -> list[Entry]:
         """Return the appointments of the calendar."""
@@ -278,10 +271,10 @@ class VisibleAnswer(Answer):
             windows, hours = self.windows[k], self.visibility.by_day(k)
             for a, b in zip(windows.start_s, windows.stop_s, strict=True) if single else ():
                 length = f"{(b - a) / 60:.0f} min of exposure"
-                entries.append(Entry(times.iso(float(a)), times.iso(float(b)), target.name, length))
+                entries.append((times.iso(float(a)), times.iso(float(b)), target.name, length))
             for first, last in true_runs(hours >= SEEN_H) if not single else ():
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
-                entries.append(Entry(self.days[first], self.days[last - 1], target.name, mean))
+                entries.append((self.days[first], self.days[last - 1], target.name, mean))
         return entries
 
     @property

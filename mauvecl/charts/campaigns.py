@@ -6,16 +6,17 @@ import base64
 import calendar as months_of_years
 import io
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, document_of, pictures_of
+from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, pictures_of, register
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import without_empty
@@ -100,9 +101,11 @@ def overview(answer: PlanAnswer) -> Picture:
             # A logarithmic axis cannot show zero.
             yields = target.recovered
             low, high, expected = np.maximum([yields.low, yields.high, yields.expected], 0.05)
-            left += [_bar("star", (low, high), k), Dots("", "star", size=7, at=([expected], [k]))]
+            bar = Line("", "star", width=3.3, alpha=0.5, at=((low, high), [k, k]))
+            left += [bar, Dots("", "star", size=7, at=([expected], [k]))]
         if np.isfinite(ends[k][0]):
-            right += [_bar("flare", ends[k], k), Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
+            bar = Line("", "flare", width=3.3, alpha=0.5, at=(ends[k], [k, k]))
+            right += [bar, Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
     # Limits at whole decades avoid labels that overlap.
     logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
@@ -117,10 +120,6 @@ def overview(answer: PlanAnswer) -> Picture:
 
 # Reports draw it in figures of their own.
 picture_of("PlanAnswer", "plan")(overview)
-
-
-def _bar(colour: str, ends: tuple[float, float], k: int) -> Line:
-    return Line("", colour, width=3.3, alpha=0.5, at=(ends, [k, k]))
 
 
 @picture_of("PlanAnswer", "visible")
@@ -200,6 +199,8 @@ class Sheets:
 
     def add(self, part: Part) -> None:
         """Write a part of a report."""
+        from matplotlib.lines import Line2D
+
         if part.new_page:
             self.left_in = 0.0
         if part.heading:
@@ -208,25 +209,25 @@ class Sheets:
         for text in part.lines:
             self.line([(0.0, text)], 8)
             self.take(0.05)
-        if part.names:
-            places = part.places or [k / len(part.names) for k in range(len(part.names))]
-            head = [part.names] if any(part.names) else []
-            size = SMALL if len(part.names) >= MANY and not part.places else NORMAL
-            self.rows([*head, *part.rows], places, size, head=bool(head))
+        places = part.places or [k / len(part.names) for k in range(len(part.names))]
+        head = [part.names] if any(part.names) else []
+        size = SMALL if len(part.names) >= MANY and not part.places else NORMAL
+        for number, row in enumerate([*head, *part.rows]):
+            weight = "bold" if head and not number else "normal"
+            self.line([(place, str(cell)) for place, cell in zip(places, row, strict=True)], size, weight=weight)
+            y, ends = self.take(0.06) / PAGE[1], (MARGIN / PAGE[0], 1 - MARGIN / PAGE[0])
+            self.pages[-1].add_artist(Line2D(ends, (y, y), color=NULL, linewidth=0.5))
         if part.note:
             self.line([(0.0, part.note)], NORMAL, color=NULL)
         if part.picture is not None and part.height_in:
-            self.picture(part.picture, part.height_in)
+            # Of the width of the text.
+            top, margin = self.take(part.height_in) / PAGE[1], MARGIN / PAGE[0]
+            heights = [1 - top, part.height_in / PAGE[1], top - part.height_in / PAGE[1]]
+            widths = [margin, 1 - 2 * margin, margin]
+            part.picture(self.pages[-1].subfigures(3, 3, height_ratios=heights, width_ratios=widths)[1, 1])
         elif part.picture is not None:
             self.pages.append(part.picture(None))
             self.left_in = 0.0
-
-    def picture(self, draw: Callable[[Any], Any], height_in: float) -> None:
-        """Draw a picture of the width of the text."""
-        top, margin = self.take(height_in) / PAGE[1], MARGIN / PAGE[0]
-        heights = [1 - top, height_in / PAGE[1], top - height_in / PAGE[1]]
-        widths = [margin, 1 - 2 * margin, margin]
-        draw(self.pages[-1].subfigures(3, 3, height_ratios=heights, width_ratios=widths)[1, 1])
 
     def line(self, cells: Sequence[tuple[float, str]], size: float, **how: Any) -> None:
         """Write cells at fractions of the text width, each wrapped before the start of the next."""
@@ -242,16 +243,6 @@ class Sheets:
             self.pages[-1].text(x / PAGE[0], y / PAGE[1], "\n".join(lines), fontsize=size, va="top", linespacing=LINE,
                                 parse_math=False, **how)  # fmt: skip
 
-    def rows(self, rows: Iterable[Sequence[object]], places: Sequence[float], size: float, *, head: bool) -> None:
-        """Write the rows of a table with a line below each, the first in bold if it has the headings."""
-        from matplotlib.lines import Line2D
-
-        for number, row in enumerate(rows):
-            weight = "bold" if head and not number else "normal"
-            self.line([(place, str(cell)) for place, cell in zip(places, row, strict=True)], size, weight=weight)
-            y, ends = self.take(0.06) / PAGE[1], (MARGIN / PAGE[0], 1 - MARGIN / PAGE[0])
-            self.pages[-1].add_artist(Line2D(ends, (y, y), color=NULL, linewidth=0.5))
-
     def take(self, height_in: float) -> float:
         """Reserve a height, on a new page if necessary, and return its top in inches from the bottom."""
         if not self.pages or self.left_in < height_in:
@@ -262,8 +253,8 @@ class Sheets:
         return top
 
 
-def plan_parts(answer: PlanAnswer) -> list[Part]:
-    """Return the report of a plan: summary, messages, a part for each target, and all assumptions."""
+def plan_report(answer: PlanAnswer) -> tuple[str, list[Part]]:
+    """Return title and parts of a plan's report: summary, messages, a part for each target, and all assumptions."""
     from mauvecl.answers.plan import LEGEND, target_lines
 
     height = 0.2 * len(answer.planned) + 1.3
@@ -290,19 +281,7 @@ def plan_parts(answer: PlanAnswer) -> list[Part]:
     assumed = answer.assumptions
     note = "Rows of assumptions.ecsv."
     parts.append(Part("What is assumed", [note], assumed.colnames, list(assumed), ASSUMED_AT, new_page=True))
-    return parts
-
-
-@document_of("PlanAnswer", "plan.pdf", when=lambda answer: answer.study.plan.report == "pdf")
-def plan_pdf(answer: PlanAnswer) -> bytes:
-    """Return the report as PDF, with a page per target."""
-    return pdf_bytes(f"Mauve: {answer.heading}", plan_parts(answer))
-
-
-@document_of("PlanAnswer", "plan.html", when=lambda answer: answer.study.plan.report == "html")
-def plan_html(answer: PlanAnswer) -> bytes:
-    """Return the report as a page."""
-    return html_bytes(f"Mauve: {answer.heading}", plan_parts(answer))
+    return f"Mauve: {answer.heading}", parts
 
 
 def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
@@ -361,25 +340,23 @@ def _plain_decades(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}"))
 
 
-def analysis_parts(answer: AnalyseAnswer) -> list[Part]:
-    """Return the report of an analysis: messages, tables without empty columns, remarks, and pictures."""
+def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[Part]]:
+    """Return title and parts of an analysis's report: messages, tables without empty columns, remarks, and pictures."""
     frames = answer.analysis.frames
     title = f"{frames.name}: {frames.n_frames} frames from {frames.date(float(frames.time_s[0]))[:19]}"
     parts = [Part(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
     parts += [Part(view.title, (), *without_empty(*view.texts())) for view in answer.all_views]
     parts.append(Part(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
-    return parts + [Part(picture=draw, seen=name) for name, draw in pictures_of(answer).items()]
+    return title, parts + [Part(picture=draw, seen=name) for name, draw in pictures_of(answer).items()]
 
 
-@document_of("AnalyseAnswer", "analyse.html", when=lambda answer: answer.study.data.report == "html")
-def analysis_html(answer: AnalyseAnswer) -> bytes:
-    """Return the report as a page."""
-    parts = analysis_parts(answer)
-    return html_bytes(parts[0].heading, parts)
-
-
-@document_of("AnalyseAnswer", "analyse.pdf", when=lambda answer: answer.study.data.report == "pdf")
-def analysis_pdf(answer: AnalyseAnswer) -> bytes:
-    """Return the report as PDF, with a page for each picture."""
-    parts = analysis_parts(answer)
-    return pdf_bytes(parts[0].heading, parts)
+# Each report as HTML and as PDF; the study chooses one of them, or none.
+for kind, name, report, chosen in (
+    ("PlanAnswer", "plan", plan_report, "study.plan.report"),
+    ("AnalyseAnswer", "analyse", analysis_report, "study.data.report"),
+):
+    for ending, write in (("html", html_bytes), ("pdf", pdf_bytes)):
+        register(
+            kind, f"{name}.{ending}", lambda answer, write=write, report=report: write(*report(answer)), document=True,
+            when=lambda answer, chosen=chosen, ending=ending: attrgetter(chosen)(answer) == ending,
+        )  # fmt: skip

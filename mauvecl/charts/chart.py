@@ -285,11 +285,6 @@ def register(kind: str, name: str, make: F, **how: Any) -> F:
     return make
 
 
-def document_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
-    """Register a function that returns the bytes of a document of a class; arguments as for `matplotlib.picture_of`."""
-    return lambda make: register(kind, name, make, document=True, **how)
-
-
 def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:
     """Return every picture of an object by file name, as functions of `path` and `ax`."""
     return {name: partial(_draw, draw) for name, draw in _made_of(thing, document=False)}

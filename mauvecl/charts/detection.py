@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from itertools import cycle
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -217,30 +217,26 @@ def observation(title: str, table: QTable) -> Picture:
     given=lambda answer: (First([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
 )
 @picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
-def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Picture:
-    """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations if simulated."""
-    from mauvecl.detection.snr import SnrResult
-
+def signal_to_noise(stars: Sequence[tuple[str, SnrResult]]) -> Picture:
+    """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations."""
     rows = list[list[Panel]]()
     for title, result in stars:
-        drawn = result if isinstance(result, SnrResult) else None
-        x = drawn.expectation if drawn else cast("Expectation", result)
+        x, whole = result.expectation, _whole(result.expectation)
         title = title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s"
-        whole = _whole(x)
-        pixel, element = (drawn.pixel, drawn.element[whole]) if drawn else (None, None)
         nm, snr = x.element_wavelength_nm[whole], x.snr_per_element()[whole]
-        rows.append([_snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), pixel),
-                     _snr_panel(title, "per 10.5 nm element", nm, snr, element)])  # fmt: skip
+        rows.append([_snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), result.pixel),
+                     _snr_panel(title, "per 10.5 nm element", nm, snr, result.element[whole])])  # fmt: skip
     title = "S/N of one exposure; nominal throughput, not a flight calibration"
     return Picture(rows, (7.6, 2.6 * len(rows) + 0.4), title, (note_of(stars),), below=True, share_x=True)
 
 
-def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable | None) -> Panel:
-    """Return the S/N in closed form, over the ranges of realisations if there is a table of them."""
-    series: list[Series] = [Line("closed form", "text", width=1.2, at=(nm, expected))]
-    for low, high, alpha, text in (("q16", "q84", 0.45, "68 %"), ("q2.5", "q97.5", 0.25, "95 %")):
-        if table is not None:
-            series.insert(0, Band(f"{text} of realisations", "star", alpha=alpha, at=(nm, table[low], table[high])))
+def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable) -> Panel:
+    """Return the S/N in closed form, over the ranges of realisations."""
+    series: list[Series] = [
+        Band("95 % of realisations", "star", alpha=0.25, at=(nm, table["q2.5"], table["q97.5"])),
+        Band("68 % of realisations", "star", alpha=0.45, at=(nm, table["q16"], table["q84"])),
+        Line("closed form", "text", width=1.2, at=(nm, expected)),
+    ]
     return Panel(WAVELENGTH, Axis(f"S/N {what}"), series, title)
 
 

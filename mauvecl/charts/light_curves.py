@@ -13,19 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Axis, Band, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
-from mauvecl.charts.matplotlib import (
-    COLOURS,
-    EMPTY,
-    INK,
-    MAX_COLUMNS,
-    contour_entries,
-    draw_contours,
-    in_rows,
-    picture_of,
-    strokes_of,
-    styled_picture,
-)
+from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
 from mauvecl.schema.columns import First, part_note
 
 if TYPE_CHECKING:
@@ -47,15 +37,15 @@ SIZES = {
 MOST_CURVES = 6
 #: Largest number of maps in a picture.
 MOST_MAPS = 6
-CONTOURS = strokes_of((0.1, 0.5, 0.9))
+CONTOURS = figures.strokes_of((0.1, 0.5, 0.9))
 HALF_WIDTH = Axis("half-width (s)", log=True)
 
 
 def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, below: bool = False) -> Picture:
     """Return a picture with a panel per star, the first ones if there are many."""
     stars, study = First(answer.stars, MOST_MAPS, "stars"), answer.study
-    columns = min(len(stars), MAX_COLUMNS)
-    rows = in_rows([panel(star) for star in stars], columns)
+    columns = min(len(stars), figures.MAX_COLUMNS)
+    rows = figures.in_rows([panel(star) for star in stars], columns)
     title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}; nominal throughput"
     return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, (stars.note, *notes), below)
 
@@ -72,8 +62,8 @@ def maps(answer: InjectAnswer) -> Picture:
             return Panel(Axis("completeness"), size, [Line("", "star", at=(f.completeness[0], y))], star.title)
 
         mesh = Mesh("completeness", at=(_edges(x), _edges(y), z))
-        finish = partial(draw_contours, at=(x, y, z), strokes=CONTOURS)
-        return Panel(HALF_WIDTH, size, [mesh, *contour_entries(CONTOURS, "found")], star.title, finish)
+        finish = partial(figures.draw_contours, at=(x, y, z), strokes=CONTOURS)
+        return Panel(HALF_WIDTH, size, [mesh, *figures.contour_entries(CONTOURS, "found")], star.title, finish)
 
     return _stars(answer, panel, below=True)
 
@@ -110,7 +100,7 @@ def energies(answer: InjectAnswer) -> Picture:
             at = _edges(x), _edges(y), np.log10(star.fitted["energy_ratio"].T)
             label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
-        finish = methodcaller("set_facecolor", EMPTY)
+        finish = methodcaller("set_facecolor", figures.EMPTY)
         return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title, finish)
 
     return _stars(answer, panel, "medians; grey: none found")
@@ -145,7 +135,7 @@ def light_curves(star: StarStare) -> Picture:
 
     def finish(axis: Any) -> None:
         label = {"label": "found flare"} if peaks else {}
-        axis.plot(peaks, [1.03] * len(peaks), "v", color=INK["flare"], transform=axis.get_xaxis_transform(),
+        axis.plot(peaks, [1.03] * len(peaks), "v", color=figures.INK["flare"], transform=axis.get_xaxis_transform(),
                   markersize=4, clip_on=False, **label)  # fmt: skip
 
     for k, band in enumerate(light.bands):
@@ -169,15 +159,7 @@ def light_curves(star: StarStare) -> Picture:
 
 @styled_picture
 def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Picture:
-    """Plot a band's light curves of several answers, with a row per star and a column per answer.
-
-    Parameters
-    ----------
-    answers : sequence of (str, StareAnswer)
-        Title and answer of each column.
-    band : int
-        Number of the band, 0 the whole range.
-    """
+    """Plot light curves of titled answers, a row per star and a column per answer; band 0 is the whole range."""
     rows: list[list[Panel]] = [[] for _ in answers[0][1].stares]
     for title, answer in answers:
         for row, star in zip(rows, answer.stares, strict=True):
@@ -230,9 +212,9 @@ def spectra_panel(
     mesh = Mesh(label, low=-reach, high=reach, palette="RdBu_r", at=(time, nm, image.T))
 
     def finish(axis: Any) -> None:
-        axis.set_facecolor(EMPTY)
+        axis.set_facecolor(figures.EMPTY)
         for ends, colour in marks:
-            axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=INK[colour], linewidth=3,
+            axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=figures.INK[colour], linewidth=3,
                       clip_on=False, solid_capstyle="butt")  # fmt: skip
 
     x = Axis(f"time from the start of the stare ({unit})", limits=(time[0], time[-1]))

@@ -10,22 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
-from mauvecl.charts.matplotlib import (
-    COLOURS,
-    COLUMN,
-    EMPTY,
-    MAX_COLUMNS,
-    UNBROKEN,
-    contour_entries,
-    draw_contours,
-    in_figure,
-    in_rows,
-    picture_of,
-    strokes_of,
-    styled_picture,
-    written,
-)
+from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
 from mauvecl.detection.requests import statistic_label
 from mauvecl.schema.columns import First, note_of
 from mauvecl.study.cases import full_label
@@ -36,7 +23,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.limit import LimitAnswer
     from mauvecl.answers.map import MapAnswer
     from mauvecl.answers.measure import MeasureAnswer, MeasuredFlare
-    from mauvecl.answers.measured_stares import JointFit, MeasuredStare
+    from mauvecl.answers.measurements import JointFit, MeasuredStare
     from mauvecl.answers.signal import ExposureAnswer, SnrAnswer
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.study import Study
@@ -62,14 +49,14 @@ def detection_map(answer: MapAnswer) -> Picture:
         ticks = (places[-1], values) if named else None
         axes.append(quantity_axis(study, sweep.quantity, log=sweep.log and not named, ticks=ticks))
     (x, y), (x_axis, y_axis) = places, axes
-    strokes = strokes_of(question.contours) if min(x.size, y.size) > 1 else {}
+    strokes = figures.strokes_of(question.contours) if min(x.size, y.size) > 1 else {}
 
     def finish(axis: Any, probability: Any) -> None:
-        axis.set_facecolor(EMPTY)
+        axis.set_facecolor(figures.EMPTY)
         if strokes:
-            draw_contours(axis, (x, y, probability), strokes)
+            figures.draw_contours(axis, (x, y, probability), strokes)
 
-    lines, row = contour_entries(strokes, "detected"), []
+    lines, row = figures.contour_entries(strokes, "detected"), []
     for statistic, p in zip(answer.statistics, answer.probability, strict=True):
         series = [Mesh("detection probability", at=(x, y, p)), *lines]
         title = statistic_label(statistic).partition(" (")[0]
@@ -79,7 +66,7 @@ def detection_map(answer: MapAnswer) -> Picture:
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
     title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
     empty = "grey: no answer" if np.isnan(answer.probability).any() else ""
-    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=bool(strokes), share_y=True)
+    return Picture([row], (figures.COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=bool(strokes), share_y=True)
 
 
 @picture_of("LimitAnswer", "limit")
@@ -93,8 +80,8 @@ def limits(answer: LimitAnswer) -> Picture:
         p, low, high = np.array([(q.value, q.low, q.high) for q in (point.probability for point in points)]).T
         flare = "" if np.isnan(limit.amplitude) else f", flare {100 * limit.amplitude:g} %"
         statistic = f", {limit.statistic}" if several else ""
-        value = f"{limit.value.value:.2f}" if of == "magnitude" else written(float(f"{limit.value.value:.3g}"))
-        text = f"{limit.star}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
+        value = f"{limit.value.value:.2f}" if of == "magnitude" else figures.written(float(f"{limit.value.value:.3g}"))
+        text = f"{limit.label}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
         at = [point.value for point in points], p, (p - low, high - p)
         series += [
             Dots(text, colour, marker=marker, size=6, at=at),
@@ -102,13 +89,13 @@ def limits(answer: LimitAnswer) -> Picture:
             Strips("", colour, alpha=0.25, at=([limit.value.low], [limit.value.high])),
         ]
     series.append(Rule(colour="text", along="y", at=power))
-    exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
+    exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{figures.UNBROKEN}s"
     title = (
         f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
         f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
     )
     x, y = quantity_axis(answer.study, of, log=of != "magnitude"), Axis("detection probability", limits=(-0.02, 1.02))
-    return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, below=True)
+    return Picture([[Panel(x, y, series)]], (figures.COLUMN, 3.0 + 0.17 * len(answer.limits)), title, below=True)
 
 
 #: Panels of noise budgets in a picture.
@@ -156,9 +143,9 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1) 
     shown = First(observed, MOST_BUDGETS, "observations")
     panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in shown]
     # A column for each cell, unless these are too many.
-    across = len(observed) // each if each <= MAX_COLUMNS and len(shown) == len(observed) else 0
-    rows = [panels[k::across] for k in range(across)] or in_rows(panels, MAX_COLUMNS)
-    size = COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
+    across = len(observed) // each if each <= figures.MAX_COLUMNS and len(shown) == len(observed) else 0
+    rows = [panels[k::across] for k in range(across)] or figures.in_rows(panels, figures.MAX_COLUMNS)
+    size = figures.COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
     title = "Noise budgets; nominal throughput, not a flight calibration"
     return Picture(rows, size, title, (shown.note,), below=True, share_x=True, share_y="col" if across else True)
 
@@ -186,7 +173,7 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
         x_axis = quantity_axis(answer.study, first, log=first == "exposure")
         row.append(Panel(x_axis, y_axis, series, f"{wavelength:g} nm"))
     title = "S/N in closed form; bars: 95 % of realisations; nominal throughput"
-    return Picture([row], (COLUMN if len(row) == 1 else 2.6 * len(row), 3.2), title, below=True, share_y=True)
+    return Picture([row], (figures.COLUMN if len(row) == 1 else 2.6 * len(row), 3.2), title, below=True, share_y=True)
 
 
 @picture_of("GaussianAnswer", "gaussian")
@@ -221,7 +208,7 @@ def gaussian(answer: GaussianAnswer) -> Picture:
         panel("false alarms\nover predicted", 1.0, 0.2, dots("fap_ratio")),
     ]
     title = "Simulation and root-of-N formula; vertical lines: as the formula predicts; nominal throughput"
-    return Picture([row], (2 * COLUMN, 0.22 * len(cells) + 1.5), title, share_y=True)
+    return Picture([row], (2 * figures.COLUMN, 0.22 * len(cells) + 1.5), title, share_y=True)
 
 
 @picture_of("ExposureAnswer", "exposure")
@@ -230,14 +217,14 @@ def exposures(answer: ExposureAnswer) -> Picture:
     first, series = answer.exposures[0], list[Series]()
     for e, colour in zip(answer.exposures, cycle(COLOURS), strict=False):
         x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
-        text = f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s"
+        text = f"{e.star}: {figures.written(float(f'{e.exposure_s:.4g}'))} s"
         series.append(Line(text, colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))))
         series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
     series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))
     per = "10.5 nm element" if first.per == "element" else first.per
     panel = Panel(Axis("exposure (s)", log=True), Axis(f"S/N per {per}", log=True), series)
     title = f"S/N at {first.wavelength_nm:g} nm against exposure; nominal throughput"
-    return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.exposures)), title, below=True)
+    return Picture([[panel]], (figures.COLUMN, 3.0 + 0.17 * len(answer.exposures)), title, below=True)
 
 
 #: Increases of chi-squared that enclose 68 and 95 % in two dimensions.
@@ -252,9 +239,10 @@ MOST_FLARES = 4
 MANY_FITS = 1000
 
 
-def _few(answer: MeasureAnswer, kind: type = object) -> tuple[Any, ...]:
-    """Return the first flares, those whose fitted model is of a kind."""
-    return (First([flare for flare in answer.flares if isinstance(flare.fitted, kind)], MOST_FLARES, "flares"),)
+def _few(answer: MeasureAnswer, *, single: bool = False) -> tuple[Any, ...]:
+    """Return the first flares, of all models or of those with a single temperature."""
+    flares = [flare for flare in answer.flares if not single or flare.model != "two-temperatures"]
+    return (First(flares, MOST_FLARES, "flares"),)
 
 
 @picture_of("MeasureAnswer", "fit", given=_few)
@@ -291,13 +279,11 @@ def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Pane
     return Picture([row], (3.4 * len(flares), 3.6), notes=(note_of(flares),), below=True)
 
 
-def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
-    from mauvecl.fits.flare_model import FlareModel
-
-    return _few(answer, FlareModel)
+#: The first flares whose model has a single temperature.
+SINGLE = partial(_few, single=True)
 
 
-@picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
+@picture_of("MeasureAnswer", "contours", given=SINGLE, when=lambda answer: bool(SINGLE(answer)[0]))
 def contours(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
 
@@ -381,7 +367,7 @@ def temperatures(star: MeasuredStare) -> Picture:
         if limits.any():
             series.append(Dots("lower limit", "star", size=10, marker="^", at=(middle[limits], low[limits])))
         positive = [value for value in (*estimate, *true) if value > 0]
-        unit = f" ({in_figure(measurement.units[q])})" if measurement.units[q] else ""
+        unit = f" ({figures.in_figure(measurement.units[q])})" if measurement.units[q] else ""
         label = " ".join(name.split(" ")[::-1]) + unit
         y = Axis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(Axis("time from the start of the stare (s)"), y, series)])

@@ -29,8 +29,6 @@ INK = {
 }  # fmt: skip
 #: Wavelengths that are shown, nm.
 RANGE_NM = (200.0, 700.0)
-#: Markers by their names in charts.
-MARKERS = {"circle": "o"}
 #: Cells of a mesh above which vector files hold it as pixels.
 MANY = 5000
 #: Panels side by side.
@@ -219,14 +217,8 @@ def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
 def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[P, Any]], Callable[..., Any]]:
     """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
 
-    Parameters
-    ----------
-    kind : str
-        Name of the class, as in ``"LimitAnswer"``.
-    name : str
-        Name of the picture's file without its ending.
-    **how
-        `given`, `each` and `when`; see `chart.Entry`.
+    `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `how` is as for
+    `chart.Entry`.
     """
     return lambda draw: register(kind, name, styled_picture(draw), **how)
 
@@ -323,7 +315,7 @@ def _draw_series(axis: Any, item: Series) -> Any:
         case Band():
             axis.fill_between(*at, step="mid" if item.step else None, **look, linewidth=0)
         case Dots():
-            form = MARKERS.get(item.marker, item.marker) or "none"
+            form = "o" if item.marker == "circle" else item.marker or "none"
             axis.errorbar(*at, fmt=form, markersize=0.6 * item.size, elinewidth=0.6 * item.width, **look)
         case Line():
             step = "steps-mid" if item.step else "default"

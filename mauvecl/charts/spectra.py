@@ -1,17 +1,21 @@
-"""Pictures of the inputs of an expectation: spectra, sky, line spread function and optics."""
+"""Charts of spectra: inputs of an expectation, fitted instruments, and changes between visits."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import cycle
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Line, Panel, Picture, Targets
-from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, picture_of, styled_picture
+from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Strips, Targets
+from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of, styled_picture
+from mauvecl.schema.columns import First, with_error
 
 if TYPE_CHECKING:
+    from mauvecl.answers.calibrate import CalibrateAnswer
+    from mauvecl.answers.change import ChangeAnswer
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.instrument.instrument import Instrument
@@ -121,3 +125,181 @@ def flares(source: Source, amplitudes: Sequence[float]) -> Panel:
     ]
     quiet = Line("no flare", "text", width=1.1, dash="dashed", at=(source.wavelength_nm, source.flux_flam))
     return Panel(WAVELENGTH, FLUX, [*lines[::-1], quiet], source.name)
+
+
+#: Pixels that are averaged for a point of the residuals, and values for one of the photon transfer.
+BIN, GROUPS = 16, 60
+THROUGHPUT = Chart(
+    "throughput", "Throughput: fitted and nominal", WAVELENGTH, Axis("electrons per photon (%)"),
+    (
+        Band("95 % interval", "star", "band", alpha=0.35),
+        Line("fitted", "star", width=2, tips=("nm", "fitted (%)")),
+        Line("nominal", dash="dashed"),
+    ),
+)  # fmt: skip
+TRANSFER = Chart(
+    "transfer", "Photon transfer: variance of frames against their mean", Axis("fitted variance (DN²)", log=True),
+    Axis("measured variance (DN²)", log=True),
+    (Line("fitted"), Dots("measured", "star", size=6, tips=("fitted", "measured"))),
+)  # fmt: skip
+
+
+def throughput_series(answer: CalibrateAnswer, scale: str = "throughput") -> dict[str, Any]:
+    """Return the data of `THROUGHPUT`, or with the scale "ratio" those relative to the nominal throughput."""
+    table = answer.throughput_table
+    nm = table["wavelength"].value
+    wide = np.exp(1.96 * np.asarray(table["relative_error"]))
+    if scale == "ratio":
+        fitted, nominal = np.asarray(table["ratio"]), np.ones(nm.size)
+    else:
+        fitted, nominal = (100 * np.asarray(table[name]) for name in ("throughput", "nominal"))
+    return {"band": (nm, fitted / wide, fitted * wide), "fitted": (nm, fitted), "nominal": (nm, nominal)}
+
+
+@picture_of("CalibrateAnswer", "throughput")
+def fitted_throughput(answer: CalibrateAnswer) -> Picture:
+    """Plot the fitted throughput with its 95 % band next to the nominal one, and their ratio."""
+    above = THROUGHPUT.panel(throughput_series(answer), f"nominal: {answer.nominal.name}")
+    ratio = THROUGHPUT.panel(throughput_series(answer, "ratio"))
+    below = Panel(WAVELENGTH, Axis("fitted / nominal"), [replace(item, listed=False) for item in ratio.series])
+    return Picture([[above], [below]], (5.2, 4.6), f"Throughput {answer.source}", share_x=True)
+
+
+def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
+    """Return name, wavelengths and averaged residuals of each star, without pixels that were not used."""
+    nm, each = answer.throughput.binned_residuals(BIN)
+    stars = zip(answer.stars, each, strict=True)
+    return [(star.name, nm[finite], row[finite]) for star, row in stars for finite in [np.isfinite(row)]]
+
+
+@picture_of("CalibrateAnswer", "residuals")
+def calibration_residuals(answer: CalibrateAnswer) -> Picture:
+    """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
+    two = Strips(along="y", alpha=0.2, at=([-2], [2]))
+    rows = [[Panel(WAVELENGTH, Axis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
+            for name, nm, row in residual_series(answer)]  # fmt: skip
+    title, notes = f"Observed less fitted spectra, means of {BIN} pixels", f"p-value {answer.throughput.p_value:.2g}"
+    return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, ("grey: 2 sigma", notes), share_x=True, share_y=True)
+
+
+def transfer_series(answer: CalibrateAnswer) -> tuple[dict[str, Any], Any]:
+    """Return the data of `TRANSFER`, and the errors of the measured variances."""
+    t = answer.transfer
+    # Dark counts have their own variance, which the fit includes.
+    groups = np.array_split(np.argsort(t.model), GROUPS)
+    model, measured = (np.array([values[group].mean() for group in groups]) for values in (t.model, t.variance))
+    error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])
+    return {"fitted": (model, model), "measured": (model, measured)}, error
+
+
+@picture_of("CalibrateAnswer", "photon-transfer", when=lambda answer: "gain" not in answer.transfer.assumed)
+def photon_transfer(answer: CalibrateAnswer) -> Picture:
+    """Plot the variance of frames against their mean, binned, with the fit and its residuals."""
+    t, (series, error) = answer.transfer, transfer_series(answer)
+    model, measured = series["measured"]
+    off = Dots("", "star", size=6, at=(model, 100 * (measured / model - 1), 100 * error / model))
+    below = Panel(TRANSFER.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
+    title = (
+        f"Photon transfer: gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise "
+        f"{with_error(t.read_noise_dn, t.read_noise_error)} DN; dark counts in {t.dark_unit}"
+    )
+    return Picture([[TRANSFER.panel(series)], [below]], (4.6, 4.6), title, share_x=True)
+
+
+@picture_of("CalibrateAnswer", "dark", when=lambda answer: answer.dark.dof > 0)
+def dark_current(answer: CalibrateAnswer) -> Picture:
+    """Plot the dark current of each pixel, and its mean against temperature with the fit."""
+    d, n = answer.dark, answer.nominal
+    pixels = Dots("", "star", size=2, at=(n.wavelength_nm, d.level_dn_per_s))
+    dark = [observation for observation in answer.observations if observation.star is None]
+    celsius = np.concatenate([np.atleast_1d(observation.temperature_c) for observation in dark])
+    kelvin = np.linspace(celsius.min(), celsius.max(), 101)
+    usual = n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * kelvin)
+    mean = list[Dots | Line]()
+    for number, frames in enumerate(dark):
+        at = frames.temperature_c, (frames.raw_dn - d.bias_dn).mean(axis=1) / frames.exposure_s
+        mean.append(Dots("" if number else "means of frames", "star", at=at))
+    mean.append(Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))))
+    mean.append(Line("nominal", dash="dashed", at=(kelvin, usual)))
+    left = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
+    right = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
+    title = f"Dark current: slope {with_error(d.slope_per_c, d.slope_error)} per °C"
+    return Picture([[left, right]], (7.2, 2.9), title)
+
+
+#: Changes whose periods are drawn, at most.
+MOST = 3
+#: Nanometres on both sides of an index that are drawn.
+AROUND_NM = 15.0
+
+
+def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
+    """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
+    from mauvecl.answers.change import MAGNITUDES
+
+    lines = list[tuple[str, Any, Any]]()
+    for name in names:
+        own = [row for row in answer.along if row.change.name == name]
+        x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: MAGNITUDES.size]]).T
+        lines.append((shown_name(name), x[np.isfinite(y)], scale * y[np.isfinite(y)]))
+    return lines
+
+
+def shown_name(change: str) -> str:
+    """Return the name of a change with its unit if it is a wavelength or a band, and with its capital letter."""
+    return f"{change} nm" if change[0].isdigit() else change.replace("balmer", "Balmer")
+
+
+@picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
+def change_against_magnitude(answer: ChangeAnswer) -> Picture:
+    """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
+    titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
+    (title,), star, row = titles, answer.study.star[0], []
+    for unit in dict.fromkeys(row.change.unit for row in answer.along):
+        names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
+        lines = [line for line in along_magnitude(answer, names, 1 if unit else 100) if line[1].size]
+        here = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
+        # Without a pixel that does not saturate there is nothing to show.
+        values, limits = [value for _, _, column in lines for value in column], None
+        if lines:
+            # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
+            limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
+        y = Axis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
+        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=lines), *here]))
+    visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
+    title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
+    return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
+
+
+@picture_of("ChangeAnswer", "periods", when=lambda answer: bool(answer.periods))
+def recovered_periods(answer: ChangeAnswer) -> Picture:
+    """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
+    first, row = First(answer.periods, MOST, "changes"), []
+    for row_of_change in first:
+        r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
+        shares = 100 * row_of_change.shares("value")
+        mesh = Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
+        unit = row_of_change.change.unit
+        y = Axis(f"semi-amplitude ({in_figure(unit) if unit else '%'})", log=True)
+        row.append(Panel(Axis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
+    time = first[0].recovery.time_d
+    title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
+    return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (first.note,))
+
+
+@picture_of("ChangeAnswer", "indices", when=lambda answer: bool(answer.indices))
+def line_indices(answer: ChangeAnswer) -> Picture:
+    """Plot the mean calibrated spectrum around each line index, with its band and continuum."""
+    title, row = answer.indices[0].title, []
+    for index_row in answer.indices:
+        if index_row.title != title:
+            continue
+        index, nm = index_row.value.index, index_row.wavelength_nm
+        near = (nm > index.continuum_nm[0][0] - AROUND_NM) & (nm < index.continuum_nm[-1][1] + AROUND_NM)
+        line = Line("mean spectrum", "star", at=(nm[near], index_row.flux[near]))
+        band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T
+        series = [line, Strips("band", "read", at=band), Strips("continuum", alpha=0.2, at=continua)]
+        y = Axis(f"flux ({in_figure('erg / (s cm2 nm)')})")
+        row.append(Panel(Axis("wavelength (nm)"), y, series, index.name))
+    title = f"{title}: bands and continua of the line indices in the mean spectrum"
+    return Picture([row], (1.0 + 2.3 * len(row), 3.1), title, below=True)

@@ -144,12 +144,12 @@ def star_label(star: Star, x: Expectation) -> str:
     return name if star.magnitude is None else f"{name} {star.band} = {star.magnitude:g}{system}"
 
 
-def place_columns(sweep: Sweep, *own: str, star: str = "label") -> tuple[Column, ...]:
+def place_columns(sweep: Sweep, *own: str) -> tuple[Column, ...]:
     """Return the columns of the star and of the swept quantities, for rows with the values `at` a cell of the sweep.
 
-    `own` names quantities for which a table has separate columns, and `star` the attribute with the star's label.
+    `own` names quantities for which a table has separate columns.
     """
-    return (star_column(star), *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own))
+    return (star_column("label"), *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own))
 
 
 def star_column(get: str = "star") -> Column:

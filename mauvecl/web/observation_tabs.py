@@ -11,16 +11,6 @@ from bokeh.palettes import interp_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
-from mauvecl.charts.calibrations import (
-    BIN,
-    THROUGHPUT,
-    TRANSFER,
-    along_magnitude,
-    residual_series,
-    shown_name,
-    throughput_series,
-    transfer_series,
-)
 from mauvecl.charts.chart import (
     WAVELENGTH,
     Axis,
@@ -37,6 +27,16 @@ from mauvecl.charts.chart import (
     Targets,
 )
 from mauvecl.charts.light_curves import SCATTER, scatter_series
+from mauvecl.charts.spectra import (
+    BIN,
+    THROUGHPUT,
+    TRANSFER,
+    along_magnitude,
+    residual_series,
+    shown_name,
+    throughput_series,
+    transfer_series,
+)
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.columns import with_error
 from mauvecl.schema.errors import InputError

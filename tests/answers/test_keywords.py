@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -14,59 +15,33 @@ from scenes import paper
 import mauvecl
 from mauvecl import Engine, FlareModel, InputError, Instrument, Source, Study, expect, fit
 
-# Keywords, and the flags that ask the same.
-ASKED: dict[str, tuple[str, dict[str, Any], str]] = {
-    "one star": ("simulate", {"star": "M4V", "magnitude": 11, "amplitude": 0.05}, "--star M4V -m 11 -a 0.05"),
-    "several": (
-        "simulate", {"star": ("G2V", "K3V"), "magnitude": np.array([7.4, 3.7]), "seed": 3},
-        "--star G2V -m 7.4 --star K3V -m 3.7 --seed 3",
-    ),
-    "units": (
-        "simulate",
-        {"star": "AU Mic", "amplitude": 24 * u.percent, "exposure": 2 * u.min, "flare_temperature": 9 * u.kK},
-        "'AU Mic' -a 24% -t 120 --flare-temperature 9000",
-    ),
-    "text": (
-        "simulate", {"star": "AU Mic", "amplitude": "24%", "exposure": "2 min"}, "'AU Mic' -a 0.24 -t 120"
-    ),
-    "arrays": ("simulate", {"star": "G2V", "magnitude": np.array([7.4]), "amplitude": [10, 20] * u.percent},
-               "--star G2V -m 7.4 -a 0.1,0.2"),
-    "sky": ("simulate", {"star": "G2V", "magnitude": 7, "sky": "none"}, "--star G2V -m 7 --sky none"),
-    "brightness": ("simulate", {"star": "G2V", "magnitude": 7, "sky": 21.5}, "--star G2V -m 7 --sky 21.5"),
-    "paper": ("simulate", {"star": "G2V", "magnitude": 7, "paper": True}, "--star G2V -m 7 --paper"),
-    "ideal": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "ideal": True, "fap": 0.1,
-                         "realisations": 2000}, "--star G2V -m 7 -a 0.1 --ideal --fap 0.1 -n 2000"),
-    "two sections with one flag": (
-        "measure", {"star": "M3V", "magnitude": 9, "amplitude": 0.5, "fits": 20, "ideal": True},
-        "--star M3V -m 9 -a 0.5 --fits 20 --ideal",
-    ),
-    "all statistics": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "all_statistics": True, "fap": 0.1,
-                                  "realisations": 2000, "ideal": True},
-                       "--star G2V -m 7 -a 0.1 --ideal --fap 0.1 -n 2000 --all-statistics"),
-    "nuisances": ("detect", {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "nuisance": {"dark": 0.1}, "fap": 0.1,
-                             "realisations": 2000},
-                  "--star G2V -m 7 -a 0.1 --nuisance dark=0.1 --fap 0.1 -n 2000"),
-    "noisy references": (
-        "detect",
-        {"star": "G2V", "magnitude": 7, "amplitude": 0.1, "fap": 0.1, "realisations": 2000, "ideal": True,
-         "statistic": "all", "reference": "stack:3", "variances": "estimated"},
-        "--star G2V -m 7 -a 0.1 --fap 0.1 -n 2000 --ideal --statistic all --reference stack:3 --variances estimated",
-    ),
-    "default of the verb": ("snr", {"star": "G2V", "magnitude": 7, "realisations": 1000}, "--star G2V -m 7 -n 1000"),
-    "sweep": ("snr", {"star": "G2V", "sweep": "magnitude=6,7", "realisations": 1000},
-              "--star G2V --sweep magnitude=6,7 -n 1000"),
-    "own section": ("exposure", {"star": "G2V", "magnitude": 7, "snr": 10, "at": 300 * u.nm},
-                    "--star G2V -m 7 --snr 10 --at 300"),
-    "targets": ("visible", {"look_at": ["eps Eri"], "start": "2027-01-01", "days": 2},
-                "--look-at 'eps Eri' --start 2027-01-01 --days 2"),
+#: Keywords, and the flags that ask the same.
+ASKED: dict[str, dict[str, Any]] = tomllib.loads(
+    (Path(__file__).parents[1] / "data" / "keywords.toml").read_text(encoding="utf-8")
+)
+ASKED |= {
+    "several": {
+        "verb": "simulate", "flags": "--star G2V -m 7.4 --star K3V -m 3.7 --seed 3 -a 0.1,0.2",
+        "keywords": {"star": ("G2V", "K3V"), "magnitude": np.array([7.4, 3.7]), "amplitude": [10, 20] * u.percent,
+                     "seed": 3},
+    },
+    "units": {
+        "verb": "simulate", "flags": "'AU Mic' -a 24% -t 120 --flare-temperature 9000",
+        "keywords": {"star": "AU Mic", "amplitude": 24 * u.percent, "exposure": 2 * u.min,
+                     "flare_temperature": 9 * u.kK},
+    },
+    "own section": {
+        "verb": "exposure", "flags": "--star G2V -m 7 --snr 10 --at 300",
+        "keywords": {"star": "G2V", "magnitude": 7, "snr": 10, "at": 300 * u.nm},
+    },
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ASKED)
 def test_keywords_ask_what_flags_ask(name: str, tmp_path: Path) -> None:
-    verb, keywords, flags = ASKED[name]
-    run(verb, *shlex.split(flags), "--no-pictures", "-o", "answer", folder=tmp_path)
-    answer = getattr(mauvecl, verb)(**keywords)
+    asked = ASKED[name]
+    run(asked["verb"], *shlex.split(asked["flags"]), "--no-pictures", "-o", "answer", folder=tmp_path)
+    answer = getattr(mauvecl, asked["verb"])(**asked["keywords"])
     assert answer.study.toml() == (tmp_path / "answer" / "study.toml").read_text()
     assert answer.tables.keys() <= {path.stem for path in (tmp_path / "answer").glob("*.ecsv")}
 

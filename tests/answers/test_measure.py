@@ -46,13 +46,6 @@ def test_correct_model_covers_and_simple_model_is_rejected(jump: Any) -> None:
     assert quality["balmer"]["snr"] == pytest.approx(134.56, rel=0.01)
 
 
-@pytest.mark.parametrize(("end", "value"), [("low", np.inf), ("high", -np.inf)])
-def test_intervals_on_either_side_of_the_truth_do_not_cover(end: str, value: float, jump: Any) -> None:
-    one = jump.flares[1]
-    found = replace(one.found, **{end: np.full_like(one.found.low, value)})
-    assert (np.array(replace(one, found=found).rows()["coverage_95"]) == 0.0).all()
-
-
 @pytest.mark.long
 def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> None:
     """At a detection probability near one half; the median of detected flares exceeds that of all (false: < 1e-6)."""
@@ -162,13 +155,16 @@ def test_lines_and_absolute_fluxes_are_measured(engine: Engine) -> None:
     assert rows["line H alpha"]["perfect"] == pytest.approx(rows["line H alpha"]["truth"], rel=0.02)
 
 
-def test_expected_regions_close(jump: Any) -> None:
-    """Check that regions end where chi-squared has risen for every amplitude."""
+def test_expected_regions_close_and_intervals_beside_the_truth_do_not_cover(jump: Any) -> None:
+    """Regions end where chi-squared has risen for every amplitude."""
     for one in jump.flares:
         kelvin, low, high = one.region(5.99)
         width = high - low
         assert (width[[0, -1]] < 1e-4 * width.max()).all()
         assert kelvin[0] < one.perfect.estimates[0, 0] < kelvin[-1]
+    for end, value in (("low", np.inf), ("high", -np.inf)):
+        found = replace(one.found, **{end: np.full_like(one.found.low, value)})
+        assert (np.array(replace(one, found=found).rows()["coverage_95"]) == 0.0).all()
 
 
 def drawn_study(*settings: str, star: str = "M3V", magnitude: float = 7.0, fits: int = 400) -> Study:

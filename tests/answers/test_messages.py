@@ -70,12 +70,6 @@ def test_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, 
     assert any("flare" in text and "saturate" in text.lower() for text in found), found
 
 
-@pytest.mark.parametrize("magnitude", ["", ", magnitude=0.03"])
-def test_star_that_saturates_is_reported_once(magnitude: str) -> None:
-    study = Study().with_settings([f"star=[{{library='Vega'{magnitude}}}]", "observation.exposure_s=5"])
-    assert len(of_kind(simulate(study, flaring=True).messages, "saturated")) == 1
-
-
 def test_many_messages_are_summarised(engine: Engine) -> None:
     """Summarise the saturating flares of 64 cells: a common message, a dozen single ones, and one for the rest."""
     study = hot_star(3.3, 300.0, **map_of([12.0 + 0.1 * n for n in range(32)], [5.0, 10.0]))

@@ -19,15 +19,13 @@ SETTINGS = [
 ASKED = Study().with_settings(SETTINGS)
 
 
-def test_defaults_are_realistic() -> None:
+def test_defaults_are_realistic_unlike_those_of_the_paper() -> None:
     study = Study()
     assert (study.observation.instrument, study.nuisances.usual, study.run.statistics) == ("mauve", True, ("matched",))
     mauve, mauvesim = Instrument.load("mauve"), Instrument.load("mauvesim")
     assert (mauve.dark_unit, mauvesim.dark_unit) == ("electrons", "DN")
     assert mauve == mauvesim.with_(dark_unit="electrons", photon_noise="poisson")
-
-
-def test_paper_and_ideal_change_the_conventions_alone() -> None:
+    # Nothing but these conventions changes.
     for changed, instrument in ((ASKED.paper(), "mauvesim"), (ASKED.ideal(), "mauve")):
         assert changed.observation.instrument == instrument
         assert not changed.nuisances.usual
@@ -112,6 +110,7 @@ def test_study_of_version_1_is_read_as_it_was(text: str, instrument: str, tmp_pa
     new = tomllib.loads(study.toml())
     assert new.keys() - tomllib.loads(Study().toml()).keys() == {"nuisances"}, "no section that says nothing"
     assert new["nuisances"] == {"usual": False, "own": {}}
+    assert "orbit" not in new
     (tmp_path / "plan.toml").write_text(OLD + "[plan]\nhours = 10\n")
     with pytest.warns(UserWarning, match="no version"):
         assert Study.read(tmp_path / "plan.toml").plan.completeness == "injections"

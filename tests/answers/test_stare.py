@@ -95,7 +95,7 @@ def test_search_finds_only_the_injected_flares(stares):
     answer = stare(study, stares)
     one, found = answer.stares[0], answer.found
     assert found["event"].tolist()[:3] == [4, 3, 2]
-    assert (found["value"] >= one.search.threshold).all()
+    assert (found["value"] >= one.threshold).all()
     assert set(found["event"]) <= {1, 2, 3, 4}
     put_in = answer.events[found["event"] - 1]
     # Within five standard errors: a normal error exceeds that once in 2e6; 15 are tested.

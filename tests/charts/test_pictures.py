@@ -4,6 +4,7 @@ import io
 import os
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -22,37 +23,21 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 import mauvecl
-from mauvecl import Engine, Study, detect, snr
+from mauvecl import Engine, Study, detect
 
 #: Width of one column of a journal, inches.
 COLUMN = 3.5
-FEW = ("run.realisations=2000", "run.fap=0.1")
-ONE = 'star=[{library="G2V", magnitude=7.4}]'
-BARE = 'star=[{library="G2V"}]'
-TWO = "flare.amplitudes=[0.05, 0.24]"
-ONLY = 'run.statistics=["matched"]'
-GRID = (
-    'map.x={quantity="magnitude", start=6, stop=10, steps=5}',
-    'map.y={quantity="amplitude", start=0.01, stop=1, steps=5, log=true}',
+#: Questions by the names of the tests that ask them.
+QUESTIONS: dict[str, dict[str, Any]] = tomllib.loads(
+    (Path(__file__).parents[1] / "data" / "pictures.toml").read_text(encoding="utf-8")
 )
-SWEEP = 'sweep.axes=[{quantity="exposure", values=[5, 50, 600]}, {quantity="magnitude", values=[4, 8]}]'
-#: Answers, and whether their first picture is one of a column's width.
-CASES: dict[str, tuple[Any, tuple[str, ...], bool]] = {
-    "detect, the paper's question": (detect, FEW, False),
-    "detect, one statistic": (detect, (*FEW, ONE, TWO, 'run.statistics=["chi2"]'), True),
-    "detect, every statistic": (detect, (*FEW, ONE, TWO, 'run.statistics=["all"]'), False),
-    "limit": (mauvecl.limit, (*FEW, BARE, TWO), True),
-    "limit of exposure": (mauvecl.limit, (*FEW, ONE, TWO, ONLY, 'limit.of="exposure"'), True),
-    "map": (mauvecl.map, (*FEW, BARE, *GRID), False),
-    "map, one statistic": (mauvecl.map, (*FEW, BARE, *GRID, ONLY), False),
-    "gaussian": (mauvecl.gaussian, (*FEW, BARE, SWEEP), False),
-    "snr": (snr, FEW, False),
-    "snr, swept": (snr, (*FEW, ONE, SWEEP), False),
-    "exposure": (mauvecl.exposure, ("signal.snr=10", "signal.wavelength_nm=300"), True),
-    "visible": (mauvecl.visible, ('orbit.targets=["eps Eri", "AU Mic"]', "orbit.days=31", "orbit.step_s=600"), False),
-    "visible, many": (mauvecl.visible, (f"orbit.targets={[f'{10 * k} 0' for k in range(8)]}", "orbit.days=5"), False),
-    "simulate": (mauvecl.simulate, (), False),
-}
+FEW, ONE, ONLY = (QUESTIONS["settings"][name] for name in ("few", "one", "only"))
+
+
+def answer_to(question: dict[str, Any], engine: Engine) -> Any:
+    settings = [one for name in question["settings"] for one in QUESTIONS["settings"].get(name, [name])]
+    drawing = mauvecl.Stares() if question["verb"] == "inject" else engine
+    return getattr(mauvecl, question["verb"])(paper(*settings), drawing)
 
 
 def drawn(answer: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -73,15 +58,10 @@ def shown_ticks(axis: Any) -> list[Text]:
     return [tick.label1 for tick in inside if tick.label1.get_visible() and tick.label1.get_text()]
 
 
-#: What `make test` looks at.
-SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure", "visible, many")
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("case", long_but(CASES, *SHORT))
+@pytest.mark.parametrize("case", QUESTIONS["texts"])
 def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -> None:
-    ask, settings, column = CASES[case]
-    answer = ask(paper(*settings), engine)
+    answer = answer_to(QUESTIONS["texts"][case], engine)
     assert answer.pictures
     exposures = {f"{x.exposure_s:g}" for x in answer.inputs}
     for place, (name, figure, renderer) in enumerate(drawn(answer)):
@@ -102,7 +82,7 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
             boxes = sorted((label.get_window_extent(renderer).extents for label in ticks[side]), key=lambda b: b[low])
             for before, after in pairwise(boxes):
                 assert before[low + 2] <= after[low] + 0.5, (name, "ticks overlap")
-        if place == 0 and column:
+        if place == 0 and QUESTIONS["texts"][case].get("column"):
             assert figure.get_figwidth() <= COLUMN, name
         words = " ".join(text.get_text() for text in texts).replace("\N{NO-BREAK SPACE}", " ")
         if exposures and not case.startswith("limit of") and name != "exposure":
@@ -111,7 +91,7 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
 
 def test_detected_flare_is_visible(engine: Engine) -> None:
     """Check that the 5 % flare, hidden in pixel noise, reaches four sigma of an element in the lower panel."""
-    answer = detect(paper(*FEW, ONE, "flare.amplitudes=[0.05]", ONLY), engine)
+    answer = detect(paper(*FEW, *ONE, "flare.amplitudes=[0.05]", *ONLY), engine)
     figure = answer.pictures["spectra"]()
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
@@ -119,36 +99,13 @@ def test_detected_flare_is_visible(engine: Engine) -> None:
     assert line.get_xdata()[-1] < answer.stars[0].detection.quiet.element_wavelength_nm[-1]
 
 
-def stars(number: int) -> str:
-    each = (f'{{library="G2V", magnitude={7 + k / 10}}}' for k in range(number))
-    return f"star=[{', '.join(each)}]"
-
-
-INJECTED = ("stare.duration_s=1500", "injections.count=10", "injections.sizes=3", "injections.widths=8",
-            "injections.fitted=2", "injections.positions=2", "search.nulls=0")  # fmt: skip
-#: Questions with more stars, flares and half-widths than a picture shows, the note, and the pictures that need none.
-PARTS: dict[str, tuple[Any, tuple[str, ...], str, set[str]]] = {
-    "detect": (detect, (*FEW, stars(7), "flare.amplitudes=[0.5]"), "6 of 7 stars shown", set()),
-    "detect, all": (detect, (*FEW, stars(6), "flare.amplitudes=[0.5]"), " shown", {"detection", "roc", "spectra"}),
-    "snr": (snr, (stars(7), "flare.amplitudes=[0.5]"), "6 of 7 stars shown", {"noise-budget"}),
-    "measure": (
-        mauvecl.measure, (ONE, "flare.amplitudes=[0.5, 0.6, 0.7, 0.8, 0.9]", "measure.fits=20"), "4 of 5 flares shown",
-        set(),
-    ),
-    "inject": (
-        lambda study, _: mauvecl.inject(study, mauvecl.Stares()), (ONE, *INJECTED), "6 of 8 half-widths shown",
-        {"completeness", "energies"},
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", long_but(PARTS, "detect", "detect, all"))
+@pytest.mark.parametrize("case", long_but(QUESTIONS["parts"], "detect", "detect, all"))
 def test_pictures_of_a_part_say_so(case: str, engine: Engine) -> None:
-    ask, settings, note, whole = PARTS[case]
-    for name, draw in ask(paper(*settings), engine).pictures.items():
+    question = QUESTIONS["parts"][case]
+    for name, draw in answer_to(question, engine).pictures.items():
         title = draw()._suptitle
         written = title.get_text().replace("\n", " ") if title else ""
-        assert (note in written) == (name not in whole), (name, written)
+        assert (question["note"] in written) == (name not in question["whole"]), (name, written)
 
 
 def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
@@ -178,7 +135,7 @@ def test_report_has_every_table_remark_and_picture() -> None:
 
 
 def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:
-    curve = detect(paper(*FEW, ONE, ONLY), engine).stars[0].detection.roc("matched")
+    curve = detect(paper(*FEW, *ONE, *ONLY), engine).stars[0].detection.roc("matched")
     for name, start in (("", "area "), ("own words", "own words: area ")):
         (entry,) = curve.plot(name=name).axes[0].get_legend().get_texts()
         assert entry.get_text().startswith(start)
