@@ -313,8 +313,8 @@ class FileFault:
     state: str  # "changed", "missing" or another fault
 
 
-#: Largest size of a file of an answer, bytes.
-LARGEST = 2**30
+#: Largest size of a file of an answer, bytes: spectra of the longest stare have 1.2e9.
+LARGEST = 2**32
 
 FAULT_COLUMNS = (Column("file", heading="file"), Column("state", heading="what"))
 

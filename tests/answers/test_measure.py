@@ -117,6 +117,10 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
     faint = measure(study.with_settings(["measure.snr_per_bin=1e6"]), engine)
     assert len(faint.tables["temperatures"]) == 0
     assert any("snr_per_bin must be " in text and "not 1000000.0" in text for text in faint.messages)
+    # Bins have the lines of two temperatures where nothing else is fitted.
+    lines = ["flare.spectrum.second_temperature_k=8000", "flare.spectrum.second_area=0.1", 'measure.lines=["H alpha"]']
+    two = measure(study.with_settings([*lines, 'measure.models=["two-temperatures"]']), engine)
+    assert any(name.startswith("line_") for name in two.tables["temperatures"].colnames)
 
 
 @pytest.mark.long
