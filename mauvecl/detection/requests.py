@@ -32,7 +32,7 @@ from mauvecl.detection.statistics import (
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
-from mauvecl.noise.scene import BATCH, FactorDistributions, Scene, prepare
+from mauvecl.noise.scene import BATCH, Scene, factor_distributions, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message
@@ -96,9 +96,8 @@ class Hypotheses:
     def __post_init__(self) -> None:
         self._chosen = statistics_by_name(self.asked)
         self.statistics = tuple(self._chosen)
-        scene, drawn = self.scene, None
-        if self.nuisances:
-            drawn = FactorDistributions.of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
+        scene = self.scene
+        drawn = factor_distributions(scene.modulations, scene.priors, scene.medians, scene.n_frames)
         self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
         if shaped is not None and not self.flares:
@@ -117,6 +116,11 @@ class Hypotheses:
         if name not in self._chosen:
             raise InputError.of("statistic", name, f"one of {', '.join(self.statistics)}")
         return self._chosen[name]
+
+    def _nulls(self) -> list[tuple[str, int]]:
+        """Return every statistic with every template that gives it a null distribution of its own."""
+        several = range(len(self.flares))
+        return [(name, k) for name, kind in self._chosen.items() for k in (several if kind.shaped else (0,))]
 
     def shape(self, statistic: str, template: int = 0) -> Expectation | None:
         """Return the flare that a shaped statistic uses as template; None for other statistics."""
@@ -233,8 +237,8 @@ class ChannelPlan:
 
     def tails(self) -> list[TailSamples | None]:
         """Return accumulators of each grid's extremes: the largest values of a null, the smallest of a flare."""
-        kinds: dict[Role, bool] = {"null": True, "flare": False}
-        return [TailSamples(largest=kinds[role]) if role in kinds else None for _, role, _ in self.keys]
+        roles = [role for _, role, _ in self.keys]
+        return [None if role == "flare_on_null_grid" else TailSamples(largest=role == "null") for role in roles]
 
     @property
     def n_rows(self) -> int:

@@ -548,7 +548,7 @@ def _unknowns(
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
     most = 100.0 if of == "temperature" else LARGEST_SPREAD
     if not least <= sd <= most:
-        unit = STARE_CHANGES["offsets"][of].unit
+        unit = "deg C" if of == "temperature" else ""
         above = "0" if least == 0 else "above 0"
         raise InputError.of(name, sd, f"a standard deviation of {above} to {most:g} {unit}".rstrip())
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -110,8 +110,7 @@ class CosmicRays(AdditiveProcess):
     electrons: tuple[float, float] = (500.0, 1000.0)
     weights: tuple[float, ...] | None = None
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         low, high = self.electrons
         if not 1 <= low <= high <= 100_000:
             raise InputError.of("electrons", (low, high), "between 1 and 100000, ascending", where="cosmic rays")
@@ -119,7 +118,6 @@ class CosmicRays(AdditiveProcess):
             wanted = int(high) - int(low) + 1
             if len(self.weights) != wanted or min(self.weights) < 0 or not sum(self.weights) > 0:
                 raise InputError.of("weights", self.weights, f"{wanted} numbers of at least 0", where="cosmic rays")
-        return self
 
     def charge(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> Float:
         """Return the distribution of the charge that a pixel collects in a time, a compound Poisson distribution."""
@@ -235,17 +233,17 @@ class PointingDrifts(Section):
         """
         import numpy as np
 
-        from mauvecl.noise.random_numbers import four_normals, words
+        from mauvecl.noise.reference import four_normals, words_at
 
         parts: list[tuple[Float, Float, Float]] = []
         begin = np.zeros((len(numbers), 1))
-        index, n = np.asarray(numbers, np.uint64)[:, None], 0
+        index, n, stream = np.asarray(numbers, np.uint64)[:, None], 0, "stare_pointing"
         while not parts or not (parts[-1][0][:, -1] >= end_s).all():
             which = np.arange(n, n + BATCH)[None]
             # Half the sum of two squared normals is exponential, and has the same bits on every machine.
-            a, b, c, d = (z.astype(np.float64) for z in four_normals(words(index, which, self.stream, 0, seed)))
+            a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, which, stream, 0, seed)))
             wait, lasts = (a * a + b * b) / 2 * (3600.0 / self.rate_per_h), (c * c + d * d) / 2 * self.duration_s
-            share = (words(index, which, self.stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
+            share = (words_at(index, which, stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
             ends = begin + np.cumsum(wait + lasts, axis=1)
             parts.append((ends - lasts, lasts, share * self.depth))
             begin, n = ends[:, -1:], n + BATCH
@@ -359,8 +357,9 @@ class Normal:
 
 Prior = Uniform | Normal
 
-#: Keys of a prior in a study, each with the number of its values.
-_FORMS: dict[type[Prior], dict[str, int]] = {Uniform: {"uniform": 2}, Normal: {"normal": 2, "between": 2}}
+#: Keys of a prior in a study, each with two values.
+_FORMS: dict[type[Prior], tuple[str, ...]] = {Uniform: ("uniform",), Normal: ("normal", "between")}
+_PAIR = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
 
 
 def _from_study(given: Any) -> Prior:
@@ -368,10 +367,10 @@ def _from_study(given: Any) -> Prior:
     if isinstance(given, Uniform | Normal):
         return given
     for kind, form in _FORMS.items():
-        if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == form.keys():
-            for key, n in form.items():
-                if not isinstance(given[key], list | tuple) or len(given[key]) != n:
-                    raise InputError.of(key, given[key], f"{n} numbers")
+        if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == {*form}:
+            for key in form:
+                if not isinstance(given[key], list | tuple) or len(given[key]) != 2:
+                    raise InputError.of(key, given[key], "2 numbers")
             return kind(*(_number(value) for key in form for value in given[key]))
     keys = [key for form in _FORMS.values() for key in form]
     if isinstance(given, Mapping) and (other := next((key for key in given if key not in keys), None)):
@@ -395,14 +394,11 @@ def _to_study(prior: Prior) -> dict[str, tuple[float, ...]]:
     return {"normal": (prior.mean, prior.sd), "between": (prior.low, prior.high)}
 
 
-def _json_schema() -> dict[str, Any]:
-    def pair(keys: Mapping[str, int]) -> dict[str, Any]:
-        several = {"type": "array", "items": {"type": "number"}}
-        lists = {key: several | {"minItems": n, "maxItems": n} for key, n in keys.items()}
-        return {"type": "object", "properties": lists, "required": [*keys], "additionalProperties": False}
-
-    return {"anyOf": [pair(form) for form in _FORMS.values()]}
-
-
+_SCHEMA = [
+    {"type": "object", "properties": dict.fromkeys(form, _PAIR), "required": [*form], "additionalProperties": False}
+    for form in _FORMS.values()
+]
 #: Prior as a field of a study's section.
-PriorField = Annotated[Prior, PlainValidator(_from_study), PlainSerializer(_to_study), WithJsonSchema(_json_schema())]
+PriorField = Annotated[
+    Prior, PlainValidator(_from_study), PlainSerializer(_to_study), WithJsonSchema({"anyOf": _SCHEMA})
+]

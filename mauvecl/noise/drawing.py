@@ -8,10 +8,10 @@ realistic number of draws reveals the difference.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from itertools import product
+from itertools import chain, product
 from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast
 
 import numpy as np
@@ -172,12 +172,6 @@ def joint_is_exact(c: Cumulants) -> NDArray[np.bool_]:
     return np.asarray(smooth & (over_sd[0] <= MAX_SKEW) & ~cut_off)
 
 
-def needs_fourth_power(c: Cumulants, *, varying: bool = False) -> bool:
-    """Return whether omitting the fourth power of the polynomial is noticeable; see `truncation_distance`."""
-    distance = truncation_distance(c.over_sd(), fourth_power=False, varying=varying)
-    return bool(is_noticeable(distance, c.variance).any())
-
-
 def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
     """Return the pixels whose frames can be drawn as one stack, from the cumulants of ONE frame.
 
@@ -287,23 +281,13 @@ def _quantiles(prior: Prior) -> tuple[Float, Float]:
     return values, prior.quantile(np.array([0.5]))
 
 
-def quantile_table(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
-    """Compute the quantile table of a prior, shape (2 * PRIOR_NODES,), and the factor at its median, minus one.
-
-    `change` converts the prior's values to a factor minus one. The table holds factors at `nodes` from the low end,
-    then from the high end, divided by the factor at the median, minus one. In this form float32 resolves priors of any
-    width and location.
-    """
-    at_nodes, median = _quantiles(prior)
-    values, centre = change(at_nodes), float(change(median)[0])
-    return ((values - centre) / (1.0 + centre)).astype(np.float32), centre
-
-
 @dataclass(frozen=True, eq=False)
 class Factors:
     """Factors of priors on light, dark and sky; factors on light include the sky's light."""
 
-    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `quantile_table`.
+    #: Quantile tables, shape (n_modulation, 2 * layout.PRIOR_NODES): factors at `nodes` from the low end of a prior,
+    #: then from the high end, divided by the factor at its median, minus one. In this form float32 resolves priors of
+    #: any width and location.
     tables: NDArray[np.float32]
     #: Factors at the priors' medians, to which the tables are relative, in the order of `SIGNAL_PARTS`.
     medians: dict[SignalPart, float]
@@ -323,7 +307,9 @@ class Factors:
                 raise InputError.of(
                     name, [float(first), float(last)], f"a prior between {varied.low:g} and {varied.high:g}"
                 )
-            tables[row], middle = quantile_table(prior, change)
+            at_nodes, median = _quantiles(prior)
+            middle = float(change(median)[0])
+            tables[row] = (change(at_nodes) - middle) / (1.0 + middle)
             centre[factor] *= 1.0 + middle
             least, most = sorted(1.0 + change(np.array([first, last])))
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
@@ -386,10 +372,14 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
             "Gaussian noise of at least 1.5 Poisson counts in each pixel and more for few counts, or no such process",
             key=modulations[0][0],
         )
+    quartic = joint and any(
+        is_noticeable(truncation_distance(c.over_sd(), fourth_power=False, varying=bool(modulations)), c.variance).any()
+        for c in chain(*varied)
+    )
     return DrawMethod(
         frames=frames,
         joint=joint,
-        quartic=joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row),
+        quartic=quartic,
         photons=not joint and quiet.photon_noise == "poisson",
         each=each,
         cumulants=cumulants,

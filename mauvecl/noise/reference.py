@@ -1,4 +1,6 @@
-"""Slow NumPy reference of the kernels' draws, and the components of a draw.
+"""Slow NumPy reference of the kernels' random numbers and draws, and the components of a draw.
+
+The generator is addressed by counter: each word depends only on realisation, frame, stream, group of pixels and seed.
 
 Counters, arithmetic and the order of sums are those of the kernels. Integers equal the device's, and so do floats on
 devices with strict arithmetic, because each fused multiply-add is rounded once. Tests and the self-test use it.
@@ -17,7 +19,6 @@ from scipy import special
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import DrawingOptions
-from mauvecl.noise.random_numbers import Floats, Words, fma, four_normals, words
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.columns import Column, table_of
@@ -31,6 +32,32 @@ MAGIC = np.float32(layout.MAGIC)
 #: A function that computes a * b + c.
 Fma = Callable[[Any, Any, Any], Any]
 T = TypeVar("T", np.uint32, np.float32)
+Words = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]
+Floats = NDArray[np.float32]
+
+_MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_POLYNOMIALS = {
+    name: [np.float32(float.fromhex(c)) for c in coefficients] for name, coefficients in layout.POLYNOMIALS.items()
+}
+_TWO_LN2 = np.float32(float.fromhex(layout.TWO_LN2))
+
+
+def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
+    """Compute Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405) of a counter and a 64-bit key.
+
+    The four words of the counter are broadcast against each other.
+    """
+    c0, c1, c2, c3 = np.broadcast_arrays(*(np.asarray(c, dtype=np.uint64) for c in counter))
+    half, low_half = np.uint64(32), np.uint64(0xFFFFFFFF)
+    for r in range(10):
+        k0, k1 = (
+            np.uint64((((seed >> shift) & 0xFFFFFFFF) + r * step) & 0xFFFFFFFF)
+            for shift, step in zip((0, 32), _KEY_STEPS, strict=True)
+        )
+        p0, p1 = _MULTIPLIERS[0] * c0, _MULTIPLIERS[1] * c2
+        c0, c1, c2, c3 = (p1 >> half) ^ c1 ^ k0, p1 & low_half, (p0 >> half) ^ c3 ^ k1, p0 & low_half
+    return (c0.astype(np.uint32), c1.astype(np.uint32), c2.astype(np.uint32), c3.astype(np.uint32))
 
 
 def words_at(
@@ -38,10 +65,57 @@ def words_at(
 ) -> Words:
     """Return the four words that four neighbouring pixels of a realisation and frame share in a stream.
 
-    The stream is a key of `layout.STREAMS`, the group is the pixel index divided by four, and the exposure is 0 for the
-    observed one and `layout.REFERENCE` for the reference.
+    The number of the stream, of which `layout.STREAMS` has the names, is the top byte of the counter's last word. The
+    group is the pixel index divided by four, and the exposure 0 for the observed one and `layout.REFERENCE` for the
+    reference.
     """
-    return words(realisation, frame, exposure + layout.STREAMS[stream], group, seed)
+    index, half = np.asarray(realisation, dtype=np.uint64), np.uint64(32)
+    last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
+    return philox((index & np.uint64(0xFFFFFFFF), index >> half, np.asarray(frame, dtype=np.uint64), last), seed)
+
+
+def fma(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Floats:
+    """Compute a * b + c in float32 with a single rounding.
+
+    The product is exact in float64. The sum is rounded to odd (its error decides the last bit), which makes the second
+    rounding, to float32, correct (Boldo & Melquiond 2008, doi 10.1109/TC.2007.70819).
+    """
+    product = np.asarray(a, np.float64) * np.asarray(b, np.float64)
+    addend = np.asarray(c, np.float64)
+    total = product + addend
+    virtual = total - product
+    error = (product - (total - virtual)) + (addend - virtual)
+    even = (np.asarray(total).view(np.int64) & 1) == 0
+    odd = np.nextafter(total, np.where(error > 0, np.inf, -np.inf))
+    return np.asarray(np.where((error != 0) & even, odd, total)).astype(np.float32)
+
+
+def _horner(name: str, x: Floats) -> Floats:
+    *rest, value = _POLYNOMIALS[name]
+    result: Floats = np.full_like(x, value)
+    for coefficient in reversed(rest):
+        result = fma(result, x, coefficient)
+    return result
+
+
+def normal_pair(radius_word: NDArray[np.uint32], angle_word: NDArray[np.uint32]) -> tuple[Floats, Floats]:
+    """Compute two standard normals from two words by the method of Box & Muller (1958, doi 10.1214/aoms/1177706645)."""
+    t = radius_word.astype(np.float32) + np.float32(0.5)
+    split = np.uint32(0x3F3504F3)
+    bits = t.view(np.uint32) - split
+    halvings = (np.int32(32) - (bits.view(np.int32) >> 23)).astype(np.float32)
+    f = ((bits & np.uint32(0x007FFFFF)) + split).view(np.float32) - np.float32(1.0)
+    radius = np.sqrt(fma(halvings, _TWO_LN2, f * _horner("log", f)))
+    s = (angle_word << np.uint32(1)).view(np.int32).astype(np.float32) * np.float32(2.0**-32)
+    y = s * s
+    sine, cosine = s * _horner("sin", y), _horner("cos", y)
+    radius = (radius.view(np.uint32) ^ (angle_word & np.uint32(0x80000000))).view(np.float32)
+    return radius * cosine, radius * sine
+
+
+def four_normals(w: Words) -> list[Floats]:
+    """Return the normals of four neighbouring pixels."""
+    return [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
 
 
 def alias_draw(

@@ -26,7 +26,7 @@ from mauvecl.noise.drawing import (
     polynomial,
     sky_share,
 )
-from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table_of, table_set
+from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table, alias_table_of
 from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, SIGNAL_PARTS, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
@@ -74,11 +74,12 @@ class FactorDistribution:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Quadrature nodes: sets of factors on dark, light and sky."""
+    """Quadrature nodes, which are sets of factors on dark, light and sky, and spectra of normal amplitudes."""
 
     probability: Float  # shape (n,)
     amounts: Float  # amounts of the changes of `changes_of`, shape (n, 3)
     scores: dict[str, Float]  # normal scores of each factor, shape (n,)
+    spectra: Float  # of factors that are treated as normal amplitudes, DN per standard deviation, shape (k, n_pixel)
 
 
 def changes_of(x: Expectation) -> tuple[Float, Float]:
@@ -94,65 +95,57 @@ def changes_of(x: Expectation) -> tuple[Float, Float]:
     return means, variances * (x.variance_dn2 / x.unsaturated_variance_dn2)
 
 
-@dataclass(frozen=True, eq=False)
-class FactorDistributions:
-    """Distributions of the drawn factors on light, dark and sky, averaged over an exposure."""
+def drawn_factors(processes: Processes, quiet: Expectation) -> dict[SignalPart, FactorDistribution]:
+    """Return the distributions of the factors that processes draw for a star, averaged over an exposure."""
+    factors = Factors.of(processes, quiet.conditions)
+    return factor_distributions(processes.modulations, factors.tables, tuple(factors.medians.values()), quiet.n_frames)
 
-    spreads: Mapping[str, FactorDistribution]
 
-    @classmethod
-    def from_processes(cls, processes: Processes, quiet: Expectation) -> FactorDistributions | None:
-        """Return the distributions of processes for a star, or None if they draw no factors."""
-        factors = Factors.of(processes, quiet.conditions)
-        return cls.of(processes.modulations, factors.tables, tuple(factors.medians.values()), quiet.n_frames)
+def factor_distributions(
+    modulations: Sequence[tuple[str, SignalPart]],
+    tables: NDArray[np.float32],
+    medians: tuple[float, ...],
+    n_frames: int,
+) -> dict[SignalPart, FactorDistribution]:
+    """Return the distributions of drawn factors on light, dark and sky; parameters as the fields of `Scene`."""
+    at_median, every = dict(zip(SIGNAL_PARTS, medians, strict=True)), dict[SignalPart, list[FactorDistribution]]()
+    for (name, factor), table in zip(modulations, tables, strict=True):
+        # Relative to the factor at the median, as the table is.
+        one = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
+        if PROCESSES[name].when == "frame" and n_frames > 1:
+            one = _normal(one.mean, one.sd / np.sqrt(n_frames))
+        every.setdefault(factor, []).append(one)
+    return {name: _product(ones, at_median[name]) for name, ones in every.items()}
 
-    @classmethod
-    def of(
-        cls,
-        modulations: Sequence[tuple[str, SignalPart]],
-        tables: NDArray[np.float32],
-        medians: tuple[float, ...],
-        n_frames: int,
-    ) -> FactorDistributions | None:
-        """Return the distributions of drawn factors, or None without any; parameters as the fields of `Scene`."""
-        at_median, spreads = dict(zip(SIGNAL_PARTS, medians, strict=True)), dict[SignalPart, list[FactorDistribution]]()
-        for (name, factor), table in zip(modulations, tables, strict=True):
-            # Relative to the factor at the median, as the table is.
-            spread = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
-            if PROCESSES[name].when == "frame" and n_frames > 1:
-                spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
-            spreads.setdefault(factor, []).append(spread)
-        return cls({name: _product(ones, at_median[name]) for name, ones in spreads.items()}) if spreads else None
 
-    def nodes(self, x: Expectation, *, weighted: bool) -> tuple[Nodes, Float]:
-        """Return the nodes over which a statistic of an exposure is integrated, and spectra of normal amplitudes.
+def factor_nodes(factors: Mapping[SignalPart, FactorDistribution], x: Expectation, *, weighted: bool) -> Nodes:
+    """Return the nodes over which a statistic of an exposure is integrated.
 
-        Factors that are treated as normal amplitudes have spectra, DN per standard deviation, (k, n_pixel). `weighted`
-        tells whether the statistic is a weighted sum instead of a sum of squares.
-        """
-        light, sky, dark = zip(*changes_of(x), strict=True)
-        moved = {"dark": dark, "light": light, "sky": sky}
-        grids, rows = [], []
-        every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
-        score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
-        for name, (part, variance) in moved.items():
-            spread = self.spreads.get(name)
-            if spread is None:
-                grids.append([(1.0, 1.0, 0.0)])
-                continue
-            if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
-                if spread.sd:
-                    rows.append(spread.sd * part)
-                grids.append([(1.0, spread.mean, 0.0)])
-                continue
-            values = np.interp(score, SCORE, spread.values)
-            grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
-            score, weight = few[0], few[1] / few[1].sum()
-        # Each of shape (n_factor, n).
-        weights, (dark, light, sky), scores = np.ascontiguousarray(np.array([*product(*grids)]).T)
-        amounts = np.column_stack([light - 1.0, light * (sky - 1.0), dark - 1.0])
-        nodes = Nodes(math.prod(weights), amounts, dict(zip(moved, scores, strict=True)))
-        return nodes, np.array(rows).reshape(len(rows), x.variance_dn2.size)
+    `weighted` tells whether the statistic is a weighted sum instead of a sum of squares.
+    """
+    light, sky, dark = zip(*changes_of(x), strict=True)
+    moved: dict[SignalPart, tuple[Float, Float]] = {"dark": dark, "light": light, "sky": sky}
+    grids, rows = [], []
+    every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
+    score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
+    for name, (part, variance) in moved.items():
+        spread = factors.get(name)
+        if spread is None:
+            grids.append([(1.0, 1.0, 0.0)])
+            continue
+        if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
+            if spread.sd:
+                rows.append(spread.sd * part)
+            grids.append([(1.0, spread.mean, 0.0)])
+            continue
+        values = np.interp(score, SCORE, spread.values)
+        grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
+        score, weight = few[0], few[1] / few[1].sum()
+    # Each of shape (n_factor, n).
+    weights, (dark, light, sky), scores = np.ascontiguousarray(np.array([*product(*grids)]).T)
+    amounts = np.column_stack([light - 1.0, light * (sky - 1.0), dark - 1.0])
+    spectra = np.array(rows).reshape(len(rows), x.variance_dn2.size)
+    return Nodes(math.prod(weights), amounts, dict(zip(moved, scores, strict=True)), spectra)
 
 
 def _normal(mean: float, sd: float) -> FactorDistribution:
@@ -216,10 +209,14 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
             f"than {SMALLEST_EXPANDED:g}, not {mean[pixel]:.3g}: draw frame by frame",
             key="mode",
         )
-    alias, starts = table_set(mean[~expanded].tolist(), tables)
-    out["table"][~expanded] = starts
-    out["bits"][~expanded] = [t.bits for t in alias]
-    out["low"][~expanded] = np.array([t.low for t in alias]) - centre[~expanded]
+    # Equal means share a table; tables are contiguous on the device.
+    means, which = np.unique(mean[~expanded], return_inverse=True)
+    alias = [alias_table(one) for one in means.tolist()]
+    ends = np.cumsum([sum(t.entries.size for t in tables), *(t.entries.size for t in alias)])
+    tables += alias
+    out["table"][~expanded] = ends[which]
+    out["bits"][~expanded] = np.array([t.bits for t in alias])[which]
+    out["low"][~expanded] = np.array([t.low for t in alias])[which] - centre[~expanded]
     root = np.sqrt(mean[expanded])
     out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
     out["slope"][expanded] = root - 1 / (36 * root)

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares import stare_scene
-from mauvecl.noise import layout, random_numbers, reference
+from mauvecl.noise import layout, reference
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.uint64]
 
 Flares, StareScene, SumTable = stare_scene.Flares, stare_scene.StareScene, stare_scene.SumTable
-fma = random_numbers.fma
+fma = reference.fma
 
 
 def exponential_less_one(x: Floats) -> Floats:
@@ -33,14 +33,12 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: 
     """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
     if scene.stare_job["jittered"]:
-        drawn = random_numbers.four_normals(
-            reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed)
-        )
+        drawn = reference.four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
         for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):
             moved[name] = z * scene.stare_job[f"{name}_jitter"]
     for u, kind in enumerate(scene.kinds):
         name = layout.MOVED[kind]
-        z = random_numbers.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
+        z = reference.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
     star, star_less_one, sky, sky_less_one, dark, dark_less_one, near, near_less_one, _ = scene.known[:, frame]
     light = moved["light"]
@@ -68,7 +66,7 @@ def _normals(scene: StareScene, numbers: Numbers, frame: int, stream: str, seed:
     """Draw a normal per statistic, rounded up to groups of four, shape (n_stare,) each."""
     groups = range(-(-len(scene.weights) // 4))
     words = [reference.words_at(numbers, int(scene.numbers[frame]), stream, group, seed) for group in groups]
-    return [z for each in words for z in random_numbers.four_normals(each)]
+    return [z for each in words for z in reference.four_normals(each)]
 
 
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
