@@ -125,8 +125,7 @@ def test_statistics_equal_reference(any_width: Engine, name: str, more: dict[str
     kind = {"statistics": names, "start": START, "seed": SEED, **how, **more}
     asked = requests.DetectRequest.of(quiet, tuple(flares), INDEX.size, **kind).hypotheses
     plan = requests.plan_channels(asked, range(len(flares)), first=True)
-    smoothed = numpy_kernels.Smoothed.of(asked, plan) if len(plan.scales) else None
-    sums = numpy_kernels.statistics(asked.scene, INDEX, SEED, plan, pair="chi2_pair" in names, smoothed=smoothed)
+    sums = numpy_kernels.statistics(asked, plan, INDEX, SEED)
     values = any_width.statistic_values(quiet, flares, count=INDEX.size, **kind)
     np.testing.assert_array_equal(values, numpy_kernels.marginalise(sums, plan.subtractions))
     if "nuisances" in more:
