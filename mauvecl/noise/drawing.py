@@ -342,6 +342,7 @@ OF_DETECTOR = ("wavelength_nm", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_
 class DrawMethod:
     """Method by which scenarios are drawn; see `Scene` for the switches."""
 
+    factors: Factors  # of the priors that are drawn
     frames: bool
     joint: bool
     quartic: bool
@@ -350,10 +351,10 @@ class DrawMethod:
     cumulants: list[Cumulants]  # of one draw of each scenario
 
 
-def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors) -> DrawMethod:
+def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMethod:
     """Choose the method for scenarios. Raises InputError if they cannot be drawn as requested, or not together."""
-    quiet, processes = scenarios[0], drawing.processes
-    modulations = processes.modulations
+    quiet, modulations = scenarios[0], drawing.processes.modulations
+    factors = Factors.of(drawing.processes, quiet.conditions)
     if quiet.wavelength_nm.size > MAX_PIXELS:
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
     for other in scenarios[1:]:
@@ -361,7 +362,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     # A grid of factors on light, dark and sky that spans the priors in steps of at most 2.
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
     corners = [*product(*(grid.tolist() for grid in grids))]
-    frames = _draw_frames(scenarios, drawing.mode, factors, processes, corners)
+    frames = _draw_frames(scenarios, drawing, factors, corners)
     each = 1 if frames else quiet.n_frames
     cumulants = [Cumulants.of(x, each) for x in scenarios]
     varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
@@ -376,14 +377,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
         is_noticeable(truncation_distance(c.over_sd(), fourth_power=False, varying=bool(modulations)), c.variance).any()
         for c in chain(*varied)
     )
-    return DrawMethod(
-        frames=frames,
-        joint=joint,
-        quartic=quartic,
-        photons=not joint and quiet.photon_noise == "poisson",
-        each=each,
-        cumulants=cumulants,
-    )
+    return DrawMethod(factors, frames, joint, quartic, not joint and quiet.photon_noise == "poisson", each, cumulants)
 
 
 def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray[np.bool_]:
@@ -430,17 +424,14 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
 
 
 def _draw_frames(
-    scenarios: Sequence[Expectation],
-    mode: Mode,
-    factors: Factors,
-    processes: Processes,
-    corners: Sequence[tuple[float, float, float]],
+    scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors, corners: Sequence[tuple[float, float, float]]
 ) -> bool:
+    mode = drawing.mode
     if scenarios[0].n_frames == 1 or mode == "frames":
         # For a single frame, both modes give the same draws.
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
-        near = near_rail(x, factors, processes)
+        near = near_rail(x, factors, drawing.processes)
         # The approximation of rounding as noise is worst for the least light and dark.
         coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
         for pixels, why in (

@@ -338,16 +338,15 @@ def prepare(
     process needs joint draws that are not exact.
     """
     drawing, quiet = drawing or Drawing(**words), scenarios[0]
-    factors = Factors.of(drawing.processes, quiet.conditions)
-    method = choose_method(scenarios, drawing, factors)
+    method = choose_method(scenarios, drawing)
     compared = np.array([0] * len(scenarios) if references is None else references, np.uint32)
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
     tables = list[AliasTable]()
     darks, dark_dn = _dark_counts(quiet, method, tables)
     arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
-        _fill_draw(arrays, k, x, method, factors, dark_dn, tables)
-        _fill_comparison(arrays, k, x, scenarios[compared[k]], method, comparison, used)
+        _fill_draw(arrays, k, x, method, dark_dn, tables)
+        _fill_comparison(arrays, k, method.each, scenarios[compared[k]], comparison, used)
     return Scene(
         n_pixel=used.size,
         n_frames=quiet.n_frames,
@@ -361,8 +360,8 @@ def prepare(
         pixels=detector_pixels(quiet, used),
         dark_counts=darks,
         tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
-        priors=factors.tables,
-        medians=tuple(factors.medians.values()),
+        priors=method.factors.tables,
+        medians=tuple(method.factors.medians.values()),
         references=compared,
         comparison=comparison,
         used=used,
@@ -405,16 +404,10 @@ def _padding(
 
 
 def _fill_draw(
-    arrays: PerScenario,
-    k: int,
-    x: Expectation,
-    method: DrawMethod,
-    factors: Factors,
-    dark_dn: Float,
-    tables: list[AliasTable],
+    arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, dark_dn: Float, tables: list[AliasTable]
 ) -> None:
     """Fill the arrays for the draw of scenario k, whose dark counts are relative to `dark_dn`."""
-    c, n_pixel, gain = method.cumulants[k], dark_dn.size, x.gain_dn_per_electron
+    c, factors, n_pixel, gain = method.cumulants[k], method.factors, dark_dn.size, x.gain_dn_per_electron
     level = arrays["levels"][k, :n_pixel]
     # The mean to which a draw is relative; separate Poisson counts are relative to integers.
     if method.joint:
@@ -438,19 +431,13 @@ def _fill_draw(
 
 
 def _fill_comparison(
-    arrays: PerScenario,
-    k: int,
-    x: Expectation,
-    reference: Expectation,
-    method: DrawMethod,
-    comparison: Comparison,
-    used: NDArray[np.bool_],
+    arrays: PerScenario, k: int, each: int, reference: Expectation, comparison: Comparison, used: NDArray[np.bool_]
 ) -> None:
-    """Fill the arrays for the comparison of scenario k with its reference."""
+    """Fill the arrays for the comparison of scenario k, in draws of `each` frames, with its reference."""
     base, n_pixel = arrays["base_dn"][k], used.size
     level, edge, fraction = (arrays[name][k, :n_pixel] for name in ("levels", "edges", "fraction"))
     mean_sum = reference.recorded_dn
-    whole = (x.n_frames // method.each) * base - np.rint(mean_sum)
+    whole = (reference.n_frames // each) * base - np.rint(mean_sum)
     if not comparison.exposures:
         fraction[:] = np.rint(mean_sum) - mean_sum
     level["shift"] = layout.MAGIC - whole
@@ -459,7 +446,7 @@ def _fill_comparison(
     level["twice"] = 2.0 * fraction * level["inverse_variance"]
     edge["base"], edge["whole"] = base, whole
     edge["low"] = layout.MAGIC - base
-    edge["high"] = layout.MAGIC + (x.highest_dn - base)
+    edge["high"] = layout.MAGIC + (reference.highest_dn - base)
     if comparison.estimated:
         # An observer knows the detector; padding has a variance of 1.
         estimate = arrays["estimates"][k]
@@ -468,11 +455,11 @@ def _fill_comparison(
         offset = np.rint(mean_sum) - reference.n_frames * (reference.bias_dn + reference.dark_dn)
         estimate["net_offset"][:n_pixel], estimate["gain"][:n_pixel] = offset, reference.gain_dn_per_electron
         estimate["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
-    ends = element_ends(x)
-    element_variance = np.bincount(x.element, variance * used)
+    ends = element_ends(reference)
+    element_variance = np.bincount(reference.element, variance * used)
     with np.errstate(divide="ignore"):
         edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
-    edge["element_offset"][ends] = np.bincount(x.element, fraction * used)
+    edge["element_offset"][ends] = np.bincount(reference.element, fraction * used)
 
 
 def _job(
