@@ -134,11 +134,11 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "far values lost": (
         "test_numbers_equal_those_of_sorting[0]",
-        ("        self._add_far(tile, tally)\n", ""),
+        ("for index in np.flatnonzero(outside).tolist():", "for index in ():"),
     ),
     "far S/N lost": (
         "test_snr_equals_that_of_sorting[16-0]",
-        ("            self._add_far_snr(tile, counts, np.flatnonzero(outside))\n", "            pass\n"),
+        ("tile.pieces(RAW_BATCH) if outside.size else ()", "()"),
     ),
     "7 rounds": (
         "test_philox_gives_the_known_answers",
@@ -159,7 +159,10 @@ MUTATIONS: dict[str, Mutation] = {
     "rounded normal for the dark": (
         "test_pearson_of_the_expansion",
         ("nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
-        ("nearest(fma(z, fma(z, curve, slope), offset))", "nearest(z * slope + offset)"),
+        (
+            'nearest(fma(z, fma(z, curve, source["slope"]), source["offset"]))',
+            'nearest(z * source["slope"] + source["offset"])',
+        ),
     ),
     "rounded normal for the joint draw": (
         "test_pearson_of_raw_counts",

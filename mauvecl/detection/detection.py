@@ -557,19 +557,14 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         }
 
 
-def _detected(probability: float, threshold: float) -> str:
-    """Return a detection probability, or why there is none."""
-    if probability == probability:
-        return f"{probability:.4f}"
-    return "saturated" if threshold == threshold else "no threshold"
-
-
 #: Columns of the table of detections.
 COLUMNS = (
     Column("name"),
     Column("statistic", description="detection statistic", heading="statistic"),
     Column("probability", description="detection probability at that threshold", heading="detected",
-           format=_detected, others=("threshold",)),
+           # Why there is none, where it is undefined.
+           format=lambda chance, cut: number(".4f", "saturated" if cut == cut else "no threshold")(chance),
+           others=("threshold",)),
     Column("low", description="its 95 % interval, lower end, the threshold's error included", heading=INTERVAL,
            format=interval(".4f"), others=("high",)),
     Column("high", description="its 95 % interval, upper end, the threshold's error included"),

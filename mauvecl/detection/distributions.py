@@ -324,7 +324,7 @@ class QuadraticForm:
         unit = float(self.weight.max())
         values, member = np.unique(self.weight / unit, return_inverse=True)
         count = np.bincount(member, minlength=values.size).astype(np.float64)
-        return Squares(values, count, np.bincount(member, self.shift**2, values.size), unit)
+        return Squares(values, count, np.bincount(member, self.shift**2, values.size).astype(np.float64), unit)
 
     @cached_property
     def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -350,24 +350,14 @@ class Device:
         self._pid = os.getpid()
 
     @property
-    def name(self) -> str:
-        """Platform and device name."""
-        return self.record.label
-
-    @property
     def variant(self) -> Variant:
         """Kernel variant of this device, before a scene sets its own options."""
         return Variant(width=self.width, vector_forms=self._vector_forms, chunk=PIXEL_BLOCK if self.width > 1 else 4)
 
     @property
-    def programs(self) -> list[str]:
-        """Sources built so far."""
-        return sorted(self._programs)
-
-    @property
     def kernel_digest(self) -> str:
         """Short sha256 of the kernels rendered so far, for run records."""
-        return hashlib.sha256("\n".join(self.programs).encode()).hexdigest()[:16]
+        return hashlib.sha256("\n".join(sorted(self._programs)).encode()).hexdigest()[:16]
 
     def kernel(self, kernel_files: tuple[str, ...], variant: Variant, name: str) -> Any:
         """Return a kernel of the program of these files; both are built once."""

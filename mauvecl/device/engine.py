@@ -36,14 +36,7 @@ from mauvecl.detection.snr import (
 from mauvecl.detection.statistics import Linear
 from mauvecl.device.build import Device, DeviceRecord, devices
 from mauvecl.device.drivers import DeviceError
-from mauvecl.device.launches import (
-    ELEMENT_CHUNK,
-    Progress,
-    Tile,
-    Tiles,
-    detection_launches,
-    scene_launches,
-)
+from mauvecl.device.launches import ELEMENT_CHUNK, Progress, Tile, Tiles, detection_launches, scene_launches
 from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison

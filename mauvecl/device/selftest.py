@@ -213,19 +213,6 @@ METHODS: dict[Any, Processes] = {
 }
 
 
-def stare_results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
-    """Return the sums of every frame of some stares with flares by each method, and the noise factors of the flares."""
-    components, stare, given = stare_case(name, count)
-    ours = {
-        method: Stares(engine.open_device).frames(
-            components, stare, given, first=START, count=count, seed=SEED, method=method, processes=processes
-        )
-        for method, processes in METHODS.items()
-    }
-    request = StaresRequest(components, stare, count, SEED, start=START, reduction=Glow(), glow=True)
-    return ours | {"noise of flares": Stares(engine.open_device).reduced(request)["glow"]}
-
-
 def stare_case(name: str, count: int) -> tuple[Components, Stare, NDArray[np.float64]]:
     """Return the components of the light of a case, its stare, and the light curves of its flares."""
     payload, wobble, n_sums = STARE_CASES[name]
@@ -308,9 +295,19 @@ START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 
 
 def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
-    """Return a device's results of a case: raw counts, statistics, histograms and tallies, or those of stares."""
+    """Return a device's results of a case: raw counts, statistics, histograms and tallies.
+
+    Those of stares are the sums of every frame with flares by each method, and the noise factors of the flares.
+    """
     if name in STARE_CASES:
-        return stare_results(engine, name, count)
+        stares, (components, stare, given) = Stares(engine.open_device), stare_case(name, count)
+        same: dict[str, Any] = {"first": START, "count": count, "seed": SEED}
+        ours = {
+            method: stares.frames(components, stare, given, method=method, processes=processes, **same)
+            for method, processes in METHODS.items()
+        }
+        request = StaresRequest(components, stare, count, SEED, start=START, reduction=Glow(), glow=True)
+        return ours | {"noise of flares": stares.reduced(request)["glow"]}
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     place: dict[str, Any] = {"start": START, "seed": SEED}

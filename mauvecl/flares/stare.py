@@ -493,9 +493,11 @@ class Stare:
             Numbers of the stares.
         seed : int
         """
+        from mauvecl.noise.reference import pointing_losses
+
         if self.pointing is None:
             return np.zeros((len(numbers), self.n_frames))
-        return self.pointing.losses(numbers, self.start_s, self.frame_s, seed)
+        return pointing_losses(self.pointing, numbers, self.start_s, self.frame_s, seed)
 
     def dark_factor(self, quiet: Expectation) -> Float:
         """Return the factor on an expectation's dark current in each frame, shape (n_frame,)."""

@@ -223,17 +223,11 @@ def alias_table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable
     bits = max(int(probability.size - 1).bit_length(), 1)
     padded = np.zeros(1 << bits)
     padded[: probability.size] = probability
-    return AliasTable(low, bits, _pack(_whole_words(padded), bits))
-
-
-def _whole_words(probability: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Convert probabilities to integers that sum to 2**32, by the method of largest remainders."""
-    exact = probability / probability.sum() * 2.0**WORD_BITS
+    # Integers that sum to 2**32, by the method of largest remainders.
+    exact = padded / padded.sum() * 2.0**WORD_BITS
     words: NDArray[np.int64] = np.floor(exact).astype(np.int64)
-    missing = int(2**WORD_BITS - words.sum())
-    largest = np.argsort(words - exact, kind="stable")[:missing]
-    words[largest] += 1
-    return words
+    words[np.argsort(words - exact, kind="stable")[: int(2**WORD_BITS - words.sum())]] += 1
+    return AliasTable(low, bits, _pack(words, bits))
 
 
 def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:

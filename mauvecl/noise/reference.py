@@ -1,7 +1,6 @@
-"""Slow NumPy reference of the kernels' random numbers and draws, and the components of a draw.
+"""Draws in NumPy: slow reference of the kernels, losses of light by pointing drifts, and components of a draw.
 
 The generator is addressed by counter: each word depends only on realisation, frame, stream, group of pixels and seed.
-
 Counters, arithmetic and the order of sums are those of the kernels. Integers equal the device's, and so do floats on
 devices with strict arithmetic, because each fused multiply-add is rounded once. Tests and the self-test use it.
 """
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from mauvecl.noise import layout
-from mauvecl.noise.disturbances import ADDITIVE
+from mauvecl.noise.disturbances import ADDITIVE, PointingDrifts
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
@@ -129,12 +128,6 @@ def alias_draw(
     return np.where((word & mask) < (entry & mask), column, entry >> shift)
 
 
-def expansion_draw(z: Floats, offset: ArrayLike, slope: ArrayLike, cubic: ArrayLike) -> Floats:
-    """Return Poisson counts of a large mean, relative to the mean rounded to an integer."""
-    curve = fma(z, cubic, np.float32(0.16666667))
-    return nearest(fma(z, fma(z, curve, slope), offset))
-
-
 def nearest(x: Floats) -> Floats:
     """Round to the nearest integer, ties to even, for values below 2**22."""
     return np.asarray((x + MAGIC) - MAGIC)
@@ -148,8 +141,10 @@ def _per_pixel(four: Sequence[NDArray[T]]) -> NDArray[T]:
 def poisson_counts(four: Words, source: NDArray[np.void], tables: NDArray[np.uint32]) -> Floats:
     """Return the counts of all pixels, relative to their rounded means, shape (n_pixel, n_draw)."""
     source = source[:, None]
-    # Both pixels of a pair use both words if the count comes from a normal.
-    counts = expansion_draw(_per_pixel(four_normals(four)), source["offset"], source["slope"], source["cubic"])
+    # Large means use an expansion in normals, in which both pixels of a pair use both words.
+    z = _per_pixel(four_normals(four))
+    curve = fma(z, source["cubic"], np.float32(0.16666667))
+    counts = nearest(fma(z, fma(z, curve, source["slope"]), source["offset"]))
     by_table = source["bits"][:, 0] > 0
     words, row = _per_pixel(four)[by_table], source[by_table]
     counts[by_table] = alias_draw(words, tables, row["bits"], row["table"]).astype(np.int32) + row["low"]
@@ -342,6 +337,57 @@ def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
 
 
 Float = NDArray[np.float64]
+
+#: Drifts that are drawn at a time, per stare.
+DRIFTS_AT_ONCE = 16
+
+
+def pointing_drifts(
+    process: PointingDrifts, numbers: NDArray[np.uint64], end_s: float, seed: int
+) -> tuple[Float, Float, Float]:
+    """Draw start, duration and depth of the drifts of stares up to a time, shape (n_stare, n_drift) each.
+
+    Each stare depends only on the seed and its number. Drifts are in order of time, and the last one of each stare
+    begins at `end_s` or later.
+    """
+    parts: list[tuple[Float, Float, Float]] = []
+    begin = np.zeros((len(numbers), 1))
+    index, n, stream = np.asarray(numbers, np.uint64)[:, None], 0, "stare_pointing"
+    while not parts or not (parts[-1][0][:, -1] >= end_s).all():
+        which = np.arange(n, n + DRIFTS_AT_ONCE)[None]
+        # Half the sum of two squared normals is exponential, and has the same bits on every machine.
+        a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, which, stream, 0, seed)))
+        wait, lasts = (a * a + b * b) / 2 * (3600.0 / process.rate_per_h), (c * c + d * d) / 2 * process.duration_s
+        share = (words_at(index, which, stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
+        ends = begin + np.cumsum(wait + lasts, axis=1)
+        parts.append((ends - lasts, lasts, share * process.depth))
+        begin, n = ends[:, -1:], n + DRIFTS_AT_ONCE
+    start, lasts, depth = (np.concatenate(several, axis=1) for several in zip(*parts, strict=True))
+    return start, lasts, depth
+
+
+def pointing_losses(
+    process: PointingDrifts, numbers: NDArray[np.uint64], start_s: NDArray[np.float64], frame_s: float, seed: int
+) -> Float:
+    """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
+
+    Frames start at `start_s` after the start of the stare.
+    """
+    start, lasts, depth = pointing_drifts(process, numbers, float(start_s[-1]) + frame_s, seed)
+    # Light lost up to the start of each drift, in seconds.
+    before = np.cumsum(depth * lasts / 2, axis=1) - depth * lasts / 2
+    rows = zip(start, lasts, depth, before, strict=True)
+    lost = np.array([_lost_until(start_s + frame_s, *row) - _lost_until(start_s, *row) for row in rows])
+    return np.clip(lost / frame_s, 0.0, 1.0)
+
+
+def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float, before_s: Float) -> Float:
+    """Return the integral of the lost share of the light up to some times, s."""
+    k = np.searchsorted(start_s, times_s, side="right") - 1
+    since = np.clip(times_s - start_s[k], 0.0, duration_s[k])
+    until = before_s[k] + depth[k] * since * (since / np.maximum(duration_s[k], 1e-300)) / 2
+    return np.asarray(np.where(k < 0, 0.0, until))
+
 
 #: Frames that are drawn together.
 FRAMES_AT_ONCE = 256

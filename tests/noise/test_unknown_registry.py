@@ -24,7 +24,6 @@ def test_every_default_prior_has_a_source_or_documentation() -> None:
     for row in unknowns.DOCUMENTED_NUISANCES:
         assert row.marginalised
         assert row.scatter > 0
-        assert row.process in unknowns.PROCESSES
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """NumPy reference implementation of the stare kernels, with the same counters, arithmetic and order of summation."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,15 +75,25 @@ def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, 
     return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
 
 
+def _conditions(
+    scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int
+) -> Iterator[tuple[int, dict[str, Floats], list[list[Floats]]]]:
+    """Yield each frame with its coefficients of steady components, and of the flares of each scenario."""
+    lost = scene.losses(numbers, seed)
+    for frame in frames:
+        steady = strengths(scene, numbers, frame, seed, lost)
+        every = range(len(flares.amplitudes))
+        yield frame, steady, [_coefficients(scene, flares, frame, k, steady["light"]) for k in every]
+
+
 def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
     """Draw statistics by the method "pixels", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
-    out, lost = [], scene.losses(numbers, seed)
-    for frame in frames:
-        conditions = strengths(scene, numbers, frame, seed, lost)
+    out = []
+    for frame, steady, of_flares in _conditions(scene, flares, numbers, frames, seed):
         drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), seed)
-        sums = np.zeros((4, len(flares.amplitudes), len(scene.weights), len(numbers)), np.float32)
-        for k in range(len(flares.amplitudes)):
-            v = _counts(scene, drawn.z, conditions, _coefficients(scene, flares, frame, k, conditions["light"]))
+        sums = np.zeros((4, len(of_flares), len(scene.weights), len(numbers)), np.float32)
+        for k, flare in enumerate(of_flares):
+            v = _counts(scene, drawn.z, steady, flare)
             for electrons in drawn.added.values():
                 v = fma(electrons, scene.scene.pixels["electron_gain"][:, None], v)
             x = reference.digitise(v, scene.scene.edges[0, :, None], clip=scene.scene.clip)
@@ -121,16 +131,10 @@ def _counts(scene: StareScene, z: Floats, conditions: dict[str, Floats], flare: 
 
 def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
     """Draw statistics by the method "cumulants", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
-    table = SumTable.of(scene.components)
-    out, lost = [], scene.losses(numbers, seed)
-    for frame in frames:
-        conditions = strengths(scene, numbers, frame, seed, lost)
+    table, out = SumTable.of(scene.components), []
+    for frame, steady, of_flares in _conditions(scene, flares, numbers, frames, seed):
         z = _normals(scene, numbers, frame, "stare_sums", seed)
-        rows = []
-        for k in range(len(flares.amplitudes)):
-            flare = _coefficients(scene, flares, frame, k, conditions["light"])
-            rows.append(_sums(scene, table, z, conditions, flare))
-        out.append(rows)
+        out.append([_sums(scene, table, z, steady, flare) for flare in of_flares])
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
 
 
