@@ -244,13 +244,6 @@ def spectrum_of(name: str, quiet: Expectation) -> Float:
     return np.asarray(NUISANCES[name].spectrum(quiet))
 
 
-def as_nuisances(given: Nuisances | Mapping[str, float] | None, quiet: Expectation) -> Nuisances | None:
-    """Convert standard deviations by name to nuisance parameters; an empty mapping becomes None."""
-    if given is None or isinstance(given, Nuisances):
-        return given
-    return Nuisances.of(quiet, given) if given else None
-
-
 def join_names(names: Sequence[str]) -> str:
     """Join names for a sentence: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
 from mauvecl.detection.counts import Grid, TailSamples
 from mauvecl.detection.distributions import Form
 from mauvecl.detection.names import DEFAULT_STATISTICS, Tails, check_statistic
-from mauvecl.detection.nuisances import Nuisances, as_nuisances
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
@@ -344,12 +344,8 @@ class Countable:
     #: Smallest number of realisations of a shard, a power of two.
     least: ClassVar[int] = 2**12
 
-    if TYPE_CHECKING:
-        # Fields of each request.
-        @property
-        def realisations(self) -> int: ...
-        @property
-        def start(self) -> int: ...
+    realisations: int
+    start: int
 
     @property
     def parts(self) -> int:
@@ -393,7 +389,9 @@ class DetectRequest(Countable):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "nuisances", as_nuisances(self.nuisances, self.quiet))
+        if isinstance(self.nuisances, Mapping):
+            unknown = Nuisances.of(self.quiet, self.nuisances) if self.nuisances else None
+            object.__setattr__(self, "nuisances", unknown)
 
     @cached_property
     def hypotheses(self) -> Hypotheses:

@@ -212,9 +212,9 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
     # Equal means share a table; tables are contiguous on the device.
     means, which = np.unique(mean[~expanded], return_inverse=True)
     alias = [alias_table(one) for one in means.tolist()]
-    ends = np.cumsum([sum(t.entries.size for t in tables), *(t.entries.size for t in alias)])
+    starts = np.cumsum([sum(t.entries.size for t in tables), *(t.entries.size for t in alias)])
     tables += alias
-    out["table"][~expanded] = ends[which]
+    out["table"][~expanded] = starts[which]
     out["bits"][~expanded] = np.array([t.bits for t in alias])[which]
     out["low"][~expanded] = np.array([t.low for t in alias])[which] - centre[~expanded]
     root = np.sqrt(mean[expanded])
