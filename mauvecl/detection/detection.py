@@ -111,8 +111,7 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
     for statistic, template in detection._nulls():
         kind, flare = detection.statistic(statistic), detection.shape(statistic, template)
         null, added = detection.closed_form(statistic, template=template), kind.added_variance(detection.setting)
-        cut = null.isf(fap)
-        rounding, both = 0.0, 0.0
+        cut, rounding, both = null.isf(fap), 0.0, 0.0
         for shift, variance in digital:
             moved = Differences(np.where(scene.used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
             form = kind.integrate_drawn(detection.setting, detection.quiet, moved, flare)

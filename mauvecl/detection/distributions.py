@@ -406,9 +406,8 @@ class Mixture:
 
     def sf(self, value: float) -> float:
         """Return the probability of exceeding `value`."""
-        normal = self._normal
-        if normal is not None:
-            mean, std = normal
+        if self._normal is not None:
+            mean, std = self._normal
             return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
         # Parts that hardly contribute need no relative precision.
         for relative in (False, True):

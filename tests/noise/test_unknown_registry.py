@@ -6,14 +6,14 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl import Processes, Stare, Study
-from mauvecl.noise import disturbances, unknowns
+from mauvecl.noise import unknowns
 from mauvecl.noise.scene import changes_of
 
 
 def test_keys_of_studies_are_the_registry() -> None:
     """Compare names and order of the processes' fields and of the keys of each section with the registry."""
     sections = Study().model_dump()
-    assert list(Processes.model_fields) == [*disturbances.ADDITIVE, *unknowns.PROCESSES]
+    assert list(Processes.model_fields) == ["cosmic_rays", *unknowns.PROCESSES]
     assert list(sections["nuisances"]) == ["usual", *unknowns.NUISANCES, "own"]
     assert list(sections["unknowns"]) == ["draws", *unknowns.INSTRUMENT_VALUES, "known"]
     assert {*unknowns.COURSES, *unknowns.STARE_PROCESSES} <= sections["stare"].keys()
