@@ -184,8 +184,8 @@ def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form,
     # Shifted gamma distributions with the cumulants of normal and of skewed noise.
     second, skewed = null.std**2 + np.array([0.0, more[0]]), null.third + np.array([0.0, more[1]])
     shape = 4.0 * second**3 / skewed**2
-    z = (cut - null.mean) / np.sqrt(second)
-    plain, there = special.gammaincc(shape, np.maximum(shape + z * np.sqrt(shape), 0.0)).tolist()
+    away = (cut - null.mean) / np.sqrt(second)
+    plain, there = special.gammaincc(shape, np.maximum(shape + away * np.sqrt(shape), 0.0)).tolist()
     return float(null.sf(cut) * there / plain)
 
 
@@ -291,7 +291,7 @@ class Roc(Drawable):
         if both[0][0][-1] < both[1][0][0] or both[1][0][-1] < both[0][0][0]:
             fewest = min(null.n, flare.n)
             found = clopper_pearson(round(area) * fewest, fewest)
-        return cls(np.append(lower[0], upper), *above, null.n, found)
+        return cls(np.append(lower[0], upper), above[0], above[1], null.n, found)
 
     def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> Any:
         """Plot detection probability against false-alarm probability; needs matplotlib."""
