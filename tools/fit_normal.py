@@ -1,4 +1,4 @@
-"""Fit the polynomials of mauvecl/noise/random_numbers.py, by Lawson's reweighted least squares, rounded to float32.
+"""Fit the polynomials of mauvecl/noise/layout.py, by Lawson's reweighted least squares, rounded to float32.
 
 python tools/fit_normal.py
 """

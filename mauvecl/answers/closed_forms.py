@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.detection.distributions import CONFIDENCE, Gaussian, Interval
+from mauvecl.detection.distributions import CONFIDENCE_SD, Gaussian, Interval
 from mauvecl.detection.names import MIN_IN_TAIL
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting
@@ -254,9 +254,8 @@ def average(intervals: Sequence[Interval]) -> Interval:
     """
     values = np.array([p.value for p in intervals])
     own = np.array([p.high - p.low for p in intervals]) / 2
-    reach = float(special.ndtri(0.5 + CONFIDENCE / 2))
     spread = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
-    half = float(np.hypot(reach * spread, np.sqrt(np.sum(own**2)) / values.size))
+    half = float(np.hypot(CONFIDENCE_SD * spread, np.sqrt(np.sum(own**2)) / values.size))
     mean = float(values.mean())
     return Interval(mean, max(mean - half, 0.0), min(mean + half, 1.0))
 

@@ -29,7 +29,8 @@ from mauvecl.detection.detection import (
 )
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.names import RECOMMENDED, check_fap, countable
-from mauvecl.detection.statistics import Linear, Matched, Setting, read_weights
+from mauvecl.detection.nuisances import read_at_pixels
+from mauvecl.detection.statistics import Linear, Matched, Setting
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
@@ -228,7 +229,8 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
     engine = engine or Engine()
 
     def detected(case: Case) -> StarDetection:
-        own = [read_weights(name, path, case.quiet.wavelength_nm) for name, path in run.weights.items()]
+        nm = case.quiet.wavelength_nm
+        own = [Linear(name, read_at_pixels("weights", name, path, nm)) for name, path in run.weights.items()]
         how = case.detect_options() | {"statistics": (*run.statistics, *own, *_other_templates(case))}
         detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
         statistics = [detection.statistic(name) for name in detection.statistics]
@@ -327,16 +329,16 @@ def _campaign(case: Case) -> list[str]:
 
     lines, tests = list[str](), many.tests
     lines.append(
-        f"A campaign of {asked.frames} frames makes {tests} tests: at {many.fap:g} per test {many.expected:.3g} false "
+        f"A campaign of {asked.frames} frames makes {tests} tests: at {run.fap:g} per test {tests * run.fap:.3g} false "
         f"alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
-        f"{many.at_most:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
+        f"{many.bound:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
     )
     if asked.fap is not None:
         rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=run.seed)
         lines.append(
             f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
-            f"{rate.independent:.4g} if they are independent, {rate.at_least:.4g} in any case"
-            f"{overlap(rate.overlapping, ', and')}: `fap={rate.at_least:.4g}`."
+            f"{rate.independent:.4g} if they are independent, {rate.bound:.4g} in any case"
+            f"{overlap(rate.overlapping, ', and')}: `fap={rate.bound:.4g}`."
         )
     if asked.alarms is not None:
         if not asked.alarms < tests:

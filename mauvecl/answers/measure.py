@@ -22,7 +22,7 @@ from mauvecl.detection.nuisances import fitted_amplitudes, join_names
 from mauvecl.device.engine import Engine
 from mauvecl.fits.flare_model import usable_variance
 from mauvecl.fits.spectrum import LEVELS, Measurement
-from mauvecl.noise.scene import FactorDistributions
+from mauvecl.noise.scene import drawn_factors
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of
@@ -326,8 +326,8 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
 
 def _not_marginalised(case: Case) -> list[str]:
     """Return a message on drawn factors over which fits do not marginalise."""
-    drawn, unknown = FactorDistributions.from_processes(case.processes, case.quiet), case.unknowns_of_fits()
-    names = [name for name in (drawn.spreads if drawn else ()) if unknown is None or name not in unknown.names]
+    drawn, unknown = drawn_factors(case.processes, case.quiet), case.unknowns_of_fits()
+    names = [name for name in drawn if unknown is None or name not in unknown.names]
     if not names:
         return []
     text = (

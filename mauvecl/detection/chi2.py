@@ -231,15 +231,13 @@ class Smoothing:
         rows = _rows(n, sigma)
         centres, between = _interpolation(n, step)
         smoothing = cls(centres, between, sigma, rows[centres].multiply(used).tocsr())
-        if step == 1 or all(smoothing._preserves_sum(flare, used) for flare in flares or (x,)):
-            return smoothing
-        return cls(np.arange(n), np.eye(n), sigma, rows.multiply(used).tocsr())
-
-    def _preserves_sum(self, flare: Expectation, used: NDArray[np.bool_]) -> bool:
-        """Return whether non-negative factors of the centres reproduce the mean of the sum over all pixels."""
-        scale, squares = self.scale(flare), _rows(used.size, self.sigma).power(2) @ (used * flare.variance_dn2)
-        whole, ours = float(self._inverse_flare(flare) @ squares), float(scale @ squares[self.centres])
-        return bool((scale >= 0).all() and abs(ours - whole) <= MAX_MEAN_ERROR * whole)
+        for flare in flares or (x,):
+            # Non-negative factors of the centres must reproduce the mean of the sum over all pixels.
+            scale, squares = smoothing.scale(flare), rows.power(2) @ (used * flare.variance_dn2)
+            whole, ours = float(smoothing._inverse_flare(flare) @ squares), float(scale @ squares[centres])
+            if (scale < 0).any() or abs(ours - whole) > MAX_MEAN_ERROR * whole:
+                return cls(np.arange(n), np.eye(n), sigma, rows.multiply(used).tocsr())
+        return smoothing
 
     def _inverse_flare(self, flare: Expectation) -> Float:
         """Return the inverse of the smoothed flare at every pixel, for squares of DN; zero where there is no light."""

@@ -135,16 +135,6 @@ class FarCounts(SparseCounts):
         # Sums of values and of their squares, in units of 2**-149 and 2**-298, and number of infinite values and NaN.
         self.first = self.second = self.undefined = 0
 
-    def add_values(self, values: NDArray[np.float32], *, above: bool) -> None:
-        """Count values outside the fine bins, all above or all below them."""
-        finite = np.isfinite(values)
-        if not finite.all():
-            self.undefined += int(values.size - finite.sum())
-            values = values[finite]
-        if values.size:
-            self.count(keys_of(values, above=above))
-            self.add_sums(*sums_of(values))
-
     def add_sums(self, first: int, second: int, undefined: int = 0) -> None:
         """Add sums of other realisations."""
         self.first += first
@@ -230,9 +220,11 @@ class Tally:
         above = steps >= HIGH_STEP
         # The complement counts NaN as below.
         below = ~(steps >= LOW_STEP)
+        far, finite = self.far[index], np.isfinite(values)
         for there, side in ((above, True), (below, False)):
-            if there.any():
-                self.far[index].add_values(values if there.all() else values[there], above=side)
+            found = values[there & finite]
+            far.count(keys_of(found, above=side))
+            far.add_sums(*sums_of(found), int(np.count_nonzero(there & ~finite)))
         return int(above.sum() + below.sum())
 
     def distribution(self, index: int) -> Distribution:

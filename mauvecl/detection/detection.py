@@ -14,7 +14,7 @@ from scipy import special
 from mauvecl.detection.chi2 import Chi2, Paper, Smoothing
 from mauvecl.detection.counts import Distribution, TailSamples, Tally
 from mauvecl.detection.distributions import (
-    CONFIDENCE,
+    CONFIDENCE_SD,
     Form,
     Interval,
     central_counts,
@@ -108,16 +108,18 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
         others.append("unknowns that are marginalised over and not drawn")
     digital = _adc_moments(detection.quiet) if scene.clip else []
     rows = []
-    for statistic in detection.statistics:
-        for template in range(len(detection.flares)) if detection.statistic(statistic).shaped else (0,):
-            null = detection.closed_form(statistic, template=template)
-            cut = null.isf(fap)
-            changes = [_shifted_fap(detection, statistic, template, *each, cut) / fap - 1.0 for each in digital]
-            rounding, both = changes or (0.0, 0.0)
-            simulated = detection.false_alarm_probability(cut, statistic, template=template)
-            skew = _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0
-            effects = skew, rounding, both - rounding, tuple(others)
-            rows.append(Departure(statistic, template, cut, fap, simulated, *effects, detection.realisations))
+    for statistic, template in detection._nulls():
+        kind, flare = detection.statistic(statistic), detection.shape(statistic, template)
+        null, added = detection.closed_form(statistic, template=template), kind.added_variance(detection.setting)
+        cut, rounding, both = null.isf(fap), 0.0, 0.0
+        for shift, variance in digital:
+            moved = Differences(np.where(scene.used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
+            form = kind.integrate_drawn(detection.setting, detection.quiet, moved, flare)
+            rounding, both = both, form.sf(cut) / fap - 1.0
+        simulated = detection.false_alarm_probability(cut, statistic, template=template)
+        skew = _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0
+        effects = skew, rounding, both - rounding, tuple(others)
+        rows.append(Departure(statistic, template, cut, fap, simulated, *effects, detection.realisations))
     return rows
 
 
@@ -178,29 +180,13 @@ def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form,
     assert isinstance(kind, Chi2 | Paper)
     # The square of a skewed variable has more variance and skew than that of a normal one.
     weights = kind.square_weights(detection.setting, flare)
-    second = null.std**2
-    skewed = null.third
     more = weights**2 @ fourth, weights**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
-    plain, there = (
-        _gamma_sf(cut, null.mean, second + part * float(more[0]), skewed + part * float(more[1])) for part in (0.0, 1.0)
-    )
-    return null.sf(cut) * there / plain
-
-
-def _gamma_sf(value: float, mean: float, variance: float, third: float) -> float:
-    """Return the probability of exceeding a value for a shifted gamma distribution with given cumulants."""
-    shape = 4.0 * variance**3 / third**2
-    return float(special.gammaincc(shape, max(shape + (value - mean) / np.sqrt(variance) * np.sqrt(shape), 0.0)))
-
-
-def _shifted_fap(
-    detection: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float
-) -> float:
-    """Return the false-alarm probability at a threshold for a changed mean and variance of each pixel."""
-    kind, used = detection.statistic(statistic), detection.scene.used
-    added = kind.added_variance(detection.setting)
-    moved = Differences(np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
-    return kind.integrate_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
+    # Shifted gamma distributions with the cumulants of normal and of skewed noise.
+    second, skewed = null.std**2 + np.array([0.0, more[0]]), null.third + np.array([0.0, more[1]])
+    shape = 4.0 * second**3 / skewed**2
+    away = (cut - null.mean) / np.sqrt(second)
+    plain, there = special.gammaincc(shape, np.maximum(shape + away * np.sqrt(shape), 0.0)).tolist()
+    return float(null.sf(cut) * there / plain)
 
 
 def _adc_moments(x: Expectation) -> list[tuple[Float, Float]]:
@@ -287,28 +273,25 @@ class Roc(Drawable):
         share their draws, so the interval is conservative. Without any overlap, its lower end is that of Clopper and
         Pearson for as many pairs as there are realisations.
         """
-        # Union of the filled bins.
-        bins = null.bins, flare.bins
-        lower, first = np.unique(np.concatenate([bins[0][0], bins[1][0]]), return_index=True)
-        upper = np.concatenate([bins[0][1], bins[1][1]])[first]
-        share, above = np.zeros((2, lower.size)), np.zeros((2, lower.size + 1))
-        for i, (d, (own, _, filled)) in enumerate(zip((null, flare), bins, strict=True)):
-            counts = np.zeros(lower.size, np.int64)
-            counts[np.searchsorted(lower, own)] = filled
-            share[i] = counts / d.n
-            # Integer counts above each edge make the ends of the curve exactly 1 and 0.
-            above[i, :-1] = counts[::-1].cumsum()[::-1] / d.n
+        # Union of the filled bins; the shapes are (2, n), for null and flare.
+        both, n = (null.bins, flare.bins), np.array([[null.n], [flare.n]])
+        lower, first = np.unique(np.concatenate([one[0] for one in both]), return_index=True)
+        upper = np.concatenate([one[1] for one in both])[first]
+        counts = np.zeros((2, lower.size), np.int64)
+        for row, (own, _, filled) in zip(counts, both, strict=True):
+            row[np.searchsorted(lower, own)] = filled
+        # Integer counts above each edge make the ends of the curve exactly 1 and 0.
+        above = np.pad(counts[:, ::-1].cumsum(axis=1)[:, ::-1], ((0, 0), (0, 1))) / n
+        share = counts / n
         beaten, beating = 1.0 - above[0, :-1] + 0.5 * share[0], above[1, :-1] - 0.5 * share[1]
         area = float(np.clip(share[1] @ beaten, 0.0, 1.0))
         spread = [float(c @ (values - area) ** 2) for c, values in ((share[1], beaten), (share[0], beating))]
-        reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * float(np.sqrt(spread[0] / flare.n + spread[1] / null.n))
-        low, high = max(area - reach, 0.0), min(area + reach, 1.0)
-        if bins[0][0][-1] < bins[1][0][0] or bins[1][0][-1] < bins[0][0][0]:
-            area = float(round(area))
-            n = min(null.n, flare.n)
-            sure = clopper_pearson(round(area) * n, n)
-            low, high = sure.low, sure.high
-        return cls(np.append(lower[0], upper), above[0], above[1], null.n, Interval(area, low, high))
+        reach = CONFIDENCE_SD * float(np.sqrt(spread[0] / flare.n + spread[1] / null.n))
+        found = Interval(area, max(area - reach, 0.0), min(area + reach, 1.0))
+        if both[0][0][-1] < both[1][0][0] or both[1][0][-1] < both[0][0][0]:
+            fewest = min(null.n, flare.n)
+            found = clopper_pearson(round(area) * fewest, fewest)
+        return cls(np.append(lower[0], upper), above[0], above[1], null.n, found)
 
     def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> Any:
         """Plot detection probability against false-alarm probability; needs matplotlib."""
@@ -483,12 +466,11 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     def without_threshold(self, fap: float) -> tuple[Message, ...]:
         """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
         sentences = []
-        for statistic in self.statistics:
-            for template in range(len(self.flares)) if self.statistic(statistic).shaped else (0,):
-                try:
-                    self.threshold(fap, statistic, template=template)
-                except NoThresholdError as error:
-                    sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
+        for statistic, template in self._nulls():
+            try:
+                self.threshold(fap, statistic, template=template)
+            except NoThresholdError as error:
+                sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
         return tuple(dict.fromkeys(sentences))
 
     def _threshold_if_any(self, fap: float, statistic: str, template: int) -> Interval:
@@ -574,19 +556,14 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         }
 
 
-def _detected(probability: float, threshold: float) -> str:
-    """Return a detection probability, or why there is none."""
-    if probability == probability:
-        return f"{probability:.4f}"
-    return "saturated" if threshold == threshold else "no threshold"
-
-
 #: Columns of the table of detections.
 COLUMNS = (
     Column("name"),
     Column("statistic", description="detection statistic", heading="statistic"),
     Column("probability", description="detection probability at that threshold", heading="detected",
-           format=_detected, others=("threshold",)),
+           # Why there is none, where it is undefined.
+           format=lambda chance, cut: number(".4f", "saturated" if cut == cut else "no threshold")(chance),
+           others=("threshold",)),
     Column("low", description="its 95 % interval, lower end, the threshold's error included", heading=INTERVAL,
            format=interval(".4f"), others=("high",)),
     Column("high", description="its 95 % interval, upper end, the threshold's error included"),

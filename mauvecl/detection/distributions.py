@@ -15,7 +15,6 @@ from functools import cache, cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from scipy import special
 
@@ -29,6 +28,8 @@ def smallest_integer(reached: Callable[[int], bool], low: int, high: int) -> int
 
 
 CONFIDENCE = 0.95
+#: Half-width of the interval of a normal value, in standard deviations.
+CONFIDENCE_SD = float(special.ndtri(0.5 + CONFIDENCE / 2))
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ def clopper_pearson_ends(
     """Return fractions and the lower and upper ends of their intervals; see `clopper_pearson`."""
     tail = (1.0 - CONFIDENCE) / 2.0
     with np.errstate(all="ignore"):
-        low = np.where(successes == 0, 0.0, scipy.special.betaincinv(successes, trials - successes + 1, tail))
-        high = np.where(successes == trials, 1.0, scipy.special.betainccinv(successes + 1, trials - successes, tail))
+        low = np.where(successes == 0, 0.0, special.betaincinv(successes, trials - successes + 1, tail))
+        high = np.where(successes == trials, 1.0, special.betainccinv(successes + 1, trials - successes, tail))
     return successes / trials, low, high
 
 
@@ -67,9 +68,9 @@ def central_counts(trials: int, probability: float) -> tuple[int, int]:
     """
     bounds = []
     for p in ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0):
-        count = int(np.ceil(scipy.special.bdtrik(p, trials, probability)))
+        count = int(np.ceil(special.bdtrik(p, trials, probability)))
         # The inverse is continuous, so the next lower count may suffice.
-        bounds.append(count - 1 if count > 0 and scipy.special.bdtr(count - 1, trials, probability) >= p else count)
+        bounds.append(count - 1 if count > 0 and special.bdtr(count - 1, trials, probability) >= p else count)
     return bounds[0], bounds[1]
 
 
@@ -102,7 +103,10 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     more = 0.5 if min(above_cut, missed) >= FEW else 0.0
     low = float(special.ndtri(special.betaincinv(above_cut + more, missed + 1.0 - more, tail)))
     high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - more, missed + more, 1.0 - tail)))
-    shared = _exceedance_correlation(fap, float(special.ndtr(middle)), correlation)
+    # Correlation of the crossings of the threshold without and with a flare.
+    p, cut = float(special.ndtr(middle)), float(special.ndtri(1.0 - fap))
+    both = _orthant(cut, float(special.ndtri(1.0 - p)), min(max(correlation, 0.0), 1.0))
+    shared = float((both - fap * p) / np.sqrt(fap * (1.0 - fap) * p * (1.0 - p)))
 
     def combined(sd: float, other: float) -> float:
         return float(np.sqrt(max(sd**2 + other**2 - 2.0 * shared * sd * other, 0.0)))
@@ -111,14 +115,6 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     beyond = combined(high - middle, upper - middle) if missed else np.inf
     value, ends = above_cut / trials, special.ndtr([middle - below, middle + beyond]).tolist()
     return Interval(value, min(ends[0], value), max(ends[1], value))
-
-
-def _exceedance_correlation(fap: float, probability: float, correlation: float) -> float:
-    """Return the correlation of threshold crossings without and with a flare, for two normals."""
-    h, k = special.ndtri([1.0 - fap, 1.0 - probability]).tolist()
-    both = _orthant(h, k, min(max(correlation, 0.0), 1.0))
-    spread = np.sqrt(fap * (1.0 - fap) * probability * (1.0 - probability))
-    return float((both - fap * probability) / spread)
 
 
 def _orthant(h: float, k: float, correlation: float) -> float:
@@ -157,15 +153,6 @@ class Squares:
     push: Float  # sum of their squared shifts
     unit: float  # unit of the weights and of the arguments `value`
 
-    @classmethod
-    def of(cls, weight: Float, shift: Float) -> Squares:
-        """Group weights and shifts, shape (n,) each."""
-        unit = float(weight.max())
-        values, member = np.unique(weight / unit, return_inverse=True)
-        push = np.bincount(member, shift**2, values.size)
-        count = np.bincount(member, minlength=values.size).astype(np.float64)
-        return cls(values, count, push.astype(np.float64), unit)
-
     def tail(self, value: float, *, upper: bool) -> tuple[float, float]:
         """Return the natural logarithm of the probability above or below a positive value, and density / probability.
 
@@ -176,12 +163,9 @@ class Squares:
         bend = self._derivative(left, 3) / (6.0 * self._derivative(left, 2))
         scale = 1.0 / np.sqrt(self._derivative(left, 2) + 1.0 / (0.5 - gap) ** 2)
         top = float(self._exponent(np.array([gap + 0j]), value, upper)[0].real)
-        while True:
-            mass = self._integral(value, upper, (gap, bend, scale), top)
-            if mass is not None:
-                break
+        while np.isnan(mass := self._integral(value, upper, (gap, bend, scale), top))[0]:
             bend = bend / 4 if bend * scale > 1e-6 else 0.0
-        probability, density = mass
+        probability, density = mass.tolist()
         return top + float(np.log(probability / np.pi)), density / probability
 
     def quantile(self, probability: float, *, upper: bool) -> float:
@@ -210,42 +194,34 @@ class Squares:
             at = after if low < after < high else (max(low, at - 3.0) + min(high, at + 3.0)) / 2
         raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
 
-    def _integral(
-        self, value: float, upper: bool, path: tuple[float, float, float], top: float
-    ) -> tuple[float, float] | None:
-        """Integrate probability and density divided by exp(top); return None if the integrand grows on the contour."""
-        step, total = STEP, self._sum(value, upper, path, top, 0.0, STEP)
-        before = None
-        for _ in range(HALVINGS):
-            if total is None:
-                return None
-            if before is not None and abs(total[0] * step - before) <= TOLERANCE * before:
-                break
-            before = total[0] * step
-            more = self._sum(value, upper, path, top, step / 2, step)
-            total, step = None if more is None else total + more, step / 2
-        return None if total is None else (total[0] * step, total[1] * step)
-
-    def _sum(
-        self, value: float, upper: bool, path: tuple[float, float, float], top: float, first: float, step: float
-    ) -> Float | None:
-        """Sum both integrands over points first, first + step, ... until they are negligible."""
+    def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> Float:
+        """Integrate probability and density divided by exp(top); NaN if the integrand grows on the contour."""
         gap, bend, scale = path
-        total = np.zeros(2)
-        while True:
-            t = first + step * np.arange(BLOCK)
-            y = scale * np.sinh(t)
-            s_gap = gap - bend * y**2 - 1j * y
-            exponent = self._exponent(s_gap, value, upper) - top
-            if exponent.real.max() > GROWTH:
-                return None
-            size = np.exp(exponent) * (1.0 - 2j * bend * y) * scale * np.cosh(t)
-            size[t == 0.0] /= 2
-            total += np.sum(size.real), np.sum((size * (0.5 - s_gap if upper else s_gap - 0.5)).real)
-            died = exponent[-1].real + 2 * t[-1] < -NEGLIGIBLE
-            if died or t[-1] > MAX_T:
-                return total
-            first = t[-1] + step
+
+        def summed(first: float, step: float) -> Float:
+            """Sum both integrands over points first, first + step, ... until they are negligible."""
+            total = np.zeros(2)
+            while True:
+                t = first + step * np.arange(BLOCK)
+                y = scale * np.sinh(t)
+                s_gap = gap - bend * y**2 - 1j * y
+                exponent = self._exponent(s_gap, value, upper) - top
+                if exponent.real.max() > GROWTH:
+                    return np.full(2, np.nan)
+                size = np.exp(exponent) * (1.0 - 2j * bend * y) * scale * np.cosh(t)
+                size[t == 0.0] /= 2
+                total += np.sum(size.real), np.sum((size * (0.5 - s_gap if upper else s_gap - 0.5)).real)
+                if exponent[-1].real + 2 * t[-1] < -NEGLIGIBLE or t[-1] > MAX_T:
+                    return total
+                first = t[-1] + step
+
+        step, total, before = STEP, summed(0.0, STEP), 0.0
+        for _ in range(HALVINGS):
+            mass = float(total[0]) * step
+            if np.isnan(mass) or abs(mass - before) <= TOLERANCE * before:
+                break
+            before, total, step = mass, total + summed(step / 2, step), step / 2
+        return step * total
 
     def _factors(self, gap: NDArray[Any]) -> NDArray[Any]:
         """Return 1 - 2 weight s for s = 1/2 - gap, without cancellation near the branch point."""
@@ -333,11 +309,10 @@ class QuadraticForm:
         if self._chi_squared:
             return float(special.chdtrc(self.weight.size, value))
         if self.effective_terms >= MANY:
+            above = float(value < self.mean)
             if abs(value - self.mean) <= NEAR * self.std:
                 u, size, phase = self._near
                 above = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
-            else:
-                above = float(value < self.mean)
             if above >= RARE or not relative:
                 return min(max(above, 0.0), 1.0)
         upper = value > self.mean
@@ -346,7 +321,10 @@ class QuadraticForm:
 
     @cached_property
     def _squares(self) -> Squares:
-        return Squares.of(self.weight, self.shift)
+        unit = float(self.weight.max())
+        values, member = np.unique(self.weight / unit, return_inverse=True)
+        count = np.bincount(member, minlength=values.size).astype(np.float64)
+        return Squares(values, count, np.bincount(member, self.shift**2, values.size).astype(np.float64), unit)
 
     @cached_property
     def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -428,9 +406,8 @@ class Mixture:
 
     def sf(self, value: float) -> float:
         """Return the probability of exceeding `value`."""
-        normal = self._normal
-        if normal is not None:
-            mean, std = normal
+        if self._normal is not None:
+            mean, std = self._normal
             return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
         # Parts that hardly contribute need no relative precision.
         for relative in (False, True):

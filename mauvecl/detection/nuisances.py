@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,30 +244,23 @@ def spectrum_of(name: str, quiet: Expectation) -> Float:
     return np.asarray(NUISANCES[name].spectrum(quiet))
 
 
-def as_nuisances(given: Nuisances | Mapping[str, float] | None, quiet: Expectation) -> Nuisances | None:
-    """Convert standard deviations by name to nuisance parameters; an empty mapping becomes None."""
-    if given is None or isinstance(given, Nuisances):
-        return given
-    return Nuisances.of(quiet, given) if given else None
-
-
 def join_names(names: Sequence[str]) -> str:
     """Join names for a sentence: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Read a nuisance spectrum from a file of wavelengths, nm, and DN per exposure, and interpolate it to pixels."""
-    return read_values(f"spectrum {shortened(path.name)} of {shortened(name)}", "DN", path, wavelength_nm)
+def read_at_pixels(
+    kind: Literal["weights", "spectrum"], name: str, path: Path, wavelength_nm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Read weights per DN of a statistic, or the spectrum of an unknown in DN per exposure, as values of pixels.
 
-
-def read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Read values of a file of two columns, and interpolate them to pixels."""
+    The file's columns are wavelengths, nm, and values, which are interpolated by `at_pixels`.
+    """
     from mauvecl.host.tables.text_tables import columns
 
-    text = read_text(path, kind if kind == "weights" else "spectrum")
-    rows = columns(what, text, f"wavelengths and {kind}", "nm")
-    return at_pixels(what, kind, rows, wavelength_nm)
+    what, values = f"{kind} {shortened(path.name)} of {shortened(name)}", "DN" if kind == "spectrum" else kind
+    rows = columns(what, read_text(path, kind), f"wavelengths and {values}", "nm")
+    return at_pixels(what, values, rows, wavelength_nm)
 
 
 def at_pixels(

@@ -7,11 +7,11 @@ device, and more than once; `sums` adds them up.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +20,12 @@ from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
 from mauvecl.detection.counts import Grid, TailSamples
 from mauvecl.detection.distributions import Form
 from mauvecl.detection.names import DEFAULT_STATISTICS, Tails, check_statistic
-from mauvecl.detection.nuisances import Nuisances, as_nuisances
-from mauvecl.detection.statistics import (
-    Linear,
-    LinearStatistic,
-    Matched,
-    Setting,
-    Statistic,
-    UvExcess,
-)
+from mauvecl.detection.nuisances import Nuisances
+from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
-from mauvecl.noise.scene import BATCH, FactorDistributions, Scene, prepare
+from mauvecl.noise.scene import BATCH, Scene, factor_distributions, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message
@@ -96,9 +89,8 @@ class Hypotheses:
     def __post_init__(self) -> None:
         self._chosen = statistics_by_name(self.asked)
         self.statistics = tuple(self._chosen)
-        scene, drawn = self.scene, None
-        if self.nuisances:
-            drawn = FactorDistributions.of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
+        scene = self.scene
+        drawn = factor_distributions(scene.modulations, scene.priors, scene.medians, scene.n_frames)
         self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
         if shaped is not None and not self.flares:
@@ -117,6 +109,11 @@ class Hypotheses:
         if name not in self._chosen:
             raise InputError.of("statistic", name, f"one of {', '.join(self.statistics)}")
         return self._chosen[name]
+
+    def _nulls(self) -> list[tuple[str, int]]:
+        """Return every statistic with every template that gives it a null distribution of its own."""
+        several = range(len(self.flares))
+        return [(name, k) for name, kind in self._chosen.items() for k in (several if kind.shaped else (0,))]
 
     def shape(self, statistic: str, template: int = 0) -> Expectation | None:
         """Return the flare that a shaped statistic uses as template; None for other statistics."""
@@ -233,8 +230,8 @@ class ChannelPlan:
 
     def tails(self) -> list[TailSamples | None]:
         """Return accumulators of each grid's extremes: the largest values of a null, the smallest of a flare."""
-        kinds: dict[Role, bool] = {"null": True, "flare": False}
-        return [TailSamples(largest=kinds[role]) if role in kinds else None for _, role, _ in self.keys]
+        roles = [role for _, role, _ in self.keys]
+        return [None if role == "flare_on_null_grid" else TailSamples(largest=role == "null") for role in roles]
 
     @property
     def n_rows(self) -> int:
@@ -246,12 +243,19 @@ class ChannelPlan:
 Rows = dict[tuple[str, int, int], NDArray[np.float64]]
 
 
-def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]) -> tuple[Rows, Rows]:
-    """Return the weights of sums over pixels, and the scales of the paper's statistic, in the kernel's order."""
-    weighted, smoothed = Rows(), Rows()
+def _rows(
+    hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]
+) -> tuple[Rows, Rows, NDArray[np.uint32]]:
+    """Return the weights of sums, and the scales of the paper's statistic, in the kernel's order.
+
+    The third result is the ends of linear rows, of those with weights per pixel, and of smoothed rows of each scenario,
+    shape (3, n_scenario).
+    """
+    weighted, smoothed, ends = Rows(), Rows(), []
     for scenario in range(1 + len(batch)):
         # Quiescent draws are compared with every flare's template, draws of a flare only with its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
+        of_pixels = len(weighted)
         # Shaped statistics come first, since the kernel fuses the first row, and sums over elements last.
         for statistic in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
             name, setting = statistic.name, hypotheses.setting
@@ -263,13 +267,9 @@ def _rows(hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[in
                     weighted |= {(name, scenario, k): own for k, own in enumerate(statistic.subtracted_rows(setting))}
                 elif isinstance(statistic, Paper):
                     smoothed[name, scenario, flare] = statistic.scale(setting, looked_for)
-    return weighted, smoothed
-
-
-def _per_scenario(keys: Iterable[tuple[str, int, int]], n_scenario: int) -> NDArray[np.uint32]:
-    """Return the number of rows of each scenario."""
-    scenarios = np.array([scenario for _, scenario, _ in keys], int)
-    return np.bincount(scenarios, minlength=n_scenario).astype(np.uint32)
+            of_pixels = of_pixels if statistic.by_element else len(weighted)
+        ends.append((len(weighted), of_pixels, len(smoothed)))
+    return weighted, smoothed, np.array(ends, np.uint32).T.copy()
 
 
 def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
@@ -278,7 +278,7 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     If `first`, the batch also counts the null distributions that all batches share.
     """
     asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
-    weighted, smoothed = _rows(hypotheses, asked, batch)
+    weighted, smoothed, (linear_end, pixels_end, scale_end) = _rows(hypotheses, asked, batch)
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
     channels = {key: fixed * n_scenario + number for number, key in enumerate([*weighted, *smoothed])}
 
@@ -310,11 +310,6 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     weights = np.zeros((len(weighted), len(scene.pixels)), np.float32)
     weights[:, : scene.n_pixel] = np.reshape([*weighted.values()], (len(weighted), scene.n_pixel))
     scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
-    linear_end, scale_end = (
-        np.cumsum(_per_scenario(rows, n_scenario), dtype=np.uint32) for rows in (weighted, smoothed)
-    )
-    of_elements = [key for key in weighted if hypotheses.statistic(key[0]).by_element]
-    pixels_end = linear_end - _per_scenario(of_elements, n_scenario)
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
     keys = [key for key, _, _ in counted]
     return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)
@@ -349,12 +344,8 @@ class Countable:
     #: Smallest number of realisations of a shard, a power of two.
     least: ClassVar[int] = 2**12
 
-    if TYPE_CHECKING:
-        # Fields of each request.
-        @property
-        def realisations(self) -> int: ...
-        @property
-        def start(self) -> int: ...
+    realisations: int
+    start: int
 
     @property
     def parts(self) -> int:
@@ -398,7 +389,9 @@ class DetectRequest(Countable):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "nuisances", as_nuisances(self.nuisances, self.quiet))
+        if isinstance(self.nuisances, Mapping):
+            unknown = Nuisances.of(self.quiet, self.nuisances) if self.nuisances else None
+            object.__setattr__(self, "nuisances", unknown)
 
     @cached_property
     def hypotheses(self) -> Hypotheses:

@@ -14,7 +14,7 @@ from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
 from mauvecl.host.arrays import ContentEquality
 from mauvecl.noise import layout
-from mauvecl.noise.random_numbers import Floats, fma
+from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
 from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError

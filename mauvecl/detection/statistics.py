@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
-from mauvecl.detection.nuisances import Nuisances, join_names, read_values
+from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.host.arrays import ContentEquality
-from mauvecl.noise.scene import FactorDistributions, changes_of
-from mauvecl.noise.unknowns import NOISE_FREE, Comparison
+from mauvecl.noise.scene import FactorDistribution, changes_of, factor_nodes
+from mauvecl.noise.unknowns import NOISE_FREE, Comparison, SignalPart
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -36,7 +35,7 @@ class Setting:
     flares: Sequence[Expectation] = ()  # possible templates
     nuisances: Nuisances | None = None  # parameters that statistics marginalise over
     # Random factors over which closed forms of marginalised statistics integrate.
-    drawn: FactorDistributions | None = None
+    drawn: Mapping[SignalPart, FactorDistribution] = field(default_factory=dict)
     _cache: dict[tuple[str, int], Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -173,11 +172,11 @@ class Statistic(ABC):
         if not setting.integrates:
             return self.form(setting, seen if priors else replace(seen, scatter=np.zeros((0, seen.mean.size))), flare)
         assert setting.nuisances
-        assert setting.drawn
-        nodes, rows = setting.drawn.nodes(observed, weighted=isinstance(self, LinearStatistic))
-        # Parameters that are not drawn keep their Gaussian priors.
-        others = setting.nuisances.without(tuple(setting.drawn.spreads))
+        nodes = factor_nodes(setting.drawn, observed, weighted=isinstance(self, LinearStatistic))
+        rows = nodes.spectra
         if priors:
+            # Parameters that are not drawn keep their Gaussian priors.
+            others = setting.nuisances.without(tuple(setting.drawn))
             rows = np.vstack([rows, others.finite(others.spectra)])
         means, variances = changes_of(observed)
         moved = Differences(seen.mean, seen.variance, scatter=rows)
@@ -394,12 +393,3 @@ class Linear(ContentEquality, LinearStatistic):
 
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         return np.asarray(self.weights * setting.used)
-
-
-def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> Linear:
-    """Read a linear statistic from a file of wavelengths, nm, and weights per DN.
-
-    Weights are interpolated linearly and are 0 outside the file's range.
-    """
-    what = f"weights {shortened(path.name)} of {shortened(name)}"
-    return Linear(name, read_values(what, "weights", path, wavelength_nm))

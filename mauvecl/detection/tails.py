@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.detection.distributions import (
-    CONFIDENCE,
-    Form,
+    CONFIDENCE_SD,
     Interval,
     Mixture,
     QuadraticForm,
@@ -30,7 +29,7 @@ from mauvecl.detection.names import check_atom, check_probability, least_countab
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE
-from mauvecl.noise.scene import quantile_at_score
+from mauvecl.noise.scene import factor_nodes, quantile_at_score
 from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.errors import InputError
 
@@ -47,37 +46,26 @@ MIN_BEYOND = 100
 
 
 @dataclass(frozen=True)
-class Campaign:
-    """False alarms of a whole campaign."""
+class CampaignRisk:
+    """Probability of any false alarm in a campaign, or the one of each test that gives a wanted one of the campaign."""
 
     tests: int
-    fap: float  # of one test
-    expected: float  # expected number of false alarms, for any dependence of the tests
-    at_most: float  # upper limit of the campaign's false-alarm probability (Bonferroni)
-    independent: float  # campaign's false-alarm probability for independent tests
-    overlapping: Interval | None  # the same for a normal statistic of overlapping stacks; None without overlap
+    bound: float  # for any dependence of the tests (Bonferroni)
+    independent: float  # for independent tests
+    overlapping: Interval | None  # for a normal statistic of overlapping stacks; None without overlap
 
 
-@dataclass(frozen=True)
-class PerTest:
-    """False-alarm probability of one test that gives a campaign a wanted false-alarm probability."""
-
-    tests: int
-    wanted: float  # probability of any false alarm in the campaign
-    at_least: float  # sufficient for any dependence of the tests (Bonferroni)
-    independent: float  # for independent tests; sufficient too for overlapping stacks of a linear statistic
-    # For a normal statistic of overlapping stacks; None without overlap or with too few simulated maxima beyond.
-    overlapping: Interval | None
-
-
-def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> PerTest:
+def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> CampaignRisk:
     """Return the false-alarm probability per test for a wanted one of the campaign; the inverse of `campaign`.
+
+    The bound suffices for any dependence of the tests, and the probability for independent ones also for overlapping
+    stacks of a linear statistic. Too few simulated maxima beyond a threshold give no probability for overlapping ones.
 
     Examples
     --------
     >>> from mauvecl.detection.tails import campaign, per_test
     >>> one = per_test(0.01, 17_280)
-    >>> f"{one.at_least:.3g} {one.independent:.3g}"
+    >>> f"{one.bound:.3g} {one.independent:.3g}"
     '5.79e-07 5.82e-07'
     >>> round(campaign(one.independent, 17_280).independent, 6)
     0.01
@@ -94,10 +82,10 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
             low, high = central_counts(SIMULATIONS, share)
             counts = (round(share * SIMULATIONS), low, high)
             overlapping = Interval(*(float(special.ndtr(-maxima[SIMULATIONS - k])) for k in counts))
-    return PerTest(tests, wanted, wanted / tests, float(-np.expm1(np.log1p(-wanted) / tests)), overlapping)
+    return CampaignRisk(tests, wanted / tests, float(-np.expm1(np.log1p(-wanted) / tests)), overlapping)
 
 
-def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> Campaign:
+def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> CampaignRisk:
     """Return the false-alarm probability of a search through consecutive frames.
 
     `fap` is that of one test, `stack` the number of frames summed in a test, and `step` that from one stack to the
@@ -110,16 +98,21 @@ def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None
     --------
     >>> from mauvecl.detection.tails import campaign
     >>> day = campaign(1e-5, 17_280)
-    >>> day.tests, round(day.at_most, 4), round(day.independent, 4)
+    >>> day.tests, round(day.bound, 4), round(day.independent, 4)
     (17280, 0.1728, 0.1587)
     """
     step = stack if step is None else step
     tests = count_tests(frames, stack, step)
     check_probability("fap", fap)
-    overlapping = _overlapping(fap, tests, stack, step, seed) if step < stack and tests > 1 else None
-    return Campaign(
-        tests, fap, tests * fap, min(tests * fap, 1.0), float(-np.expm1(tests * np.log1p(-fap))), overlapping
-    )
+    independent, overlapping = float(-np.expm1(tests * np.log1p(-fap))), None
+    if step < stack and tests > 1:
+        # The probability of an alarm in a stretch; stretches are combined as if they were independent.
+        stretch = min(tests, STRETCH)
+        alarms = int((_maxima(stretch, stack, step, seed) >= -special.ndtri(fap) * np.sqrt(stack)).sum())
+        one = clopper_pearson(alarms, SIMULATIONS)
+        chances = np.minimum([one.value, one.low, one.high], 1 - 1e-16)
+        overlapping = Interval(*(-np.expm1(tests / stretch * np.log1p(-chances))).tolist())
+    return CampaignRisk(tests, min(tests * fap, 1.0), independent, overlapping)
 
 
 def count_tests(frames: int, stack: int, step: int) -> int:
@@ -130,18 +123,6 @@ def count_tests(frames: int, stack: int, step: int) -> int:
             key="step",
         )
     return (frames - stack) // step + 1
-
-
-def _overlapping(fap: float, tests: int, stack: int, step: int, seed: int) -> Interval:
-    """Simulate the probability of an alarm in a stretch, and combine stretches as if they were independent."""
-    stretch = min(tests, STRETCH)
-    cut = -special.ndtri(fap) * np.sqrt(stack)
-    alarms = int((_maxima(stretch, stack, step, seed) >= cut).sum())
-    chance = clopper_pearson(alarms, SIMULATIONS)
-    power = tests / stretch
-    return Interval(
-        *(float(-np.expm1(power * np.log1p(-min(p, 1 - 1e-16)))) for p in (chance.value, chance.low, chance.high))
-    )
 
 
 def _maxima(stretch: int, stack: int, step: int, seed: int) -> NDArray[np.float64]:
@@ -201,8 +182,13 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
         for number in range(len(blocks), goal // BLOCK):
             blocks.append(_block(hypotheses, statistic, template, how, seed, number))
         values, logs = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        cut, error = _threshold(values, logs, fap)
-        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, *_probabilities_at(values, logs, cut.value))
+        weight, n = np.exp(logs), values.size
+        cut, error = _threshold(values, weight, fap)
+        # Probabilities of values above the threshold, and a lower limit of that of the threshold itself.
+        same = weight[values == cut.value]
+        at = float(same.sum() / n)
+        least = at - 4.0 * math.sqrt(max(float(same @ same) / n - at**2, 0.0) / n)
+        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, float(weight[values > cut.value].sum() / n), least)
         if error <= WANTED_ERROR:
             return Tail(cut, fap, error, values.size)
         if goal >= MAX_REALISATIONS:
@@ -233,10 +219,10 @@ def _check(hypotheses: Hypotheses, fap: float) -> None:
             )
 
 
-def _threshold(values: Float, logs: Float, fap: float) -> tuple[Interval, float]:
+def _threshold(values: Float, weights: Float, fap: float) -> tuple[Interval, float]:
     """Return the value with a weighted fraction `fap` at or above, and the fraction's relative error."""
     order = np.argsort(-values, kind="stable")
-    ordered, weight = values[order], np.exp(logs[order])
+    ordered, weight = values[order], weights[order]
     above = np.cumsum(weight) / values.size
     # Variance of the mean weight of the draws that exceed each value.
     variance = np.maximum(np.cumsum(weight**2) / values.size - above**2, 0.0) / values.size
@@ -246,19 +232,10 @@ def _threshold(values: Float, logs: Float, fap: float) -> tuple[Interval, float]
     at = int(np.searchsorted(above, fap))
     relative = float(error[at] / above[at])
     # The fraction at the ends differs by its error at the threshold.
-    reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * relative
+    reach = CONFIDENCE_SD * relative
     ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
     low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
     return Interval(float(ordered[at]), low, high), relative
-
-
-def _probabilities_at(values: Float, logs: Float, cut: float) -> tuple[float, float]:
-    """Return the probability of values above a threshold, and a lower limit of that of the threshold itself."""
-    weight, n = np.exp(logs), values.size
-    same = weight[values == cut]
-    mean = float(same.sum() / n)
-    error = math.sqrt(max(float(same @ same) / n - mean**2, 0.0) / n)
-    return float(weight[values > cut].sum() / n), mean - 4.0 * error
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,21 +261,26 @@ class _Tilt:
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
         if isinstance(null, Mixture):
-            assert setting.drawn
             # Posterior probability of the factors given an alarm.
             chance = null.weights * [part.sf(goal) for part in parts]
             chance = chance / chance.sum()
-            nodes = setting.drawn.nodes(hypotheses.quiet, weighted=tilt.square is None)[0]
+            nodes = factor_nodes(setting.drawn, hypotheses.quiet, weighted=tilt.square is None)
             for name, score in nodes.scores.items():
                 mean = float(chance @ score)
                 scores[name] = mean, max(float(np.sqrt(chance @ (score - mean) ** 2)), 1.0)
         if tilt.square is None:
             # Linear statistic: shift the mean along its direction, by the mean in alarms.
-            moves = [_hazard((goal - part.mean) / part.std) for part in parts] if scores else [goal / tilt.per_sigma]
+            moves = np.array([goal / tilt.per_sigma])
+            if scores:
+                z = np.array([(goal - part.mean) / part.std for part in parts])
+                moves = np.exp(-(z**2) / 2 - special.log_ndtr(-z)) / np.sqrt(2 * np.pi)
             return cls(tilt.directions, np.ones(1), float(chance @ moves), scores)
         if setting.nuisances:
-            # Account for squares that marginalisation subtracts and factors add.
-            goal = float(tilt.square.sum() * (chance @ [_growth(part, goal) for part in parts]))
+            # Account for squares that marginalisation subtracts and factors add: the growth, at least one, of the
+            # central squares that makes the mean of each sum of squares equal to the goal.
+            squares = [part for part in parts if isinstance(part, QuadraticForm)]
+            growth = [(goal - float(part.weight @ part.shift**2)) / float(part.weight.sum()) for part in squares]
+            goal = float(tilt.square.sum() * (chance @ np.maximum(growth, 1.0)))
         # Quadratic statistic: exponential tilting of each independent square increases the spread.
         return cls(tilt.directions, _stretch(tilt.square, goal), scores=scores)
 
@@ -312,17 +294,6 @@ class _Tilt:
         # Ratio of standard normal densities to those of spread `stretch`.
         logs = np.log(self.stretch).sum() - 0.5 * there**2 @ (1.0 - 1.0 / self.stretch**2)
         return (there - along) @ self.directions, np.asarray(logs)
-
-
-def _hazard(z: float) -> float:
-    """Return the mean of a standard normal variable given that it exceeds z."""
-    return float(np.exp(-(z**2) / 2 - special.log_ndtr(-z)) / np.sqrt(2 * np.pi))
-
-
-def _growth(form: Form, goal: float) -> float:
-    """Return the factor, at least one, on central squares that makes the mean of a sum of squares equal to `goal`."""
-    assert isinstance(form, QuadraticForm)
-    return max((goal - float(form.weight @ form.shift**2)) / float(form.weight.sum()), 1.0)
 
 
 def _stretch(square: Float, goal: float) -> Float:

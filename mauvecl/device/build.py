@@ -13,7 +13,6 @@ import warnings
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.device.drivers import (
@@ -26,7 +25,7 @@ from mauvecl.device.drivers import (
     show_intel_runtime,
 )
 from mauvecl.host import VERSION
-from mauvecl.noise import layout, random_numbers
+from mauvecl.noise import layout
 from mauvecl.noise.scene import PIXEL_BLOCK
 from mauvecl.noise.unknowns import PROCESSES
 
@@ -140,7 +139,14 @@ def load_opencl() -> Any:
         os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
     except OSError as error:
         raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
-    _provide_libraries(kernel_cache().work / "libraries")
+    libraries = kernel_cache().work / "libraries"
+    if not libraries.exists():
+        # PoCL links kernels as a compiler links programs, with the compiler's own libraries, although kernels call none
+        # of their functions. Empty archives take their places where no compiler is installed.
+        libraries.mkdir()
+        for name in ("gcc", "gcc_s", "c"):
+            (libraries / f"lib{name}.a").write_bytes(b"!<arch>\n")
+        os.environ["LIBRARY_PATH"] = os.pathsep.join(filter(None, (os.environ.get("LIBRARY_PATH"), str(libraries))))
     if kernel_cache().pid != os.getpid():
         # PoCL's threads do not survive a fork; its next call would wait forever.
         raise DeviceError("OpenCL was loaded before a fork, but needs a newly started process (use spawn)")
@@ -151,20 +157,6 @@ def load_opencl() -> Any:
     except ImportError as error:
         raise DeviceError(f"pyopencl cannot be loaded ({error}): install {driver_sources()}") from error
     return pyopencl
-
-
-def _provide_libraries(folder: Path) -> None:
-    """Let kernels be linked where no compiler is installed.
-
-    PoCL links each kernel as a compiler links a program: with libraries that come with compilers, although kernels call
-    none of their functions. Empty archives take their places, and are searched after those that are installed.
-    """
-    if folder.exists():
-        return
-    folder.mkdir()
-    for name in ("gcc", "gcc_s", "c"):
-        (folder / f"lib{name}.a").write_bytes(b"!<arch>\n")
-    os.environ["LIBRARY_PATH"] = os.pathsep.join(filter(None, (os.environ.get("LIBRARY_PATH"), str(folder))))
 
 
 def _devices() -> list[Any]:
@@ -248,8 +240,8 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
     values = asdict(variant) | {
         "attributes": local,
         "streams": layout.STREAMS,
-        "polynomials": {k: [f"{c}f" for c in v] for k, v in random_numbers.POLYNOMIALS.items()},
-        "two_ln2": f"{random_numbers.TWO_LN2}f",
+        "polynomials": {k: [f"{c}f" for c in v] for k, v in layout.POLYNOMIALS.items()},
+        "two_ln2": f"{layout.TWO_LN2}f",
         "magic": f"{layout.MAGIC}f",
         "reference": layout.REFERENCE,
         "fixed": len(layout.FIXED_STATISTICS),
@@ -358,24 +350,14 @@ class Device:
         self._pid = os.getpid()
 
     @property
-    def name(self) -> str:
-        """Platform and device name."""
-        return self.record.label
-
-    @property
     def variant(self) -> Variant:
         """Kernel variant of this device, before a scene sets its own options."""
         return Variant(width=self.width, vector_forms=self._vector_forms, chunk=PIXEL_BLOCK if self.width > 1 else 4)
 
     @property
-    def programs(self) -> list[str]:
-        """Sources built so far."""
-        return sorted(self._programs)
-
-    @property
     def kernel_digest(self) -> str:
         """Short sha256 of the kernels rendered so far, for run records."""
-        return hashlib.sha256("\n".join(self.programs).encode()).hexdigest()[:16]
+        return hashlib.sha256("\n".join(sorted(self._programs)).encode()).hexdigest()[:16]
 
     def kernel(self, kernel_files: tuple[str, ...], variant: Variant, name: str) -> Any:
         """Return a kernel of the program of these files; both are built once."""

@@ -257,14 +257,6 @@ def flags() -> frozenset[str]:
     return frozenset()
 
 
-def target(device: Any) -> tuple[str, str] | None:
-    """Return the triple and processor name for which PoCL compiles, or None if they need no change."""
-    match = TARGET.search(str(device.version))
-    if match is None or not (CHOOSES_LIBRARY in str(device.platform.version) or match[2] == UNKNOWN):
-        return None
-    return match[1], match[2]
-
-
 def names(device: Any) -> tuple[str | None, ...]:
     """Return the names to compile for, best first; ``(None,)`` leaves the choice to PoCL."""
     return levels(flags()) if flags() and _name_address(device) is not None else (None,)
@@ -281,12 +273,14 @@ def set_processor_name(device: Any, name: str) -> bool:
 
 
 def _name_address(device: Any) -> int | None:
-    """Return the address of the pointer to the processor's name in PoCL's record, or None if it is not found."""
-    own_target = target(device)
-    if own_target is None:
+    """Return the address of the pointer to the processor's name in PoCL's record.
+
+    None if the name needs no change, or is not found.
+    """
+    match = TARGET.search(str(device.version))
+    if match is None or not (CHOOSES_LIBRARY in str(device.platform.version) or match[2] == UNKNOWN):
         return None
-    triple, own = own_target
-    record = int(device.int_ptr)
+    (triple, own), record = match.groups(), int(device.int_ptr)
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError:
@@ -340,12 +334,17 @@ def show_intel_runtime() -> Iterator[None]:
 @cache
 def _folder() -> Path | None:
     """Make a folder of .icd files, Intel's among them, or return None if there is nothing to add."""
-    library = _library()
-    if library is None:
+    try:
+        file = next(file for file in metadata.files(WHEEL) or () if file.name == DRIVER)
+        library = Path(str(file.locate())).resolve(strict=True)
+    except (metadata.PackageNotFoundError, StopIteration, OSError):
         return None
     system = os.environ.get(FOLDER_VARIABLES[1]) or DEFAULT_FOLDER
     folders = [system, os.path.join(sys.prefix, "etc", "OpenCL", "vendors")]
-    files = {path.name: _text(path) for place in reversed(folders) for path in sorted(Path(place).glob("*.icd"))}
+    files = {}
+    for path in (path for place in reversed(folders) for path in sorted(Path(place).glob("*.icd"))):
+        with contextlib.suppress(OSError, UnicodeError):
+            files[path.name] = path.read_text(encoding="utf-8")
     drivers = {name: text for name, text in files.items() if DRIVER not in text or Path(text.strip()).exists()}
     if any(DRIVER in text for text in drivers.values()):
         # The system lists Intel's runtime already.
@@ -357,22 +356,6 @@ def _folder() -> Path | None:
             (folder / name).write_text(text, encoding="utf-8")
         return folder
     return None
-
-
-def _library() -> Path | None:
-    """Return the path of the wheel's library, or None if the wheel is not installed."""
-    with contextlib.suppress(metadata.PackageNotFoundError):
-        for file in metadata.files(WHEEL) or ():
-            if file.name == DRIVER:
-                path = Path(str(file.locate())).resolve()
-                return path if path.exists() else None
-    return None
-
-
-def _text(path: Path) -> str:
-    with contextlib.suppress(OSError, UnicodeError):
-        return path.read_text(encoding="utf-8")
-    return ""
 
 
 #: Kinds of failures that callers may want to tell apart.
@@ -434,14 +417,20 @@ def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> 
 
 def _working_level(device: Any, names: tuple[str | None, ...], others: Callable[[], Sequence[Any]]) -> str | None:
     """Return the level that an earlier process has found, or try levels until a first build succeeds."""
-    limit_s = _limit_s()
+    said = os.environ.get(LIMIT, "")
+    try:
+        limit_s = float(said or LIMIT_S)
+    except ValueError:
+        limit_s = -1.0
+    if not 0 <= limit_s <= 86400:
+        raise InputError.of(LIMIT, said, "between 1 and 86400 seconds of processor time, or 0 for no limit")
     number = next((i for i, other in enumerate(others()) if other.int_ptr == device.int_ptr), None)
     if limit_s == 0 or number is None or not sys.executable:
         return names[0]
     # The level's key in the cache is unique for driver, processor and installation.
     about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
-    said = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
-    cache, key = kernel_cache(), f"level-{hashlib.sha256(said.encode()).hexdigest()[:32]}"
+    unique = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
+    cache, key = kernel_cache(), f"level-{hashlib.sha256(unique.encode()).hexdigest()[:32]}"
     known = cache.read_text(key)
     if known is not None:
         return known or None
@@ -463,14 +452,6 @@ def _working_level(device: Any, names: tuple[str | None, ...], others: Callable[
         f"processor {device.name.strip()} ({'; '.join(failed)}); it needs enough memory, a linker that works, another "
         f"device (`mauvecl devices` lists them) or another driver: {driver_sources()}; {LIMIT} sets the limit of time"
     )
-
-
-def _limit_s() -> float:
-    said = os.environ.get(LIMIT, "")
-    with contextlib.suppress(ValueError):
-        if not said or 0 <= float(said) <= 86400:
-            return float(said or LIMIT_S)
-    raise InputError.of(LIMIT, said, "between 1 and 86400 seconds of processor time, or 0 for no limit")
 
 
 def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | None:

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from mauvecl.detection.counts import TailSamples, Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.names import DEFAULT_STATISTICS, Tails
-from mauvecl.detection.nuisances import Nuisances, as_nuisances
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.requests import (
     Countable,
     DetectRequest,
-    Hypotheses,
     RealiseRequest,
     Shard,
     SnrRequest,
@@ -36,14 +35,7 @@ from mauvecl.detection.snr import (
 from mauvecl.detection.statistics import Linear
 from mauvecl.device.build import Device, DeviceRecord, devices
 from mauvecl.device.drivers import DeviceError
-from mauvecl.device.launches import (
-    ELEMENT_CHUNK,
-    Progress,
-    Tile,
-    Tiles,
-    detection_launches,
-    scene_launches,
-)
+from mauvecl.device.launches import ELEMENT_CHUNK, Progress, Tile, Tiles, detection_launches, scene_launches
 from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
@@ -360,15 +352,14 @@ class Engine:
             including the sums that a marginalised chi2 subtracts. Finally ``paper``, in the order of ``matched``.
         """
         self.open_device.check_process()
-        check_last(start, count)
+        how = (start, Drawing(**drawing), comparison, "counted", nuisances)
         # The request validates the arguments and turns a single flare into a sequence.
-        request = DetectRequest(quiet, flares, count, seed, statistics)  # type: ignore[arg-type]
-        flares, statistics = request.flares, request.statistics
-        scene = prepare([quiet, *flares], comparison=comparison, **drawing)
-        if len(flares) >= BATCH[scene.frames]:
-            raise InputError.of("flares", len(flares), f"at most {BATCH[scene.frames] - 1} in one launch")
-        hypotheses = Hypotheses(quiet, flares, statistics, scene, nuisances=as_nuisances(nuisances, quiet))
-        plan = plan_channels(hypotheses, range(len(flares)), first=True)
+        request = DetectRequest(quiet, flares, count, seed, statistics, *how)  # type: ignore[arg-type]
+        hypotheses, n_flares = request.hypotheses, len(request.flares)
+        scene = hypotheses.scene
+        if n_flares >= BATCH[scene.frames]:
+            raise InputError.of("flares", n_flares, f"at most {BATCH[scene.frames] - 1} in one launch")
+        plan = plan_channels(hypotheses, range(n_flares), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 
         with detection_launches(self.open_device, scene, seed, plan, hypotheses) as launches:

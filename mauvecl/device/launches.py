@@ -96,7 +96,8 @@ class Tiles:
                     raise
                 if size <= self._step:
                     raise DeviceError(
-                        f"{self._device.name} has too little memory for {self._step} realisations of it: {error}",
+                        f"{self._device.record.label} has too little memory for {self._step} realisations of it: "
+                        f"{error}",
                         "memory",
                     ) from error
                 size //= 2
@@ -162,7 +163,8 @@ class Launches:
             if not out_of_memory(error):
                 raise
             raise DeviceError(
-                f"{self._device.name} has too little memory for {data.nbytes} bytes of a scene: {error}", "memory"
+                f"{self._device.record.label} has too little memory for {data.nbytes} bytes of a scene: {error}",
+                "memory",
             ) from error
         self._buffers.append(buffer)
         return buffer
@@ -236,19 +238,15 @@ class Launches:
         self._launch("histogram", items, *observed)
         self._queue.finish()
         self._counted += tile.wanted
-        outside = self._take(self._histograms[-1], self._shapes[-1])
-        if outside.any():
-            self._add_far_snr(tile, counts, np.flatnonzero(outside))
-        if self._counted * self._scene.n_draws > MAX_COUNTED:
-            self.flush_counts(counts)
-
-    def _add_far_snr(self, tile: Tile, counts: Counts, elements: NDArray[np.intp]) -> None:
-        """Count values outside the device's bins on the host, from the raw spectra of the same realisations."""
-        for piece in tile.pieces(RAW_BATCH):
+        outside = np.flatnonzero(self._take(self._histograms[-1], self._shapes[-1]))
+        # The host counts values outside the device's bins, from the raw spectra of the same realisations.
+        for piece in tile.pieces(RAW_BATCH) if outside.size else ():
             raw = np.empty((piece.wanted, self._scene.n_pixel), np.int32)
             self.realise(piece, raw)
             base = self._scene.n_draws * self._scene.base_dn[0]
-            counts.add_far(np.ascontiguousarray(raw.T) - base[:, None], *self._observed, elements)
+            counts.add_far(np.ascontiguousarray(raw.T) - base[:, None], *self._observed, outside)
+        if self._counted * self._scene.n_draws > MAX_COUNTED:
+            self.flush_counts(counts)
 
     def flush_counts(self, counts: Counts) -> None:
         """Move the device's histograms to the host."""
@@ -316,20 +314,17 @@ class Launches:
         self._launch("tally", (count,) if items == 1 else (count, items), *tile.rows(), np.uint32(tile.size), *buffers)
         self._queue.finish()
         self._counted += tile.wanted
-        self._add_far(tile, tally)
-        if self._counted > MAX_COUNTED:
-            self.flush(tally)
-
-    def _add_far(self, tile: Tile, tally: Tally) -> None:
-        """Count values outside the device's bins on the host."""
-        outside = self._take(self._named["outside"], (len(tally.grids),))
-        for index in np.flatnonzero(outside):
-            outlying = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
+        # The host counts values outside the device's bins.
+        outside = self._take(self._named["outside"], (count,))
+        for index in np.flatnonzero(outside).tolist():
+            outlying = tally.add_far(index, self.channel(tile, tally.grids[index].channel))
             if outlying != outside[index]:
                 raise DeviceError(
-                    f"{self._device.name} must have {outlying} values outside a histogram as the host, but has "
+                    f"{self._device.record.label} must have {outlying} values outside a histogram as the host, but has "
                     f"{outside[index]}"
                 )
+        if self._counted > MAX_COUNTED:
+            self.flush(tally)
 
     def flush(self, tally: Tally) -> None:
         """Move the device's histograms and sums to the host."""

@@ -213,19 +213,6 @@ METHODS: dict[Any, Processes] = {
 }
 
 
-def stare_results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
-    """Return the sums of every frame of some stares with flares by each method, and the noise factors of the flares."""
-    components, stare, given = stare_case(name, count)
-    ours = {
-        method: Stares(engine.open_device).frames(
-            components, stare, given, first=START, count=count, seed=SEED, method=method, processes=processes
-        )
-        for method, processes in METHODS.items()
-    }
-    request = StaresRequest(components, stare, count, SEED, start=START, reduction=Glow(), glow=True)
-    return ours | {"noise of flares": Stares(engine.open_device).reduced(request)["glow"]}
-
-
 def stare_case(name: str, count: int) -> tuple[Components, Stare, NDArray[np.float64]]:
     """Return the components of the light of a case, its stare, and the light curves of its flares."""
     payload, wobble, n_sums = STARE_CASES[name]
@@ -308,9 +295,19 @@ START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 
 
 def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
-    """Return a device's results of a case: raw counts, statistics, histograms and tallies, or those of stares."""
+    """Return a device's results of a case: raw counts, statistics, histograms and tallies.
+
+    Those of stares are the sums of every frame with flares by each method, and the noise factors of the flares.
+    """
     if name in STARE_CASES:
-        return stare_results(engine, name, count)
+        stares, (components, stare, given) = Stares(engine.open_device), stare_case(name, count)
+        same: dict[str, Any] = {"first": START, "count": count, "seed": SEED}
+        ours = {
+            method: stares.frames(components, stare, given, method=method, processes=processes, **same)
+            for method, processes in METHODS.items()
+        }
+        request = StaresRequest(components, stare, count, SEED, start=START, reduction=Glow(), glow=True)
+        return ours | {"noise of flares": stares.reduced(request)["glow"]}
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     place: dict[str, Any] = {"start": START, "seed": SEED}
@@ -359,11 +356,6 @@ def statistics_of(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS
     return tuple(n for n in names if not STATISTICS[n].paired) if "nuisances" in how else names
 
 
-def digest(array: NDArray[Any]) -> str:
-    """Return a short digest of the bytes of an array."""
-    return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:12]
-
-
 def known_answers(engine: Engine) -> Check:
     """Compare Philox on the device, plain and in its loop-invariant form, with Random123's vectors."""
     device = engine.open_device
@@ -392,7 +384,8 @@ def check_results(engine: Engine) -> Iterator[Check]:
             # Zeros may have either sign.
             differ = [part for part in differ if not np.array_equal(ours[part], theirs[part])]
         if not differ:
-            passed, text = True, "digests " + " ".join(digest(array) for array in ours.values())
+            digests = (hashlib.sha256(array.tobytes()).hexdigest()[:12] for array in ours.values())
+            passed, text = True, f"digests {' '.join(digests)}"
         elif engine.device.promise == SAME_BITS:
             passed, text = False, f"{', '.join(differ)} differ from the reference's"
         else:

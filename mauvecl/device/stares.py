@@ -267,11 +267,9 @@ class StareLaunches(Launches):
         """
         if self._by_sums:
             self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
-        else:
-            self._by_pixels(tile, out[:, row : row + tile.wanted])
-
-    def _by_pixels(self, tile: Tile, out: Floats) -> None:
-        """Draw pixels, a few frames of all stares at a time."""
+            return
+        # Pixels are drawn a few frames of all stares at a time.
+        out = out[:, row : row + tile.wanted]
         tile = tile.narrow(self.variant.width)
         n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
         block = max(1, TILE_BYTES // (4 * each))

@@ -493,9 +493,11 @@ class Stare:
             Numbers of the stares.
         seed : int
         """
+        from mauvecl.noise.reference import pointing_losses
+
         if self.pointing is None:
             return np.zeros((len(numbers), self.n_frames))
-        return self.pointing.losses(numbers, self.start_s, self.frame_s, seed)
+        return pointing_losses(self.pointing, numbers, self.start_s, self.frame_s, seed)
 
     def dark_factor(self, quiet: Expectation) -> Float:
         """Return the factor on an expectation's dark current in each frame, shape (n_frame,)."""
@@ -548,7 +550,7 @@ def _unknowns(
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
     most = 100.0 if of == "temperature" else LARGEST_SPREAD
     if not least <= sd <= most:
-        unit = STARE_CHANGES["offsets"][of].unit
+        unit = "deg C" if of == "temperature" else ""
         above = "0" if least == 0 else "above 0"
         raise InputError.of(name, sd, f"a standard deviation of {above} to {most:g} {unit}".rstrip())
 

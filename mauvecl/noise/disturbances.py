@@ -6,12 +6,11 @@ Studies contain priors, so this module imports NumPy only when a quantile is com
 from __future__ import annotations
 
 import contextlib
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -31,61 +30,16 @@ if TYPE_CHECKING:
 NEGLIGIBLE = 2.0**-40
 
 
-@validated
-class AdditiveProcess(Section, ABC):
-    """Charge that each pixel collects independently in each draw, and the study section that describes it.
-
-    Kernels draw it from a table of `charge` in a separate stream, multiply it by the gain, and add it to the other
-    noise of the pixel. Subclasses are listed in `ADDITIVE` by their study keys.
-    """
-
-    #: Number of the random stream in `layout.STREAMS`.
-    stream: ClassVar[int]
-    #: Name in messages and tables.
-    label: ClassVar[str]
-
-    @abstractmethod
-    def charge(self, seconds: float) -> Float:
-        """Return the probabilities of 0, 1, 2, ... electrons in a pixel in a time, shape (n,).
-
-        The omitted tail has a probability below `NEGLIGIBLE`.
-        """
-
-    @abstractmethod
-    def most_electrons(self, seconds: float) -> int:
-        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
-
-    def variance_dn2(self, quiet: Expectation) -> Float:
-        """Return the added variance of each pixel in a frame, DN^2, shape (n_pixel,)."""
-        import numpy as np
-
-        charge = self.charge(quiet.frame_s)
-        electrons = np.arange(charge.size)
-        variance = float(charge @ electrons**2 - (charge @ electrons) ** 2)
-        return np.asarray(variance * quiet.gain_dn_per_electron**2)
-
-    @property
-    def particles_per_cm2_s(self) -> float | None:
-        """Rate of incident particles, or None if the process is not caused by particles from outside."""
-        return None
-
-    def with_particles(self, rate_per_cm2_s: float) -> Self:
-        """Return the process at another rate of incident particles."""
-        return self
-
-    @property
-    def assumption(self) -> tuple[str, str, str]:
-        """Row of a table of assumptions: quantity, value and source."""
-        return (self.label, "", "the study")
-
-
 #: Rate of hits per area.
 ParticleRate = Annotated[float, Unit("1 / (cm2 s)"), Range(0, 1e6)]
 
 
 @validated
-class CosmicRays(AdditiveProcess):
+class CosmicRays(Section):
     """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
+
+    Each pixel collects charge independently in each draw: kernels draw it from a table of `charge` in a separate
+    stream, multiply it by the gain, and add it to the other noise of the pixel.
 
     Attributes
     ----------
@@ -101,6 +55,7 @@ class CosmicRays(AdditiveProcess):
         Relative probabilities of the integers in this range; equal by default.
     """
 
+    #: Number of the random stream in `layout.STREAMS`, and name in messages and tables.
     stream: ClassVar[int] = 3
     label: ClassVar[str] = "cosmic rays"
 
@@ -110,8 +65,7 @@ class CosmicRays(AdditiveProcess):
     electrons: tuple[float, float] = (500.0, 1000.0)
     weights: tuple[float, ...] | None = None
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         low, high = self.electrons
         if not 1 <= low <= high <= 100_000:
             raise InputError.of("electrons", (low, high), "between 1 and 100000, ascending", where="cosmic rays")
@@ -119,10 +73,12 @@ class CosmicRays(AdditiveProcess):
             wanted = int(high) - int(low) + 1
             if len(self.weights) != wanted or min(self.weights) < 0 or not sum(self.weights) > 0:
                 raise InputError.of("weights", self.weights, f"{wanted} numbers of at least 0", where="cosmic rays")
-        return self
 
     def charge(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> Float:
-        """Return the distribution of the charge that a pixel collects in a time, a compound Poisson distribution."""
+        """Return the probabilities of 0, 1, 2, ... electrons in a pixel in a time, shape (n,).
+
+        The distribution is compound Poisson; the omitted tail has a probability below `NEGLIGIBLE`.
+        """
         import numpy as np
 
         low, high = (int(e) for e in self.electrons)
@@ -141,6 +97,7 @@ class CosmicRays(AdditiveProcess):
         return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
 
     def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:
+        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
         from scipy import special
 
         hits = self._hits(seconds)
@@ -148,6 +105,15 @@ class CosmicRays(AdditiveProcess):
         while special.pdtrc(most, hits) > NEGLIGIBLE:
             most += 1
         return most * int(self.electrons[1])
+
+    def variance_dn2(self, quiet: Expectation) -> Float:
+        """Return the added variance of each pixel in a frame, DN^2, shape (n_pixel,)."""
+        import numpy as np
+
+        charge = self.charge(quiet.frame_s)
+        electrons = np.arange(charge.size)
+        variance = float(charge @ electrons**2 - (charge @ electrons) ** 2)
+        return np.asarray(variance * quiet.gain_dn_per_electron**2)
 
     def _hits(self, seconds: float) -> float:
         """Return the mean number of hits in one pixel."""
@@ -159,19 +125,19 @@ class CosmicRays(AdditiveProcess):
         return self.rate_per_cm2_s
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
+        """Return the process at another rate of incident particles."""
         return self.model_copy(update={"rate_per_cm2_s": rate_per_cm2_s})
 
     @property
     def assumption(self) -> tuple[str, str, str]:
+        """Row of a table of assumptions: quantity, value and source."""
         low, high = self.electrons
         return ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise")
 
 
-#: Additive processes: fields of `Processes`, keys of studies' ``processes``.
-ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
-
-#: Drifts that are drawn at a time, per stare.
-BATCH = 16
+#: Additive processes: fields of `Processes`, keys of studies' ``processes``. Another one is a section with the same
+#: methods.
+ADDITIVE: dict[str, type[CosmicRays]] = {"cosmic_rays": CosmicRays}
 
 
 @validated
@@ -226,55 +192,6 @@ class PointingDrifts(Section):
             unit="%",
         ),
     ] = 0.5
-
-    def drifts(self, numbers: NDArray[np.uint64], end_s: float, seed: int) -> tuple[Float, Float, Float]:
-        """Draw start, duration and depth of the drifts of stares up to a time, shape (n_stare, n_drift) each.
-
-        Each stare depends only on the seed and its number. Drifts are in order of time, and the last one of each stare
-        begins at `end_s` or later.
-        """
-        import numpy as np
-
-        from mauvecl.noise.random_numbers import four_normals, words
-
-        parts: list[tuple[Float, Float, Float]] = []
-        begin = np.zeros((len(numbers), 1))
-        index, n = np.asarray(numbers, np.uint64)[:, None], 0
-        while not parts or not (parts[-1][0][:, -1] >= end_s).all():
-            which = np.arange(n, n + BATCH)[None]
-            # Half the sum of two squared normals is exponential, and has the same bits on every machine.
-            a, b, c, d = (z.astype(np.float64) for z in four_normals(words(index, which, self.stream, 0, seed)))
-            wait, lasts = (a * a + b * b) / 2 * (3600.0 / self.rate_per_h), (c * c + d * d) / 2 * self.duration_s
-            share = (words(index, which, self.stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
-            ends = begin + np.cumsum(wait + lasts, axis=1)
-            parts.append((ends - lasts, lasts, share * self.depth))
-            begin, n = ends[:, -1:], n + BATCH
-        start, lasts, depth = (np.concatenate(several, axis=1) for several in zip(*parts, strict=True))
-        return start, lasts, depth
-
-    def losses(self, numbers: NDArray[np.uint64], start_s: NDArray[np.float64], frame_s: float, seed: int) -> Float:
-        """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
-
-        Frames start at `start_s` after the start of the stare.
-        """
-        import numpy as np
-
-        start, lasts, depth = self.drifts(numbers, float(start_s[-1]) + frame_s, seed)
-        # Light lost up to the start of each drift, in seconds.
-        before = np.cumsum(depth * lasts / 2, axis=1) - depth * lasts / 2
-        rows = zip(start, lasts, depth, before, strict=True)
-        lost = np.array([_lost_until(start_s + frame_s, *row) - _lost_until(start_s, *row) for row in rows])
-        return np.clip(lost / frame_s, 0.0, 1.0)
-
-
-def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float, before_s: Float) -> Float:
-    """Return the integral of the lost share of the light up to some times, s."""
-    import numpy as np
-
-    k = np.searchsorted(start_s, times_s, side="right") - 1
-    since = np.clip(times_s - start_s[k], 0.0, duration_s[k])
-    until = before_s[k] + depth[k] * since * (since / np.maximum(duration_s[k], 1e-300)) / 2
-    return np.asarray(np.where(k < 0, 0.0, until))
 
 
 #: Largest distance of a cut from the mean in standard deviations; beyond it, the logarithm of the tail loses precision.
@@ -359,8 +276,9 @@ class Normal:
 
 Prior = Uniform | Normal
 
-#: Keys of a prior in a study, each with the number of its values.
-_FORMS: dict[type[Prior], dict[str, int]] = {Uniform: {"uniform": 2}, Normal: {"normal": 2, "between": 2}}
+#: Keys of a prior in a study, each with two values.
+_FORMS: dict[type[Prior], tuple[str, ...]] = {Uniform: ("uniform",), Normal: ("normal", "between")}
+_PAIR = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
 
 
 def _from_study(given: Any) -> Prior:
@@ -368,10 +286,10 @@ def _from_study(given: Any) -> Prior:
     if isinstance(given, Uniform | Normal):
         return given
     for kind, form in _FORMS.items():
-        if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == form.keys():
-            for key, n in form.items():
-                if not isinstance(given[key], list | tuple) or len(given[key]) != n:
-                    raise InputError.of(key, given[key], f"{n} numbers")
+        if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == {*form}:
+            for key in form:
+                if not isinstance(given[key], list | tuple) or len(given[key]) != 2:
+                    raise InputError.of(key, given[key], "2 numbers")
             return kind(*(_number(value) for key in form for value in given[key]))
     keys = [key for form in _FORMS.values() for key in form]
     if isinstance(given, Mapping) and (other := next((key for key in given if key not in keys), None)):
@@ -395,14 +313,11 @@ def _to_study(prior: Prior) -> dict[str, tuple[float, ...]]:
     return {"normal": (prior.mean, prior.sd), "between": (prior.low, prior.high)}
 
 
-def _json_schema() -> dict[str, Any]:
-    def pair(keys: Mapping[str, int]) -> dict[str, Any]:
-        several = {"type": "array", "items": {"type": "number"}}
-        lists = {key: several | {"minItems": n, "maxItems": n} for key, n in keys.items()}
-        return {"type": "object", "properties": lists, "required": [*keys], "additionalProperties": False}
-
-    return {"anyOf": [pair(form) for form in _FORMS.values()]}
-
-
+_SCHEMA = [
+    {"type": "object", "properties": dict.fromkeys(form, _PAIR), "required": [*form], "additionalProperties": False}
+    for form in _FORMS.values()
+]
 #: Prior as a field of a study's section.
-PriorField = Annotated[Prior, PlainValidator(_from_study), PlainSerializer(_to_study), WithJsonSchema(_json_schema())]
+PriorField = Annotated[
+    Prior, PlainValidator(_from_study), PlainSerializer(_to_study), WithJsonSchema({"anyOf": _SCHEMA})
+]

@@ -8,10 +8,10 @@ realistic number of draws reveals the difference.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from itertools import product
+from itertools import chain, product
 from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast
 
 import numpy as np
@@ -172,12 +172,6 @@ def joint_is_exact(c: Cumulants) -> NDArray[np.bool_]:
     return np.asarray(smooth & (over_sd[0] <= MAX_SKEW) & ~cut_off)
 
 
-def needs_fourth_power(c: Cumulants, *, varying: bool = False) -> bool:
-    """Return whether omitting the fourth power of the polynomial is noticeable; see `truncation_distance`."""
-    distance = truncation_distance(c.over_sd(), fourth_power=False, varying=varying)
-    return bool(is_noticeable(distance, c.variance).any())
-
-
 def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
     """Return the pixels whose frames can be drawn as one stack, from the cumulants of ONE frame.
 
@@ -287,23 +281,13 @@ def _quantiles(prior: Prior) -> tuple[Float, Float]:
     return values, prior.quantile(np.array([0.5]))
 
 
-def quantile_table(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
-    """Compute the quantile table of a prior, shape (2 * PRIOR_NODES,), and the factor at its median, minus one.
-
-    `change` converts the prior's values to a factor minus one. The table holds factors at `nodes` from the low end,
-    then from the high end, divided by the factor at the median, minus one. In this form float32 resolves priors of any
-    width and location.
-    """
-    at_nodes, median = _quantiles(prior)
-    values, centre = change(at_nodes), float(change(median)[0])
-    return ((values - centre) / (1.0 + centre)).astype(np.float32), centre
-
-
 @dataclass(frozen=True, eq=False)
 class Factors:
     """Factors of priors on light, dark and sky; factors on light include the sky's light."""
 
-    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `quantile_table`.
+    #: Quantile tables, shape (n_modulation, 2 * layout.PRIOR_NODES): factors at `nodes` from the low end of a prior,
+    #: then from the high end, divided by the factor at its median, minus one. In this form float32 resolves priors of
+    #: any width and location.
     tables: NDArray[np.float32]
     #: Factors at the priors' medians, to which the tables are relative, in the order of `SIGNAL_PARTS`.
     medians: dict[SignalPart, float]
@@ -323,7 +307,9 @@ class Factors:
                 raise InputError.of(
                     name, [float(first), float(last)], f"a prior between {varied.low:g} and {varied.high:g}"
                 )
-            tables[row], middle = quantile_table(prior, change)
+            at_nodes, median = _quantiles(prior)
+            middle = float(change(median)[0])
+            tables[row] = (change(at_nodes) - middle) / (1.0 + middle)
             centre[factor] *= 1.0 + middle
             least, most = sorted(1.0 + change(np.array([first, last])))
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
@@ -356,6 +342,7 @@ OF_DETECTOR = ("wavelength_nm", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_
 class DrawMethod:
     """Method by which scenarios are drawn; see `Scene` for the switches."""
 
+    factors: Factors  # of the priors that are drawn
     frames: bool
     joint: bool
     quartic: bool
@@ -364,10 +351,10 @@ class DrawMethod:
     cumulants: list[Cumulants]  # of one draw of each scenario
 
 
-def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors) -> DrawMethod:
+def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMethod:
     """Choose the method for scenarios. Raises InputError if they cannot be drawn as requested, or not together."""
-    quiet, processes = scenarios[0], drawing.processes
-    modulations = processes.modulations
+    quiet, modulations = scenarios[0], drawing.processes.modulations
+    factors = Factors.of(drawing.processes, quiet.conditions)
     if quiet.wavelength_nm.size > MAX_PIXELS:
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
     for other in scenarios[1:]:
@@ -375,7 +362,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     # A grid of factors on light, dark and sky that spans the priors in steps of at most 2.
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
     corners = [*product(*(grid.tolist() for grid in grids))]
-    frames = _draw_frames(scenarios, drawing.mode, factors, processes, corners)
+    frames = _draw_frames(scenarios, drawing, factors, corners)
     each = 1 if frames else quiet.n_frames
     cumulants = [Cumulants.of(x, each) for x in scenarios]
     varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
@@ -386,14 +373,11 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
             "Gaussian noise of at least 1.5 Poisson counts in each pixel and more for few counts, or no such process",
             key=modulations[0][0],
         )
-    return DrawMethod(
-        frames=frames,
-        joint=joint,
-        quartic=joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row),
-        photons=not joint and quiet.photon_noise == "poisson",
-        each=each,
-        cumulants=cumulants,
+    quartic = joint and any(
+        is_noticeable(truncation_distance(c.over_sd(), fourth_power=False, varying=bool(modulations)), c.variance).any()
+        for c in chain(*varied)
     )
+    return DrawMethod(factors, frames, joint, quartic, not joint and quiet.photon_noise == "poisson", each, cumulants)
 
 
 def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray[np.bool_]:
@@ -440,17 +424,14 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
 
 
 def _draw_frames(
-    scenarios: Sequence[Expectation],
-    mode: Mode,
-    factors: Factors,
-    processes: Processes,
-    corners: Sequence[tuple[float, float, float]],
+    scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors, corners: Sequence[tuple[float, float, float]]
 ) -> bool:
+    mode = drawing.mode
     if scenarios[0].n_frames == 1 or mode == "frames":
         # For a single frame, both modes give the same draws.
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
-        near = near_rail(x, factors, processes)
+        near = near_rail(x, factors, drawing.processes)
         # The approximation of rounding as noise is worst for the least light and dark.
         coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
         for pixels, why in (

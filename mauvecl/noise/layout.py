@@ -5,7 +5,6 @@ They are rendered into the kernels as C; a test compares every offset on the dev
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,6 +126,17 @@ EXPONENTIAL = tuple(float(np.float32(1.0 / np.prod(np.arange(1.0, n + 3)))) for 
 LN2_PARTS = (0.693359375, -2.1219444e-4)
 LOG2_E = 1.442695
 
+#: Minimax fits in float32 from tools/fit_normal.py: -2 ln(1 + f) / f for f in [sqrt(1/2) - 1, sqrt(2) - 1],
+#: sin(pi s) / s and cos(pi s) in s^2 for s in [-1/2, 1/2].
+POLYNOMIALS = {
+    "log": ("-0x1.fffffap+0", "0x1.0000d4p+0", "-0x1.555ca0p-1", "0x1.ff30e2p-2", "-0x1.97073ap-2", "0x1.62c872p-2",
+            "-0x1.501394p-2", "0x1.9e7c7ep-3"),
+    "sin": ("0x1.921fb6p+1", "-0x1.4abbc4p+2", "0x1.4668f2p+1", "-0x1.32535ap-1", "0x1.3e17cap-4"),
+    "cos": ("0x1.fffffep-1", "-0x1.3bd3a6p+2", "0x1.03bd06p+2", "-0x1.54f61ap+0", "0x1.c1f066p-3"),
+}  # fmt: skip
+#: 2 ln 2 in float32.
+TWO_LN2 = "0x1.62e430p+0"
+
 #: Structs by their names in C.
 STRUCTS = {
     "Job": JOB, "Pixel": PIXEL, "Level": LEVEL, "Edge": EDGE, "Poisson": POISSON, "Response": RESPONSE,
@@ -213,17 +223,11 @@ def alias_table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable
     bits = max(int(probability.size - 1).bit_length(), 1)
     padded = np.zeros(1 << bits)
     padded[: probability.size] = probability
-    return AliasTable(low, bits, _pack(_whole_words(padded), bits))
-
-
-def _whole_words(probability: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Convert probabilities to integers that sum to 2**32, by the method of largest remainders."""
-    exact = probability / probability.sum() * 2.0**WORD_BITS
+    # Integers that sum to 2**32, by the method of largest remainders.
+    exact = padded / padded.sum() * 2.0**WORD_BITS
     words: NDArray[np.int64] = np.floor(exact).astype(np.int64)
-    missing = int(2**WORD_BITS - words.sum())
-    largest = np.argsort(words - exact, kind="stable")[:missing]
-    words[largest] += 1
-    return words
+    words[np.argsort(words - exact, kind="stable")[: int(2**WORD_BITS - words.sum())]] += 1
+    return AliasTable(low, bits, _pack(words, bits))
 
 
 def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
@@ -243,19 +247,3 @@ def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
             if left[rich] < share:
                 small.append(rich)
     return np.array(entries, dtype=np.uint32)
-
-
-def table_set(means: Iterable[float], tables: list[AliasTable]) -> tuple[list[AliasTable], list[int]]:
-    """Append a table for each distinct mean to `tables`, which are contiguous on the device.
-
-    Return the table of each mean, and where it starts.
-    """
-    size = sum(table.entries.size for table in tables)
-    distinct: dict[float, tuple[AliasTable, int]] = {}
-    for mean in (means := list(means)):
-        if mean not in distinct:
-            table = alias_table(mean)
-            distinct[mean] = (table, size)
-            tables.append(table)
-            size += table.entries.size
-    return [distinct[mean][0] for mean in means], [distinct[mean][1] for mean in means]

@@ -1,5 +1,6 @@
-"""Slow NumPy reference of the kernels' draws, and the components of a draw.
+"""Draws in NumPy: slow reference of the kernels, losses of light by pointing drifts, and components of a draw.
 
+The generator is addressed by counter: each word depends only on realisation, frame, stream, group of pixels and seed.
 Counters, arithmetic and the order of sums are those of the kernels. Integers equal the device's, and so do floats on
 devices with strict arithmetic, because each fused multiply-add is rounded once. Tests and the self-test use it.
 """
@@ -15,9 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from mauvecl.noise import layout
-from mauvecl.noise.disturbances import ADDITIVE
+from mauvecl.noise.disturbances import ADDITIVE, PointingDrifts
 from mauvecl.noise.drawing import DrawingOptions
-from mauvecl.noise.random_numbers import Floats, Words, fma, four_normals, words
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.columns import Column, table_of
@@ -31,6 +31,32 @@ MAGIC = np.float32(layout.MAGIC)
 #: A function that computes a * b + c.
 Fma = Callable[[Any, Any, Any], Any]
 T = TypeVar("T", np.uint32, np.float32)
+Words = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]
+Floats = NDArray[np.float32]
+
+_MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_POLYNOMIALS = {
+    name: [np.float32(float.fromhex(c)) for c in coefficients] for name, coefficients in layout.POLYNOMIALS.items()
+}
+_TWO_LN2 = np.float32(float.fromhex(layout.TWO_LN2))
+
+
+def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
+    """Compute Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405) of a counter and a 64-bit key.
+
+    The four words of the counter are broadcast against each other.
+    """
+    c0, c1, c2, c3 = np.broadcast_arrays(*(np.asarray(c, dtype=np.uint64) for c in counter))
+    half, low_half = np.uint64(32), np.uint64(0xFFFFFFFF)
+    for r in range(10):
+        k0, k1 = (
+            np.uint64((((seed >> shift) & 0xFFFFFFFF) + r * step) & 0xFFFFFFFF)
+            for shift, step in zip((0, 32), _KEY_STEPS, strict=True)
+        )
+        p0, p1 = _MULTIPLIERS[0] * c0, _MULTIPLIERS[1] * c2
+        c0, c1, c2, c3 = (p1 >> half) ^ c1 ^ k0, p1 & low_half, (p0 >> half) ^ c3 ^ k1, p0 & low_half
+    return (c0.astype(np.uint32), c1.astype(np.uint32), c2.astype(np.uint32), c3.astype(np.uint32))
 
 
 def words_at(
@@ -38,10 +64,57 @@ def words_at(
 ) -> Words:
     """Return the four words that four neighbouring pixels of a realisation and frame share in a stream.
 
-    The stream is a key of `layout.STREAMS`, the group is the pixel index divided by four, and the exposure is 0 for the
-    observed one and `layout.REFERENCE` for the reference.
+    The number of the stream, of which `layout.STREAMS` has the names, is the top byte of the counter's last word. The
+    group is the pixel index divided by four, and the exposure 0 for the observed one and `layout.REFERENCE` for the
+    reference.
     """
-    return words(realisation, frame, exposure + layout.STREAMS[stream], group, seed)
+    index, half = np.asarray(realisation, dtype=np.uint64), np.uint64(32)
+    last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
+    return philox((index & np.uint64(0xFFFFFFFF), index >> half, np.asarray(frame, dtype=np.uint64), last), seed)
+
+
+def fma(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Floats:
+    """Compute a * b + c in float32 with a single rounding.
+
+    The product is exact in float64. The sum is rounded to odd (its error decides the last bit), which makes the second
+    rounding, to float32, correct (Boldo & Melquiond 2008, doi 10.1109/TC.2007.70819).
+    """
+    product = np.asarray(a, np.float64) * np.asarray(b, np.float64)
+    addend = np.asarray(c, np.float64)
+    total = product + addend
+    virtual = total - product
+    error = (product - (total - virtual)) + (addend - virtual)
+    even = (np.asarray(total).view(np.int64) & 1) == 0
+    odd = np.nextafter(total, np.where(error > 0, np.inf, -np.inf))
+    return np.asarray(np.where((error != 0) & even, odd, total)).astype(np.float32)
+
+
+def _horner(name: str, x: Floats) -> Floats:
+    *rest, value = _POLYNOMIALS[name]
+    result: Floats = np.full_like(x, value)
+    for coefficient in reversed(rest):
+        result = fma(result, x, coefficient)
+    return result
+
+
+def normal_pair(radius_word: NDArray[np.uint32], angle_word: NDArray[np.uint32]) -> tuple[Floats, Floats]:
+    """Compute two standard normals from two words by the method of Box & Muller (1958, doi 10.1214/aoms/1177706645)."""
+    t = radius_word.astype(np.float32) + np.float32(0.5)
+    split = np.uint32(0x3F3504F3)
+    bits = t.view(np.uint32) - split
+    halvings = (np.int32(32) - (bits.view(np.int32) >> 23)).astype(np.float32)
+    f = ((bits & np.uint32(0x007FFFFF)) + split).view(np.float32) - np.float32(1.0)
+    radius = np.sqrt(fma(halvings, _TWO_LN2, f * _horner("log", f)))
+    s = (angle_word << np.uint32(1)).view(np.int32).astype(np.float32) * np.float32(2.0**-32)
+    y = s * s
+    sine, cosine = s * _horner("sin", y), _horner("cos", y)
+    radius = (radius.view(np.uint32) ^ (angle_word & np.uint32(0x80000000))).view(np.float32)
+    return radius * cosine, radius * sine
+
+
+def four_normals(w: Words) -> list[Floats]:
+    """Return the normals of four neighbouring pixels."""
+    return [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
 
 
 def alias_draw(
@@ -53,12 +126,6 @@ def alias_draw(
     entry = table[np.asarray(start, np.uint32) + column]
     mask = (np.uint32(1) << shift) - np.uint32(1)
     return np.where((word & mask) < (entry & mask), column, entry >> shift)
-
-
-def expansion_draw(z: Floats, offset: ArrayLike, slope: ArrayLike, cubic: ArrayLike) -> Floats:
-    """Return Poisson counts of a large mean, relative to the mean rounded to an integer."""
-    curve = fma(z, cubic, np.float32(0.16666667))
-    return nearest(fma(z, fma(z, curve, slope), offset))
 
 
 def nearest(x: Floats) -> Floats:
@@ -74,8 +141,10 @@ def _per_pixel(four: Sequence[NDArray[T]]) -> NDArray[T]:
 def poisson_counts(four: Words, source: NDArray[np.void], tables: NDArray[np.uint32]) -> Floats:
     """Return the counts of all pixels, relative to their rounded means, shape (n_pixel, n_draw)."""
     source = source[:, None]
-    # Both pixels of a pair use both words if the count comes from a normal.
-    counts = expansion_draw(_per_pixel(four_normals(four)), source["offset"], source["slope"], source["cubic"])
+    # Large means use an expansion in normals, in which both pixels of a pair use both words.
+    z = _per_pixel(four_normals(four))
+    curve = fma(z, source["cubic"], np.float32(0.16666667))
+    counts = nearest(fma(z, fma(z, curve, source["slope"]), source["offset"]))
     by_table = source["bits"][:, 0] > 0
     words, row = _per_pixel(four)[by_table], source[by_table]
     counts[by_table] = alias_draw(words, tables, row["bits"], row["table"]).astype(np.int32) + row["low"]
@@ -268,6 +337,57 @@ def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
 
 
 Float = NDArray[np.float64]
+
+#: Drifts that are drawn at a time, per stare.
+DRIFTS_AT_ONCE = 16
+
+
+def pointing_drifts(
+    process: PointingDrifts, numbers: NDArray[np.uint64], end_s: float, seed: int
+) -> tuple[Float, Float, Float]:
+    """Draw start, duration and depth of the drifts of stares up to a time, shape (n_stare, n_drift) each.
+
+    Each stare depends only on the seed and its number. Drifts are in order of time, and the last one of each stare
+    begins at `end_s` or later.
+    """
+    parts: list[tuple[Float, Float, Float]] = []
+    begin = np.zeros((len(numbers), 1))
+    index, n, stream = np.asarray(numbers, np.uint64)[:, None], 0, "stare_pointing"
+    while not parts or not (parts[-1][0][:, -1] >= end_s).all():
+        which = np.arange(n, n + DRIFTS_AT_ONCE)[None]
+        # Half the sum of two squared normals is exponential, and has the same bits on every machine.
+        a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, which, stream, 0, seed)))
+        wait, lasts = (a * a + b * b) / 2 * (3600.0 / process.rate_per_h), (c * c + d * d) / 2 * process.duration_s
+        share = (words_at(index, which, stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
+        ends = begin + np.cumsum(wait + lasts, axis=1)
+        parts.append((ends - lasts, lasts, share * process.depth))
+        begin, n = ends[:, -1:], n + DRIFTS_AT_ONCE
+    start, lasts, depth = (np.concatenate(several, axis=1) for several in zip(*parts, strict=True))
+    return start, lasts, depth
+
+
+def pointing_losses(
+    process: PointingDrifts, numbers: NDArray[np.uint64], start_s: NDArray[np.float64], frame_s: float, seed: int
+) -> Float:
+    """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
+
+    Frames start at `start_s` after the start of the stare.
+    """
+    start, lasts, depth = pointing_drifts(process, numbers, float(start_s[-1]) + frame_s, seed)
+    # Light lost up to the start of each drift, in seconds.
+    before = np.cumsum(depth * lasts / 2, axis=1) - depth * lasts / 2
+    rows = zip(start, lasts, depth, before, strict=True)
+    lost = np.array([_lost_until(start_s + frame_s, *row) - _lost_until(start_s, *row) for row in rows])
+    return np.clip(lost / frame_s, 0.0, 1.0)
+
+
+def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float, before_s: Float) -> Float:
+    """Return the integral of the lost share of the light up to some times, s."""
+    k = np.searchsorted(start_s, times_s, side="right") - 1
+    since = np.clip(times_s - start_s[k], 0.0, duration_s[k])
+    until = before_s[k] + depth[k] * since * (since / np.maximum(duration_s[k], 1e-300)) / 2
+    return np.asarray(np.where(k < 0, 0.0, until))
+
 
 #: Frames that are drawn together.
 FRAMES_AT_ONCE = 256

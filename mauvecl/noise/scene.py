@@ -26,7 +26,7 @@ from mauvecl.noise.drawing import (
     polynomial,
     sky_share,
 )
-from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table_of, table_set
+from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table, alias_table_of
 from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, SIGNAL_PARTS, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
@@ -74,11 +74,12 @@ class FactorDistribution:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Quadrature nodes: sets of factors on dark, light and sky."""
+    """Quadrature nodes, which are sets of factors on dark, light and sky, and spectra of normal amplitudes."""
 
     probability: Float  # shape (n,)
     amounts: Float  # amounts of the changes of `changes_of`, shape (n, 3)
     scores: dict[str, Float]  # normal scores of each factor, shape (n,)
+    spectra: Float  # of factors that are treated as normal amplitudes, DN per standard deviation, shape (k, n_pixel)
 
 
 def changes_of(x: Expectation) -> tuple[Float, Float]:
@@ -94,65 +95,57 @@ def changes_of(x: Expectation) -> tuple[Float, Float]:
     return means, variances * (x.variance_dn2 / x.unsaturated_variance_dn2)
 
 
-@dataclass(frozen=True, eq=False)
-class FactorDistributions:
-    """Distributions of the drawn factors on light, dark and sky, averaged over an exposure."""
+def drawn_factors(processes: Processes, quiet: Expectation) -> dict[SignalPart, FactorDistribution]:
+    """Return the distributions of the factors that processes draw for a star, averaged over an exposure."""
+    factors = Factors.of(processes, quiet.conditions)
+    return factor_distributions(processes.modulations, factors.tables, tuple(factors.medians.values()), quiet.n_frames)
 
-    spreads: Mapping[str, FactorDistribution]
 
-    @classmethod
-    def from_processes(cls, processes: Processes, quiet: Expectation) -> FactorDistributions | None:
-        """Return the distributions of processes for a star, or None if they draw no factors."""
-        factors = Factors.of(processes, quiet.conditions)
-        return cls.of(processes.modulations, factors.tables, tuple(factors.medians.values()), quiet.n_frames)
+def factor_distributions(
+    modulations: Sequence[tuple[str, SignalPart]],
+    tables: NDArray[np.float32],
+    medians: tuple[float, ...],
+    n_frames: int,
+) -> dict[SignalPart, FactorDistribution]:
+    """Return the distributions of drawn factors on light, dark and sky; parameters as the fields of `Scene`."""
+    at_median, every = dict(zip(SIGNAL_PARTS, medians, strict=True)), dict[SignalPart, list[FactorDistribution]]()
+    for (name, factor), table in zip(modulations, tables, strict=True):
+        # Relative to the factor at the median, as the table is.
+        one = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
+        if PROCESSES[name].when == "frame" and n_frames > 1:
+            one = _normal(one.mean, one.sd / np.sqrt(n_frames))
+        every.setdefault(factor, []).append(one)
+    return {name: _product(ones, at_median[name]) for name, ones in every.items()}
 
-    @classmethod
-    def of(
-        cls,
-        modulations: Sequence[tuple[str, SignalPart]],
-        tables: NDArray[np.float32],
-        medians: tuple[float, ...],
-        n_frames: int,
-    ) -> FactorDistributions | None:
-        """Return the distributions of drawn factors, or None without any; parameters as the fields of `Scene`."""
-        at_median, spreads = dict(zip(SIGNAL_PARTS, medians, strict=True)), dict[SignalPart, list[FactorDistribution]]()
-        for (name, factor), table in zip(modulations, tables, strict=True):
-            # Relative to the factor at the median, as the table is.
-            spread = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
-            if PROCESSES[name].when == "frame" and n_frames > 1:
-                spread = _normal(spread.mean, spread.sd / np.sqrt(n_frames))
-            spreads.setdefault(factor, []).append(spread)
-        return cls({name: _product(ones, at_median[name]) for name, ones in spreads.items()}) if spreads else None
 
-    def nodes(self, x: Expectation, *, weighted: bool) -> tuple[Nodes, Float]:
-        """Return the nodes over which a statistic of an exposure is integrated, and spectra of normal amplitudes.
+def factor_nodes(factors: Mapping[SignalPart, FactorDistribution], x: Expectation, *, weighted: bool) -> Nodes:
+    """Return the nodes over which a statistic of an exposure is integrated.
 
-        Factors that are treated as normal amplitudes have spectra, DN per standard deviation, (k, n_pixel). `weighted`
-        tells whether the statistic is a weighted sum instead of a sum of squares.
-        """
-        light, sky, dark = zip(*changes_of(x), strict=True)
-        moved = {"dark": dark, "light": light, "sky": sky}
-        grids, rows = [], []
-        every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
-        score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
-        for name, (part, variance) in moved.items():
-            spread = self.spreads.get(name)
-            if spread is None:
-                grids.append([(1.0, 1.0, 0.0)])
-                continue
-            if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
-                if spread.sd:
-                    rows.append(spread.sd * part)
-                grids.append([(1.0, spread.mean, 0.0)])
-                continue
-            values = np.interp(score, SCORE, spread.values)
-            grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
-            score, weight = few[0], few[1] / few[1].sum()
-        # Each of shape (n_factor, n).
-        weights, (dark, light, sky), scores = np.ascontiguousarray(np.array([*product(*grids)]).T)
-        amounts = np.column_stack([light - 1.0, light * (sky - 1.0), dark - 1.0])
-        nodes = Nodes(math.prod(weights), amounts, dict(zip(moved, scores, strict=True)))
-        return nodes, np.array(rows).reshape(len(rows), x.variance_dn2.size)
+    `weighted` tells whether the statistic is a weighted sum instead of a sum of squares.
+    """
+    light, sky, dark = zip(*changes_of(x), strict=True)
+    moved: dict[SignalPart, tuple[Float, Float]] = {"dark": dark, "light": light, "sky": sky}
+    grids, rows = [], []
+    every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
+    score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
+    for name, (part, variance) in moved.items():
+        spread = factors.get(name)
+        if spread is None:
+            grids.append([(1.0, 1.0, 0.0)])
+            continue
+        if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
+            if spread.sd:
+                rows.append(spread.sd * part)
+            grids.append([(1.0, spread.mean, 0.0)])
+            continue
+        values = np.interp(score, SCORE, spread.values)
+        grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
+        score, weight = few[0], few[1] / few[1].sum()
+    # Each of shape (n_factor, n).
+    weights, (dark, light, sky), scores = np.ascontiguousarray(np.array([*product(*grids)]).T)
+    amounts = np.column_stack([light - 1.0, light * (sky - 1.0), dark - 1.0])
+    spectra = np.array(rows).reshape(len(rows), x.variance_dn2.size)
+    return Nodes(math.prod(weights), amounts, dict(zip(moved, scores, strict=True)), spectra)
 
 
 def _normal(mean: float, sd: float) -> FactorDistribution:
@@ -216,10 +209,14 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
             f"than {SMALLEST_EXPANDED:g}, not {mean[pixel]:.3g}: draw frame by frame",
             key="mode",
         )
-    alias, starts = table_set(mean[~expanded].tolist(), tables)
-    out["table"][~expanded] = starts
-    out["bits"][~expanded] = [t.bits for t in alias]
-    out["low"][~expanded] = np.array([t.low for t in alias]) - centre[~expanded]
+    # Equal means share a table; tables are contiguous on the device.
+    means, which = np.unique(mean[~expanded], return_inverse=True)
+    alias = [alias_table(one) for one in means.tolist()]
+    starts = np.cumsum([sum(t.entries.size for t in tables), *(t.entries.size for t in alias)])
+    tables += alias
+    out["table"][~expanded] = starts[which]
+    out["bits"][~expanded] = np.array([t.bits for t in alias])[which]
+    out["low"][~expanded] = np.array([t.low for t in alias])[which] - centre[~expanded]
     root = np.sqrt(mean[expanded])
     out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
     out["slope"][expanded] = root - 1 / (36 * root)
@@ -341,16 +338,15 @@ def prepare(
     process needs joint draws that are not exact.
     """
     drawing, quiet = drawing or Drawing(**words), scenarios[0]
-    factors = Factors.of(drawing.processes, quiet.conditions)
-    method = choose_method(scenarios, drawing, factors)
+    method = choose_method(scenarios, drawing)
     compared = np.array([0] * len(scenarios) if references is None else references, np.uint32)
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
     tables = list[AliasTable]()
     darks, dark_dn = _dark_counts(quiet, method, tables)
     arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
-        _fill_draw(arrays, k, x, method, factors, dark_dn, tables)
-        _fill_comparison(arrays, k, x, scenarios[compared[k]], method, comparison, used)
+        _fill_draw(arrays, k, x, method, dark_dn, tables)
+        _fill_comparison(arrays, k, method.each, scenarios[compared[k]], comparison, used)
     return Scene(
         n_pixel=used.size,
         n_frames=quiet.n_frames,
@@ -364,8 +360,8 @@ def prepare(
         pixels=detector_pixels(quiet, used),
         dark_counts=darks,
         tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
-        priors=factors.tables,
-        medians=tuple(factors.medians.values()),
+        priors=method.factors.tables,
+        medians=tuple(method.factors.medians.values()),
         references=compared,
         comparison=comparison,
         used=used,
@@ -408,16 +404,10 @@ def _padding(
 
 
 def _fill_draw(
-    arrays: PerScenario,
-    k: int,
-    x: Expectation,
-    method: DrawMethod,
-    factors: Factors,
-    dark_dn: Float,
-    tables: list[AliasTable],
+    arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, dark_dn: Float, tables: list[AliasTable]
 ) -> None:
     """Fill the arrays for the draw of scenario k, whose dark counts are relative to `dark_dn`."""
-    c, n_pixel, gain = method.cumulants[k], dark_dn.size, x.gain_dn_per_electron
+    c, factors, n_pixel, gain = method.cumulants[k], method.factors, dark_dn.size, x.gain_dn_per_electron
     level = arrays["levels"][k, :n_pixel]
     # The mean to which a draw is relative; separate Poisson counts are relative to integers.
     if method.joint:
@@ -441,19 +431,13 @@ def _fill_draw(
 
 
 def _fill_comparison(
-    arrays: PerScenario,
-    k: int,
-    x: Expectation,
-    reference: Expectation,
-    method: DrawMethod,
-    comparison: Comparison,
-    used: NDArray[np.bool_],
+    arrays: PerScenario, k: int, each: int, reference: Expectation, comparison: Comparison, used: NDArray[np.bool_]
 ) -> None:
-    """Fill the arrays for the comparison of scenario k with its reference."""
+    """Fill the arrays for the comparison of scenario k, in draws of `each` frames, with its reference."""
     base, n_pixel = arrays["base_dn"][k], used.size
     level, edge, fraction = (arrays[name][k, :n_pixel] for name in ("levels", "edges", "fraction"))
     mean_sum = reference.recorded_dn
-    whole = (x.n_frames // method.each) * base - np.rint(mean_sum)
+    whole = (reference.n_frames // each) * base - np.rint(mean_sum)
     if not comparison.exposures:
         fraction[:] = np.rint(mean_sum) - mean_sum
     level["shift"] = layout.MAGIC - whole
@@ -462,7 +446,7 @@ def _fill_comparison(
     level["twice"] = 2.0 * fraction * level["inverse_variance"]
     edge["base"], edge["whole"] = base, whole
     edge["low"] = layout.MAGIC - base
-    edge["high"] = layout.MAGIC + (x.highest_dn - base)
+    edge["high"] = layout.MAGIC + (reference.highest_dn - base)
     if comparison.estimated:
         # An observer knows the detector; padding has a variance of 1.
         estimate = arrays["estimates"][k]
@@ -471,11 +455,11 @@ def _fill_comparison(
         offset = np.rint(mean_sum) - reference.n_frames * (reference.bias_dn + reference.dark_dn)
         estimate["net_offset"][:n_pixel], estimate["gain"][:n_pixel] = offset, reference.gain_dn_per_electron
         estimate["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
-    ends = element_ends(x)
-    element_variance = np.bincount(x.element, variance * used)
+    ends = element_ends(reference)
+    element_variance = np.bincount(reference.element, variance * used)
     with np.errstate(divide="ignore"):
         edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
-    edge["element_offset"][ends] = np.bincount(x.element, fraction * used)
+    edge["element_offset"][ends] = np.bincount(reference.element, fraction * used)
 
 
 def _job(

@@ -16,7 +16,7 @@ from pydantic import create_model
 
 from mauvecl.noise.disturbances import (
     ADDITIVE,
-    AdditiveProcess,
+    CosmicRays,
     Normal,
     ParticleRate,
     PointingDrifts,
@@ -42,16 +42,12 @@ if TYPE_CHECKING:
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]
 SIGNAL_PARTS: tuple[SignalPart, ...] = get_args(SignalPart)
-#: Object of an unknown: a part of the signal, the wavelength dependence of the response, or an instrument value.
-Of = Literal["star", "light", "sky", "dark", "response", "instrument"]
-#: How often an unknown takes another value.
-When = Literal["frame", "exposure", "stare", "campaign"]
 #: Quantities of a stare that change: the quiescent level of the star; the throughput for the light of star, flare and
 #: sky; the brightness of the sky; the temperature of the detector.
 Changing = Literal["star", "light", "sky", "temperature"]
 CHANGING: tuple[Changing, ...] = get_args(Changing)
 #: Part of the signal that each of them changes; a nuisance parameter of this name takes its place in a frame.
-CHANGED_PART: dict[Changing, Of] = {"star": "star", "light": "light", "sky": "sky", "temperature": "dark"}
+CHANGED_PART: dict[Changing, str] = {"star": "star", "light": "light", "sky": "sky", "temperature": "dark"}
 #: Sections of a stare's unknowns: independent from frame to frame; constant; a change per hour; an orbital cycle.
 Course = Literal["jitters", "offsets", "drifts", "cycles"]
 COURSES: tuple[Course, ...] = get_args(Course)
@@ -71,20 +67,18 @@ class Unknown:
     """Value that an observer does not know."""
 
     name: str  # its key in a section of studies
-    of: Of  # changed part of the signal, or "instrument"
-    when: When  # how often it takes another value
     prior: Prior | Amplitude | None = None  # default prior; None if it is known by default
     label: str = ""  # description in messages and tables
-    source: str = ""  # source of the default prior, or "assumption"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Process(Unknown):
-    """Unknown factor on light, dark or sky, drawn per frame or exposure."""
+    """Unknown factor on a part of the signal, drawn per frame or exposure."""
 
     of: SignalPart = "light"
-    when: When = "exposure"
+    when: Literal["frame", "exposure"] = "exposure"
     prior: Prior | None = None
+    source: str = ""  # source of the default prior, or "assumption"
     stream: int  # its number in `layout.STREAMS`
     #: Range of allowed values.
     low: float
@@ -93,10 +87,6 @@ class Process(Unknown):
     change: Callable[[Conditions, Float], Float]
     expected: str | float = 1.0  # value in the expectation, or its key in the expectation's conditions
     drawn: str = ""  # description of the default prior for messages and documentation
-
-    def expected_in(self, conditions: Conditions) -> float:
-        """Return the value in an expectation."""
-        return conditions[self.expected] if isinstance(self.expected, str) else self.expected
 
     @property
     def moments(self) -> tuple[float, float]:
@@ -113,7 +103,6 @@ class Process(Unknown):
 class Nuisance(Unknown):
     """Unknown amplitude of a known spectrum, which statistics marginalise over."""
 
-    when: When = "exposure"
     prior: Amplitude | None = None
     #: Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
     spectrum: Callable[[Expectation], Float]
@@ -130,24 +119,9 @@ class Nuisance(Unknown):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StareChange(Unknown):
-    """Unknown change during a stare, drawn for each stare or frame; its prior is a normal amplitude.
-
-    `unit` is that of the amplitude, empty if it is relative; `name` is the changed quantity.
-    """
-
-    name: Changing
-    prior: Amplitude | None = None
-    unit: str = ""
-    course: Course
-
-
-@dataclass(frozen=True, kw_only=True)
 class InstrumentValue(Unknown):
     """Unknown but constant value of the instrument, over which answers are averaged."""
 
-    of: Of = "instrument"
-    when: When = "campaign"
     prior: Prior | None = None
     #: Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
     scales: str | None = None
@@ -251,7 +225,6 @@ PROCESSES = _by_name(
 NUISANCES = _by_name(
     Nuisance(
         name="dark",
-        of="dark",
         label="the dark level",
         unit="deg C",
         spectrum=lambda quiet: quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"],
@@ -261,7 +234,6 @@ NUISANCES = _by_name(
     ),
     Nuisance(
         name="light",
-        of="light",
         label="the light level",
         spectrum=lambda quiet: quiet.recorded_light_dn,
         of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
@@ -271,7 +243,6 @@ NUISANCES = _by_name(
     ),
     Nuisance(
         name="sky",
-        of="sky",
         label="the sky level",
         spectrum=lambda quiet: quiet.sky_dn,
         process="sky_level",
@@ -280,7 +251,6 @@ NUISANCES = _by_name(
     ),
     Nuisance(
         name="tilt",
-        of="response",
         label="the response's colour",
         spectrum=lambda quiet: quiet.recorded_light_dn * _tilt(quiet),
         of_flare=_tilt,
@@ -296,37 +266,18 @@ else:
     NuisanceName = Literal[tuple(NUISANCES)]
 
 
-def _drawn_by(process: str) -> tuple[float, str]:
-    """Return the standard deviation of the default prior of a process, and its source."""
-    return PROCESSES[process].moments[1], PROCESSES[process].source
-
-
-#: Default amplitudes of a stare's unknowns and their sources, most of them those of processes.
-_STARE_DEFAULTS: dict[tuple[Course, Changing], tuple[float, str]] = {
-    ("jitters", "light"): _drawn_by("jitter"),
-    ("offsets", "sky"): _drawn_by("sky_level"),
-    ("drifts", "star"): (0.01, "assumption: slow variability of the star"),
-    ("cycles", "temperature"): _drawn_by("detector_temperature"),
+#: Quantities with unknown changes during a stare, by course; keys of studies' ``stare``. No jitter of the star alone is
+#: drawn.
+STARE_CHANGES: dict[Course, tuple[Changing, ...]] = {
+    course: tuple(name for name in CHANGING if (course, name) != ("jitters", "star")) for course in COURSES
 }
-
-
-def _stare_change(course: Course, name: Changing) -> StareChange:
-    sd, source = _STARE_DEFAULTS.get((course, name), (None, ""))
-    return StareChange(
-        name=name,
-        of=CHANGED_PART[name],
-        when="frame" if course == "jitters" else "stare",
-        prior=None if sd is None else Amplitude(sd),
-        unit="deg C" if name == "temperature" else "",
-        source=source,
-        course=course,
-    )
-
-
-#: Unknown changes of a stare by course and quantity; keys of studies' ``stare``. No jitter of the star alone is drawn.
-STARE_CHANGES: dict[Course, dict[Changing, StareChange]] = {
-    course: {name: _stare_change(course, name) for name in CHANGING if (course, name) != ("jitters", "star")}
-    for course in COURSES
+#: Documented standard deviations of a stare's unknowns, most of them those of processes.
+DEFAULT_SPREADS: dict[Course, dict[Changing, float]] = {
+    "jitters": {"light": PROCESSES["jitter"].moments[1]},
+    "offsets": {"sky": PROCESSES["sky_level"].moments[1]},
+    # Assumption: slow variability of the star.
+    "drifts": {"star": 0.01},
+    "cycles": {"temperature": PROCESSES["detector_temperature"].moments[1]},
 }
 
 #: Constant instrument values of which a campaign knows only priors; keys of studies' ``unknowns``. The documentation
@@ -365,9 +316,8 @@ def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
     errors = instrument.throughput_errors
     if errors is None:
         return dict(INSTRUMENT_VALUES)
-    measured = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")} | set(
-        errors.values
-    )
+    fitted = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")}
+    measured = fitted.union(errors.values)
     values = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in measured}
     modes = []
     for k in range(min(len(errors.modes), MAX_MODES)):
@@ -379,23 +329,11 @@ def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
 
 def default_processes(temperature_c: float) -> dict[str, Prior]:
     """Return the documented priors of the processes, for the detector's nominal temperature."""
-    priors: dict[str, Prior] = {}
-    for row in PROCESSES.values():
-        prior = row.prior
-        if row.expected == "temperature_c" and isinstance(prior, Normal):
-            t = temperature_c
-            prior = Normal(t + prior.mean, prior.sd, t + prior.low, t + prior.high)
-        if prior is not None:
-            priors[row.name] = prior
-    return priors
-
-
-def default_spreads() -> dict[Course, dict[Changing, float]]:
-    """Return the documented standard deviations of a stare's unknowns."""
-    return {
-        course: {name: row.prior.sd for name, row in rows.items() if row.prior is not None}
-        for course, rows in STARE_CHANGES.items()
-    }
+    priors = {row.name: row.prior for row in PROCESSES.values() if row.prior is not None}
+    warm, t = priors["detector_temperature"], temperature_c
+    assert isinstance(warm, Normal)
+    # Its row is relative to the nominal temperature.
+    return priors | {"detector_temperature": Normal(t + warm.mean, warm.sd, t + warm.low, t + warm.high)}
 
 
 _keys: Any = {name: (kind | None, None) for name, kind in ADDITIVE.items()} | dict.fromkeys(
@@ -425,7 +363,7 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
     """
 
     @property
-    def additive(self) -> dict[str, AdditiveProcess]:
+    def additive(self) -> dict[str, CosmicRays]:
         """Enabled additive processes by name."""
         return {name: process for name in ADDITIVE if (process := getattr(self, name)) is not None}
 
@@ -441,20 +379,19 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
         return copy
 
     @property
-    def particle_processes(self) -> list[AdditiveProcess]:
+    def particle_processes(self) -> list[CosmicRays]:
         """Enabled processes that incident particles cause."""
-        return [process for process in self.additive.values() if process.particles_per_cm2_s is not None]
+        return list(self.additive.values())
 
     @property
     def particles_per_cm2_s(self) -> float:
         """Largest rate of incident particles of the enabled processes; zero without any."""
-        return max((process.particles_per_cm2_s or 0.0 for process in self.particle_processes), default=0.0)
+        return max((process.particles_per_cm2_s for process in self.particle_processes), default=0.0)
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
         every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
-        caused = {name: process for name, process in every.items() if process.particles_per_cm2_s is not None}
-        update = {name: process.with_particles(rate_per_cm2_s) for name, process in caused.items()}
+        update = {name: process.with_particles(rate_per_cm2_s) for name, process in every.items()}
         copy: Self = self.model_copy(update=update)
         return copy
 

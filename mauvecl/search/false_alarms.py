@@ -45,7 +45,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.detection.distributions import CONFIDENCE, Interval, central_counts
+from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_counts
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.search import BATCH
@@ -330,7 +330,7 @@ class SampledRate:
             )
         value = float(brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))
         # The rate falls by about a factor exp(-u) per unit of u.
-        reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * self.log_rate(value)[1] / value
+        reach = CONFIDENCE_SD * self.log_rate(value)[1] / value
         return Interval(value, value - reach, value + reach)
 
 

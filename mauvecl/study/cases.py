@@ -331,7 +331,7 @@ class Case:
         The factor on all light has the mean and, unless the study states another, the standard deviation of what is
         drawn; those of a stare are of the stare. The documented set leaves the star's own level free as well.
         """
-        from mauvecl.noise.scene import WEIGHTS, FactorDistributions
+        from mauvecl.noise.scene import WEIGHTS, drawn_factors
 
         quiet = self.quiet if quiet is None else quiet
         unknown, given = self.unknowns(quiet), self.study.nuisances.light
@@ -339,8 +339,7 @@ class Case:
             return unknown
         if given is None and "star" not in unknown.names:
             unknown = unknown.with_spectrum("star", quiet.net_source_dn, math.inf)
-        drawn = FactorDistributions.from_processes(self.processes, quiet) if stare is None else None
-        light = None if drawn is None else drawn.spreads.get("light")
+        light = drawn_factors(self.processes, quiet).get("light") if stare is None else None
         if light is None:
             return unknown.without(["light"]) if given is None else unknown
         if given is not None:
@@ -359,10 +358,10 @@ class Case:
     def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
         """Return the input of statistics for closed forms."""
         from mauvecl.detection.statistics import Setting
-        from mauvecl.noise.scene import FactorDistributions
+        from mauvecl.noise.scene import drawn_factors
 
         unknown = self.unknowns(quiet)
-        drawn = FactorDistributions.from_processes(self.processes, quiet) if unknown else None
+        drawn = drawn_factors(self.processes, quiet) if unknown else {}
         return Setting(quiet, ~quiet.saturated, self.study.run.comparison(), flares, unknown, drawn)
 
     def with_value(self, quantity: str, value: float | str) -> Self:
@@ -486,7 +485,8 @@ def off_centre(expectations: list[Expectation], processes: Processes) -> list[st
     sentences = []
     for name, _ in processes.modulations:
         first, last = getattr(processes, name).quantile(np.array([0.0, 1.0]))
-        values = {PROCESSES[name].expected_in(x.conditions) for x in expectations}
+        expected = PROCESSES[name].expected
+        values = {x.conditions[expected] if isinstance(expected, str) else expected for x in expectations}
         outside = sorted(value for value in values if not first - TINY <= value <= last + TINY)
         if outside:
             sentences.append(

@@ -260,10 +260,10 @@ class OwnNuisance(Section):
         """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
         import numpy as np
 
-        from mauvecl.detection.nuisances import at_pixels, read_spectrum
+        from mauvecl.detection.nuisances import at_pixels, read_at_pixels
 
         if self.file is not None:
-            return read_spectrum(name, self.file, wavelength_nm)
+            return read_at_pixels("spectrum", name, self.file, wavelength_nm)
         return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
 
 

@@ -14,7 +14,7 @@ from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_o
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.stare import Event, Stare, check_contributions, temperatures_of
 from mauvecl.noise.disturbances import Normal, Prior
-from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
+from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, STARE_PROCESSES, Changing, Course
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.study.stare import KNOWN_CHANGES, EventChoice, StareQuestion
@@ -67,7 +67,7 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
         spreads[course][changed] = math.hypot(spreads[course].get(changed, 0.0), sd)
     spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
     if study.nuisances.usual:
-        spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
+        spreads = {how: documented | spreads[how] for how, documented in DEFAULT_SPREADS.items()}
 
     names = (*KNOWN_CHANGES, *STARE_PROCESSES, "orbit_s")
     changes: dict[str, Any] = {name: getattr(q, name) for name in names} | spreads

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from scenes import paper
+from scenes import paper, study_of_g2v
 from scipy import stats
 
 from mauvecl import Engine, Study, detect
@@ -21,15 +21,11 @@ def said(
     engine: Engine, frames: int, stack: int = 1, of_test: float = 0.02, **campaign: float
 ) -> list[list[float | None]]:
     """Return the numbers of a detection's sentences on a campaign and on its wanted chance, in the order above."""
-    changes = {"output_min_nm": 300.0, "output_max_nm": 303.0}
-    data = {
-        "star": [{"library": "G2V", "magnitude": 7.4}],
-        "flare": {"amplitudes": [0.1]},
-        "observation": {"exposure_s": 5.0 * stack, "changes": changes},
-        "run": {"realisations": 10_000, "fap": of_test, "statistics": ["matched"], "tails": "sampled"},
-        "campaign": {"frames": frames, "step": stack, **campaign},
-    }
-    study = Study.build(data, "test")
+    study = study_of_g2v(
+        observation={"exposure_s": 5.0 * stack, "changes": {"output_min_nm": 300.0, "output_max_nm": 303.0}},
+        run={"realisations": 10_000, "fap": of_test, "tails": "sampled", "seed": 1},
+        campaign={"frames": frames, "step": stack, **campaign},
+    )
     assert Study.build(study.model_dump(), "again") == study
     text = "\n".join(detect(study, engine).messages)
     found = [re.search(pattern, text) for pattern in (MANY, ONE)]

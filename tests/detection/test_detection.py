@@ -77,12 +77,6 @@ def test_tail_samples_are_reproducible_extremes(engine: Engine) -> None:
         np.testing.assert_array_equal(largest["value"], np.sort(values[null])[::-1][:1000])
         np.testing.assert_array_equal(smallest["value"], np.sort(values[with_flare])[:1000])
         np.testing.assert_array_equal(values[null][largest["realisation"] - 70], largest["value"])
-    # In other tiles the same: the largest is addressed by its realisation alone.
-    small = Engine(tile=256).detect(quiet, [flare], realisations=3000, **kind)
-    for statistic in ("chi2", "matched"):
-        for flare_or_none in (None, 0):
-            ours, theirs = (d.tail_samples(statistic, flare_or_none) for d in (found, small))
-            np.testing.assert_array_equal(ours["realisation"], theirs["realisation"])
 
 
 def test_saturated_pixels_are_left_out(engine: Engine) -> None:
@@ -117,7 +111,4 @@ def test_own_weights_define_a_statistic(engine: Engine) -> None:
         for name in ("slope", "uv_excess"):
             d = found.distribution(name, flare)
             assert ks_probability(d, found.closed_form(name, flare).sf) > 1e-6
-    theory = found.closed_form("slope", 3)
-    delta = flares[3].signal_dn - quiet.signal_dn
-    assert theory.mean == pytest.approx(float(slope.weights @ delta))
     assert found.dof("slope") == 1

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from answers import expectations, of_kind
-from scenes import instrument, star
+from scenes import instrument, star, study_of_g2v
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, InputError, Study, detect
@@ -91,22 +91,16 @@ def test_sampled_threshold_raises_as_well(engine: Engine) -> None:
 
 
 def study(magnitude: float, **sections: object) -> Study:
-    changes = {"output_min_nm": 300.0, "output_max_nm": 301.5}
-    data = {
-        "star": [{"library": "G2V", "magnitude": magnitude}],
-        "flare": {"amplitudes": [1e-5]},
-        "observation": {"changes": changes, "exposure_s": 5.0},
-        "run": {"realisations": N, "seed": 3, "fap": 0.01, "statistics": ["matched"]},
-    }
-    return Study.build(data | sections, "test").paper()
+    observation = {"changes": {"output_min_nm": 300.0, "output_max_nm": 301.5}, "exposure_s": 5.0}
+    given = {"star": [{"library": "G2V", "magnitude": magnitude}], "run": {"realisations": N, "seed": 3}}
+    return study_of_g2v(**given, flare={"amplitudes": [1e-5]}, observation=observation, **sections).paper()
 
 
 def at_the_rail() -> float:
     """Return the magnitude at which the faintest pixel of `study` reaches saturation on average."""
 
     def faintest(magnitude: float) -> float:
-        one = study(magnitude)
-        (x, *_) = expectations(one)
+        x = expectations(study(magnitude))[0]
         return float((x.mean_raw_dn - x.ceiling_dn).min())
 
     return float(optimize.brentq(faintest, -5.0, 10.0))

@@ -20,6 +20,17 @@ from mauvecl import BalmerFlare, Engine, Expectation, FlareModel, Nuisances, Two
 
 MAUVE = mauvecl.Instrument.load("mauvesim")
 FREE, SKY_SD, DARK_C = np.inf, 0.1, 0.5
+FLARE = TwoBlackbodies(8000.0, 30_000.0, 0.05)
+
+
+@cache
+def scene(
+    library: str, magnitude: float, amplitude: float, light: Any = 10_000.0, exposure: float = 50.0, **how: Any
+) -> tuple[Expectation, Expectation, FlareModel]:
+    """Return expectations without and with a flare, of a temperature or a spectrum, and the model that is fitted."""
+    own, x = star(library, magnitude), quiet(library, magnitude, exposure)
+    lit = own.flaring(amplitude, light) if isinstance(light, float) else own.flaring(amplitude, spectrum=light)
+    return x, expect(lit, MAUVE, exposure=exposure), FlareModel.of(own, MAUVE, x, **how)
 
 
 def drawn(lit: Expectation, factor: np.ndarray, rng: np.random.Generator, *, unknown: bool = True) -> np.ndarray:
@@ -51,9 +62,7 @@ def test_intervals_cover_where_light_is_lost(
     library: str, magnitude: float, amplitude: float, kelvin: float, jump: float, light: str
 ) -> None:
     """Fit 600 draws with losses of 2 +- 1 %: coverages of 93.5 to 96.5 %, each quantity fails in 2e-6 of seeds."""
-    x = quiet(library, magnitude)
-    m = FlareModel.of(star(library, magnitude), MAUVE, x, jump=jump > 1)
-    lit = expect(star(library, magnitude).flaring(amplitude, spectrum=BalmerFlare(kelvin, jump)), MAUVE, exposure=50.0)
+    x, lit, m = scene(library, magnitude, amplitude, BalmerFlare(kelvin, jump), jump=jump > 1)
     unknown = Nuisances.of(x, {"light": FREE, "dark": FREE, "sky": SKY_SD})
     if light == "prior":
         unknown = unknown.with_prior("light", -0.02, 0.01)
@@ -72,8 +81,7 @@ def test_intervals_cover_where_light_is_lost(
 @pytest.mark.parametrize("amplitude", [0.5, 2.0])
 def test_intervals_agree_with_brute_force(amplitude: float, sd: float) -> None:
     """Compare with chi-squared minimised over temperature, factor and dark level, with a quantity held."""
-    x = quiet("M3V", 9.0)
-    m = FlareModel.of(star("M3V", 9.0), MAUVE, x)
+    x, _, m = scene("M3V", 9.0, amplitude)
     counts = m.counts(11_000.0, [amplitude])
     variance = x.variance_dn2 + x.gain_dn_per_electron * counts
     rng = np.random.default_rng(4203)
@@ -115,9 +123,7 @@ def test_intervals_agree_with_brute_force(amplitude: float, sd: float) -> None:
 
 def test_single_frames_have_uniform_losses() -> None:
     """Fit 1500 single frames that lose 0-5 %, and know the star's level by nothing else: 93.5 to 96.5 % (2e-6)."""
-    source = star("M3V", 9.0)
-    x = quiet("M3V", 9.0, 5.0)
-    m, lit = FlareModel.of(source, MAUVE, x), expect(source.flaring(20.0, 10_000.0), MAUVE, exposure=5.0)
+    x, lit, m = scene("M3V", 9.0, 20.0, exposure=5.0)
     unknown = Nuisances.of(x, {"light": FREE, "dark": FREE, "sky": SKY_SD})
     unknown = unknown.with_prior("light", -0.025, 0.05 / 12**0.5).with_spectrum("star", x.net_source_dn, FREE)
     nodes = np.linspace(-(3.0**0.5), 3.0**0.5, 401)
@@ -134,9 +140,7 @@ def test_single_frames_have_uniform_losses() -> None:
 
 def test_two_temperatures_are_dimmed_alike() -> None:
     """Recover both temperatures and all fluxes of a dimmed exposure without noise, to 3 % of their errors."""
-    source, x = star("M3V", 6.0), quiet("M3V", 6.0)
-    m = FlareModel.of(source, MAUVE, x)
-    lit = expect(source.flaring(2.0, spectrum=TwoBlackbodies(8000.0, 30_000.0, 0.05)), MAUVE, exposure=50.0)
+    x, lit, m = scene("M3V", 6.0, 2.0, FLARE)
     unknown = Nuisances.of(x, {"light": FREE})
     raw = [lit.recorded_dn + (f - 1.0) * lit.light_dn for f in (1.0, 0.9)]
     found = mauvecl.fit_two_temperatures(np.array(raw), x, m, unknown)
@@ -149,9 +153,7 @@ def test_two_temperatures_are_dimmed_alike() -> None:
 
 def test_light_that_may_be_lost_altogether_leaves_fluxes_without_limit() -> None:
     """Check a star too faint to tell the factor: no upper limit of the flux, and a temperature as before."""
-    source, x = star("M3V", 15.0), quiet("M3V", 15.0)
-    m = FlareModel.of(source, MAUVE, x)
-    lit = expect(source.flaring(500.0, 10_000.0), MAUVE, exposure=50.0)
+    x, lit, m = scene("M3V", 15.0, 500.0)
     found = fit(lit.recorded_dn, x, m, Nuisances.of(x, {"light": FREE, "dark": FREE}), levels=(0.95,))
     place = found.column("flux bolometric")
     assert np.isposinf(found.high[0, 0, place])
@@ -161,22 +163,13 @@ def test_light_that_may_be_lost_altogether_leaves_fluxes_without_limit() -> None
 
 def test_tilt_of_the_response_tilts_the_flare() -> None:
     """Fit an exposure without noise whose response is tilted by 2 %, star and flare: the temperature stays."""
-    source, x = star("M3V", 7.0), quiet("M3V", 7.0)
-    m = FlareModel.of(source, MAUVE, x)
-    lit = expect(source.flaring(2.0, 10_000.0), MAUVE, exposure=50.0)
+    x, lit, m = scene("M3V", 7.0, 2.0)
     tilted = lit.recorded_dn + 0.02 * lit.light_dn * (x.wavelength_nm - 450.0) / 250.0
     found = fit(tilted, x, m, Nuisances.of(x, {"tilt": FREE, "dark": FREE}))
     assert abs(found.estimates[0, 0] - 10_000.0) < 0.1 * found.errors[0, 0]
     plain = Nuisances.of(x, {"own": FREE, "dark": FREE}, own={"own": Nuisances.of(x, {"tilt": 1.0}).spectra[0]})
     other = fit(tilted, x, m, plain)
     assert abs(other.estimates[0, 0] - 10_000.0) > 2 * found.errors[0, 0]
-
-
-@cache
-def exposures(library: str, magnitude: float, amplitude: float, kelvin: float, jump: float) -> list[Expectation]:
-    own = star(library, magnitude)
-    light = BalmerFlare(kelvin, jump)
-    return [expect(one, MAUVE, exposure=50.0) for one in (own, own.flaring(amplitude, spectrum=light))]
 
 
 @pytest.mark.parametrize(
@@ -193,11 +186,10 @@ def test_intervals_cover_where_pixels_saturate(
     engine: Engine, library: str, magnitude: float, amplitude: float, kelvin: float, jump: float
 ) -> None:
     """Fit 300 drawn exposures: coverages of 92 to 98 % and good fits, each quantity fails in 2e-6 of seeds."""
-    quiet, lit = exposures(library, magnitude, amplitude, kelvin, jump)
+    x, lit, m = scene(library, magnitude, amplitude, BalmerFlare(kelvin, jump), jump=jump > 1)
     assert lit.saturated.any()
-    m = FlareModel.of(star(library, magnitude), MAUVE, quiet, jump=jump > 1)
     n = 300
-    found = fit(engine.realise(lit, count=n, seed=4301), quiet, m, levels=(0.95,))
+    found = fit(engine.realise(lit, count=n, seed=4301), x, m, levels=(0.95,))
     truth = np.array(list(m.values(kelvin, m.amplitudes(kelvin, amplitude, jump=jump)).values()))
     covered(found, truth, 0.92, 0.98)
     assert scipy.stats.binom.sf(int((found.p_value < 0.01).sum()) - 1, n, 0.01) > 1e-6
@@ -207,21 +199,19 @@ def test_exposures_with_and_without_saturated_pixels_are_fitted_together(engine:
     """Compare the fits of bright and faint flares in one call with those of separate calls, to a tenth of an error."""
     raw = []
     for amplitude in (0.1, 2.0, 5.0):
-        quiet, lit = exposures("K2.5V", 2.0, amplitude, 10_000.0, 1.0)
+        x, lit, m = scene("K2.5V", 2.0, amplitude)
         raw.append(engine.realise(lit, count=3, seed=4302))
-    m = FlareModel.of(star("K2.5V", 2.0), MAUVE, quiet)
-    together = fit(np.concatenate(raw), quiet, m)
+    together = fit(np.concatenate(raw), x, m)
     for k, one in enumerate(raw):
-        alone = fit(one, quiet, m)
+        alone = fit(one, x, m)
         away = (together.estimates[3 * k : 3 * k + 3] - alone.estimates) / alone.errors
         assert (np.abs(away) < 0.1).all()
 
 
 def test_every_jump_is_allowed_where_no_flare_is(engine: Engine) -> None:
     """Fit 200 exposures without a flare: the jump's interval is [1, inf) wherever that of the amplitude holds zero."""
-    quiet, _ = exposures("M3V", 9.0, 0.5, 10_000.0, 1.0)
-    m = FlareModel.of(star("M3V", 9.0), MAUVE, quiet, jump=True)
-    found = fit(engine.realise(quiet, count=200, seed=4303), quiet, m)
+    x, _, m = scene("M3V", 9.0, 0.5, jump=True)
+    found = fit(engine.realise(x, count=200, seed=4303), x, m)
     for level, probability in enumerate(found.levels):
         none = found.snr**2 <= scipy.stats.chi2.ppf(probability, 1)
         assert none.mean() > 0.3
@@ -232,33 +222,16 @@ def test_every_jump_is_allowed_where_no_flare_is(engine: Engine) -> None:
 
 def test_sharp_maxima_at_bounds_are_found() -> None:
     """Fit a flare without a jump in few pixels, where the bound bends the likelihood within a node of temperature."""
-    quiet, lit = exposures("K2.5V", 2.0, 5.0, 10_000.0, 1.0)
-    m = FlareModel.of(star("K2.5V", 2.0), MAUVE, quiet, jump=True)
-    found = fit(lit.recorded_dn, quiet, m)
+    x, lit, m = scene("K2.5V", 2.0, 5.0, jump=True)
+    found = fit(lit.recorded_dn, x, m)
     assert found.chi2[0] < 1e-3
     assert np.abs(found.estimates[0] - list(m.values(10_000.0, m.amplitudes(10_000.0, 5.0)).values()))[0] < 1.0
 
 
-FLARE = TwoBlackbodies(8000.0, 30_000.0, 0.05)
-
-
-@cache
-def expectations() -> tuple[Expectation, Expectation, Expectation]:
-    """Return expectations without a flare, with one of two temperatures, and with one of 9000 K."""
-    lit = (star().flaring(3.0, spectrum=FLARE), star().flaring(0.5, 9000.0))
-    quiet, two, one = (expect(x, MAUVE, exposure=50.0) for x in (star(), *lit))
-    return quiet, two, one
-
-
-@cache
-def model(**how: Any) -> FlareModel:
-    return FlareModel.of(star(), MAUVE, expectations()[0], distance_pc=5.0, **how)
-
-
 def test_two_temperatures_are_recovered_without_noise() -> None:
     """Compare to 0.6 %, the step between second temperatures, which is far below their error."""
-    quiet, two, _ = expectations()
-    found = mauvecl.fit_two_temperatures(two.recorded_dn, quiet, model())
+    x, two, m = scene("M3V", 9.0, 3.0, FLARE, distance_pc=5.0)
+    found = mauvecl.fit_two_temperatures(two.recorded_dn, x, m)
     best = dict(zip(found.names, found.estimates[0], strict=True))
     assert best["second temperature"] == pytest.approx(30_000.0, rel=0.007)
     assert best["temperature"] == pytest.approx(8000.0, rel=0.01)
@@ -266,22 +239,23 @@ def test_two_temperatures_are_recovered_without_noise() -> None:
     assert best["amplitude"] == pytest.approx(3.0, rel=0.002)
     assert found.chi2[0] < 0.1
     # A single blackbody does not fit.
-    assert fit(two.recorded_dn, quiet, model()).chi2[0] > 1000.0
+    assert fit(two.recorded_dn, x, m).chi2[0] > 1000.0
     # Total light is that of the spectrum that was added.
     grid = FLARE.grid(np.linspace(200.0, 700.0, 2001))
     scale = best["flux bolometric"] / FLARE.bolometric_flux()
     assert best["flux 200-700 nm"] == pytest.approx(10 * scale * np.trapezoid(FLARE.flux(grid), grid), rel=0.03)
     # A line that the flare lacks hardly changes the errors.
-    lined = mauvecl.fit_two_temperatures(two.recorded_dn, quiet, model(lines=("H alpha",)))
+    *_, with_line = scene("M3V", 9.0, 3.0, FLARE, distance_pc=5.0, lines=("H alpha",))
+    lined = mauvecl.fit_two_temperatures(two.recorded_dn, x, with_line)
     assert lined.errors[0, [0, 1, -2, -1]] == pytest.approx(found.errors[0, [0, 1, -2, -1]], rel=0.1)
 
 
 @pytest.mark.long
 def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> None:
     """Fit 400 draws: a coverage of 93 to 97 % fails in 1e-6 of seeds on each side of four quantities."""
-    quiet, two, _ = expectations()
-    found = mauvecl.fit_two_temperatures(engine.realise(two, count=400, seed=3), quiet, model(), levels=(0.95,))
-    exact = mauvecl.fit_two_temperatures(two.recorded_dn, quiet, model())
+    x, two, m = scene("M3V", 9.0, 3.0, FLARE, distance_pc=5.0)
+    found = mauvecl.fit_two_temperatures(engine.realise(two, count=400, seed=3), x, m, levels=(0.95,))
+    exact = mauvecl.fit_two_temperatures(two.recorded_dn, x, m)
     truth = {"temperature": 8000.0, "second temperature": 30_000.0, "second area": 0.05}
     truth["flux bolometric"] = float(exact.estimates[0, exact.column("flux bolometric")])
     for name, value in truth.items():
@@ -296,8 +270,8 @@ def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> 
 @pytest.mark.long
 def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engine) -> None:
     """Fit a blackbody of 9000 K: the second temperature has no limit, the first is that of the plain fit."""
-    quiet, _, one = expectations()
-    found = mauvecl.fit_two_temperatures(engine.realise(one, count=20, seed=5), quiet, model(), levels=(0.95,))
+    x, one, m = scene("M3V", 9.0, 0.5, 9000.0, distance_pc=5.0)
+    found = mauvecl.fit_two_temperatures(engine.realise(one, count=20, seed=5), x, m, levels=(0.95,))
     area, second = found.column("second area"), found.column("second temperature")
     assert (found.low[0, :, area] == 0.0).sum() >= 15
     assert np.isinf(found.high[0, :, second]).sum() >= 15

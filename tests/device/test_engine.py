@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -125,8 +126,7 @@ def test_statistics_equal_reference(any_width: Engine, name: str, more: dict[str
     kind = {"statistics": names, "start": START, "seed": SEED, **how, **more}
     asked = requests.DetectRequest.of(quiet, tuple(flares), INDEX.size, **kind).hypotheses
     plan = requests.plan_channels(asked, range(len(flares)), first=True)
-    smoothed = numpy_kernels.Smoothed.of(asked, plan) if len(plan.scales) else None
-    sums = numpy_kernels.statistics(asked.scene, INDEX, SEED, plan, pair="chi2_pair" in names, smoothed=smoothed)
+    sums = numpy_kernels.statistics(asked, plan, INDEX, SEED)
     values = any_width.statistic_values(quiet, flares, count=INDEX.size, **kind)
     np.testing.assert_array_equal(values, numpy_kernels.marginalise(sums, plan.subtractions))
     if "nuisances" in more:
@@ -183,11 +183,8 @@ def test_neighbours_are_uncorrelated(engine: Engine) -> None:
 @pytest.mark.parametrize("tile", [16, 64, 4096])
 def test_tile_size_does_not_affect_results(engine: Engine, tile: int) -> None:
     (quiet, *flares), _ = case("stack")
-    whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(requests.STATISTICS))
-    parts = Engine(tile=tile).detect(
-        quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(requests.STATISTICS)
-    )
-    same(parts, whole)
+    how = {"realisations": 3001, "start": 77, "seed": 6, "statistics": tuple(requests.STATISTICS)}
+    same(Engine(tile=tile).detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
 
 
 THREADS = """
@@ -247,20 +244,11 @@ def test_snr_includes_photon_noise_of_sky(engine: Engine, signal: Any) -> None:
 
 def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
     (quiet, *flares), _ = case("stack")
-    seen: list[tuple[int, int]] = []
-    Engine(tile=1024, progress=lambda done, total: seen.append((done, total))).detect(
-        quiet, flares, realisations=5000, seed=1
-    )
-    assert (seen[0], seen[-1]) == ((0, 5000), (5000, 5000))
-    assert len(seen) == 6
-
-    calls = iter([KeyboardInterrupt])
-
-    def stop(done: int, total: int) -> None:
-        for error in calls:
-            raise error
-
-    stopping = Engine(tile=1024, progress=stop)
+    seen = Mock()
+    Engine(tile=1024, progress=seen).detect(quiet, flares, realisations=5000, seed=1)
+    assert (seen.call_args_list[0], seen.call_args) == (call(0, 5000), call(5000, 5000))
+    assert seen.call_count == 6
+    stopping = Engine(tile=1024, progress=Mock(side_effect=[KeyboardInterrupt, None, None]))
     with pytest.raises(KeyboardInterrupt):
         stopping.realise(quiet, count=5000, seed=1)
     assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3, "the engine works on"

@@ -103,16 +103,21 @@ def test_second_process_builds_nothing_unless_the_store_is_damaged(filled: tuple
         assert not Path(again["work"]).exists()
 
 
+def build_in(cache: drivers.KernelCache, number: int, size: int = 100) -> Path:
+    """Build a made-up program of this size and return its folder."""
+    with cache.building(f"key{number}"):
+        folder = cache.work / "AA" / f"program{number}"
+        folder.mkdir(parents=True)
+        (folder / "program.bc").write_bytes(bytes(size))
+    return folder
+
+
 def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
     """Store a program at the next build, not only at the end of the process."""
     one = drivers.KernelCache(tmp_path / "store", tmp_path / "work-1")
-    for number in range(2):
-        with one.building(f"key{number}"):
-            (one.work / "AA" / f"program{number}").mkdir(parents=True)
-            (one.work / "AA" / f"program{number}" / "program.bc").write_bytes(bytes(100))
-        if number == 0:
-            # The first launch completes the program.
-            (one.work / "AA" / "program0" / "kernel.so").write_bytes(bytes(100))
+    # The first launch completes the program.
+    (build_in(one, 0) / "kernel.so").write_bytes(bytes(100))
+    build_in(one, 1)
     other = drivers.KernelCache(tmp_path / "store", tmp_path / "work-2")
     assert other.restore("key0")
     assert [path.name for path in files_of(other.work)] == ["kernel.so", "program.bc"]
@@ -158,14 +163,10 @@ def test_working_folder_of_killed_process_is_removed_after_90_days(tmp_path: Pat
     folder.mkdir()
     then = time.time() - days * 86400
     os.utime(folder, (then, then))
+    # A link to nothing is listed and has no age, as a folder that another process removes meanwhile.
+    (tmp_path / f"{drivers.WORK}removed").symlink_to(tmp_path / "nothing")
     assert drivers._working_folder(tmp_path) is not None
     assert folder.exists() == (days < 90)
-
-
-def test_folder_that_another_process_removes_does_no_harm(tmp_path: Path) -> None:
-    """A link to nothing is listed and has no age, as a folder that is removed meanwhile."""
-    (tmp_path / f"{drivers.WORK}01234567").symlink_to(tmp_path / "removed")
-    assert drivers._working_folder(tmp_path) is not None
 
 
 @pytest.mark.long
@@ -185,10 +186,7 @@ def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(drivers, "MAX_STORED", 25_000)
     for number in range(4):
         cache = drivers.KernelCache(tmp_path / "store", tmp_path / f"work{number}")
-        with cache.building(f"key{number}"):
-            folder = cache.work / "AA" / f"program{number}"
-            folder.mkdir(parents=True)
-            (folder / "program.bc").write_bytes(bytes(10_000))
+        build_in(cache, number, 10_000)
         cache.store_programs()
         then = time.time() - 100 + number
         os.utime(cache.store / f"key{number}.zip", (then, then))

@@ -44,7 +44,7 @@ probes.expansion(words, words[::-1].copy(), 2225.0)
 probes.alias(words, np.zeros(16, np.uint32), 4)
 ends = np.repeat(np.array([0, 1, 2**31 - 1, 2**31, 2**32 - 1], np.uint32), 32)
 probes.prior(ends, ~ends, np.zeros(2 * layout.PRIOR_NODES, np.float32))
-print("kernels", len(engine.open_device.programs))
+print("kernels", len(engine.open_device._programs))
 """
 
 RACE = """

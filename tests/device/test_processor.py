@@ -160,10 +160,7 @@ def test_other_devices_are_unchanged(device: Record) -> None:
     assert drivers.names(device) == (None,)
     assert not drivers.set_processor_name(device, "x86-64-v3")
     assert (device.words == before).all()
-
-
-def test_record_at_invalid_address_is_ignored() -> None:
-    device = Record("generic")
+    # Nothing is read at an invalid address.
     device.int_ptr = 2**46
     assert not drivers.set_processor_name(device, "x86-64-v3")
 

@@ -59,12 +59,13 @@ def test_joint_draws_cannot_be_distinguished_from_exact_ones(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["mauvesim", "mauve"])
-def test_nominal_payload_is_drawn_jointly_at_all_settings(name: str) -> None:
+def test_nominal_payload_is_drawn_jointly_and_stacked_at_all_settings(name: str) -> None:
     """Check nine temperatures and 1 to 100 frames, in the pixels with most and least light."""
     for temperature in (-40, -30, -20, -9, 0, 9, 15, 21, 25):
         payload = instrument(name, part=True, temperature_c=float(temperature))
         for frames in (1, 2, 10, 100):
             (x,) = star(payload=payload, exposure=5.0 * frames)
+            assert not prepare([x]).frames
             for pixel in (int(x.light_dn.argmin()), int(x.light_dn.argmax())):
                 assert exact.draws_to_tell(exact.of_stack(x, pixel), by_polynomial(x, pixel)) > SOONEST
 

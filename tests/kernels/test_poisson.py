@@ -10,7 +10,7 @@ from probes import Probes
 from scipy import stats
 
 from mauvecl.device import selftest
-from mauvecl.noise import layout, random_numbers, reference
+from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
 #: From this mean on, counts are drawn by an expansion.
@@ -126,16 +126,6 @@ def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None
     assert needed(float(source["cubic"])) > 1e13
     if mean < 1e5:  # beyond, what is left is the coefficients' own float32
         assert needed(0.0) < 1e-2 * needed(float(source["cubic"]))
-
-
-def test_expansion_equals_the_reference(probes: Probes) -> None:
-    mean = 2225.0
-    w = np.array(reference.words_at(np.arange(4096), 0, "dark", 1, 5))
-    z = random_numbers.normal_pair(w[0], w[1])
-    root = np.sqrt(mean)
-    coefficients = [np.float32(c) for c in (-1 / 6, root - 1 / (36 * root), -1 / (72 * root))]
-    twin = [reference.expansion_draw(row, *coefficients) for row in z]
-    np.testing.assert_array_equal(probes.expansion(w[0], w[1], mean), twin)
 
 
 def test_equal_means_share_a_table() -> None:

@@ -9,18 +9,14 @@ from processes import python
 
 from mauvecl.noise import layout
 
-N = 4000
-
-
 #: A toy process that is registered before anything else is imported, as a new row of the registry is.
 TOY = """
 import json, sys
 from typing import ClassVar
 import numpy as np
 import mauvecl.noise.disturbances as additive
-import mauvecl.noise.disturbances
 
-class Bursts(additive.AdditiveProcess):
+class Bursts(additive.CosmicRays):
     "Bursts of the dark current: a Poisson number of bursts with exponentially distributed electrons."
     stream: ClassVar[int] = 40
     label: ClassVar[str] = "bursts"
@@ -43,12 +39,14 @@ from mauvecl.flares.stare_scene import Flares, StareScene
 from reference import stares as twin
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
+
+N = 4000
 sections = {"bursts": {"per_s": 0.02}, "cosmic_rays": {"rate_per_cm2_s": 300.0}}
 study = Study.build({"star": [{"library": "G2V", "magnitude": 7.4}], "processes": sections}, "t")
 both = study.processes
-quiet, engine, index = toy(64, 3), Engine(), np.arange(NUMBER, dtype=np.uint64)
+quiet, engine, index = toy(64, 3), Engine(), np.arange(N, dtype=np.uint64)
 bursts = Processes(bursts=both.bursts)
-clean, hit, all_ = (engine.realise(quiet, count=NUMBER, seed=2, processes=p) for p in (Processes(), bursts, both))
+clean, hit, all_ = (engine.realise(quiet, count=N, seed=2, processes=p) for p in (Processes(), bursts, both))
 few = index[:8]
 charge = both.bursts.charge(15.0)
 electrons = np.arange(charge.size)
@@ -69,7 +67,7 @@ print(json.dumps({
     "same": same(hit, bursts) and same(all_, both),
     "stares": bool((frames == slow).all()),
     "added": float(np.mean((hit - clean) / gain)), "mean": mean,
-    "sd": float(np.sqrt((charge @ electrons**2 - mean**2) / (NUMBER * 64))),
+    "sd": float(np.sqrt((charge @ electrons**2 - mean**2) / (N * 64))),
     "column": "bursts" in simulate(study).observations[0][2].colnames,
 }))
 """
@@ -78,7 +76,7 @@ print(json.dumps({
 @pytest.mark.long
 def test_another_process_needs_its_class_and_row_only() -> None:
     """Section, kernels, reference, stares and decomposition follow a row; the added charge is that of the class."""
-    done = python(TOY.replace("NUMBER", str(N)), PYTHONPATH=os.pathsep.join(sys.path))
+    done = python(TOY, PYTHONPATH=os.pathsep.join(sys.path))
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["keys"][-1:] == ["bursts"]
     assert found["kept"]

@@ -1,14 +1,12 @@
 """Extreme words and counters in the production kernels."""
 
-from dataclasses import fields, replace
-from typing import Any
-
+import exact
 import numpy as np
 import pytest
 from refusals import refused
 from scenes import instrument, star
 
-from mauvecl import CosmicRays, Engine, Expectation, Processes
+from mauvecl import CosmicRays, Engine, Processes
 from mauvecl.device.launches import scene_launches
 from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
@@ -38,15 +36,6 @@ def place_of(words: tuple[int, int, int, int], stream: str) -> tuple[int, int, i
     raise AssertionError("no such place")
 
 
-def draw_one(engine: Engine, scene: Any, index: int, seed: int) -> np.ndarray:
-    """Draw one realisation of a scene with the production kernel."""
-    out = np.empty((1, scene.n_pixel), np.int32)
-    tile = engine._tiles.at(index, 1, 4096)
-    with scene_launches(engine.open_device, scene, seed) as launches:
-        launches.realise(tile, out)
-    return out
-
-
 ENDS = [
     (0, 0, 0, 0),
     (2**32 - 1,) * 4,
@@ -73,11 +62,11 @@ def test_extreme_words_in_production_kernel_equal_reference(
 ) -> None:
     seed, index, frame, group = place_of(words, stream)
     np.testing.assert_array_equal([int(w[0]) for w in reference.words_at([index], frame, stream, group, seed)], words)
-    options = dict(options)
-    payload = instrument(options.pop("name", "mauvesim"), part=True, output_max_nm=310.0, **options)
-    (x,) = star(payload=payload, exposure=5.0)
+    (x,) = star(payload=instrument(**{"part": True, "output_max_nm": 310.0} | options), exposure=5.0)
     scene = prepare([x], first_frame=frame, first_group=group, **how)
-    raw = draw_one(engine, scene, index, seed)
+    raw = np.empty((1, scene.n_pixel), np.int32)
+    with scene_launches(engine.open_device, scene, seed) as launches:
+        launches.realise(engine._tiles.at(index, 1, 4096), raw)
     np.testing.assert_array_equal(raw, reference.realise(scene, np.array([index], np.uint64), seed))
     # No word gives more than 6.77 sigma of its own noise, or half the tables' 2**-33.
     z = (raw[0, :4] - x.mean_raw_dn[:4]) / np.sqrt(x.variance_dn2[:4])
@@ -96,23 +85,9 @@ def test_draws_at_counter_boundaries_equal_reference(engine: Engine, index: int)
     assert len(np.unique(raw, axis=0)) == 41
 
 
-def wide(pixels: int) -> Expectation:
-    (x,) = star(exposure=5.0)
-    values = {field.name: getattr(x, field.name) for field in fields(x)}
-    size = x.wavelength_nm.size
-    tiled = {name: np.resize(old, pixels) for name, old in values.items() if np.size(old) == size and size > 1}
-    element = np.arange(pixels) // 35
-    tiled |= {
-        "wavelength_nm": 200.0 + 0.01 * np.arange(pixels),
-        "element": element,
-        "element_wavelength_nm": 200.0 + np.arange(element[-1] + 1),
-    }
-    return replace(x, **tiled)
-
-
 def test_largest_number_of_pixels_is_drawn(engine: Engine) -> None:
     """Draw 65 536 pixels: all equal the reference, all groups differ, and statistics are defined."""
-    x = wide(65_536)
+    x = exact.flat(65_536, 1, dark=2225.0, photons=40.0)
     raw = engine.realise(x, start=2**40, count=2, seed=3)
     np.testing.assert_array_equal(raw, reference.realise(prepare([x]), np.array([2**40, 2**40 + 1], np.uint64), 3))
     z = (raw - x.mean_raw_dn) / np.sqrt(x.variance_dn2)
@@ -120,4 +95,4 @@ def test_largest_number_of_pixels_is_drawn(engine: Engine) -> None:
     found = engine.detect(x, [], realisations=4000, seed=3, statistics=("chi2",)).distribution("chi2")
     assert abs(found.mean - 65_536) < 5 * np.sqrt(2 * 65_536 / 4000)
     with refused("pixels", "65540", "65536"):
-        prepare([wide(65_540)])
+        prepare([exact.flat(65_540, 1)])

@@ -1,22 +1,25 @@
 """Pointing drifts: distributions of waits, durations and depths, correlation in time, and means of frames."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from marks import long_but
 from scipy import integrate, stats
 
-from mauvecl.noise import unknowns
+from mauvecl.noise import reference, unknowns
 
 #: Three statistical tests of 4.5 sigma and KS tests at 1e-5: about one run in 10 000 fails by chance. Seeds were fixed
 #: before the first run.
 SIGMA, LEAST_P, SEED = 4.5, 1e-5, 11
 DRIFTS = unknowns.STARE_PROCESSES["pointing"](rate_per_h=6.0, duration_s=200.0, depth=0.8)
+drifts, losses = (partial(function, DRIFTS) for function in (reference.pointing_drifts, reference.pointing_losses))
 WAIT_S = 600.0
 NUMBERS = np.arange(20_000, dtype=np.uint64)
 
 
 def test_waits_durations_and_depths_have_their_distributions() -> None:
-    start, lasts, depth = DRIFTS.drifts(NUMBERS[:4000], 5000.0, SEED)
+    start, lasts, depth = drifts(NUMBERS[:4000], 5000.0, SEED)
     assert (start[:, -1] >= 5000.0).all()
     ends = np.column_stack([np.zeros(4000), (start + lasts)[:, :-1]])
     waits = start - ends
@@ -46,7 +49,7 @@ def occupied(time_s: float) -> float:
 def test_occupation_and_its_correlation_in_time(time_s: float, later_s: float) -> None:
     """P(drift at t) and P(drift at t and t + h) follow in closed form."""
     at = np.array([time_s, time_s + later_s])
-    lost = DRIFTS.losses(NUMBERS, at, 1e-6, SEED) > 0
+    lost = losses(NUMBERS, at, 1e-6, SEED) > 0
     n, p = len(NUMBERS), occupied(time_s)
     assert abs(lost[:, 0].mean() - p) < SIGMA * np.sqrt(p * (1 - p) / n)
     share = 200.0 / (200.0 + WAIT_S)
@@ -58,7 +61,7 @@ def test_occupation_and_its_correlation_in_time(time_s: float, later_s: float) -
 @pytest.mark.long
 def test_moments_of_the_loss() -> None:
     """Long after the start, the loss in a drift is a share of its depth that is uniform between 0 and 1."""
-    lost = DRIFTS.losses(NUMBERS, np.array([20_000.0]), 1e-6, SEED)[:, 0]
+    lost = losses(NUMBERS, np.array([20_000.0]), 1e-6, SEED)[:, 0]
     share = 200.0 / (200.0 + WAIT_S)
     mean, square, fourth = share * 0.8 / 4, share * 0.8**2 / 9, share * 0.8**4 / 25
     n = len(NUMBERS)
@@ -69,14 +72,14 @@ def test_moments_of_the_loss() -> None:
 
 def test_frames_hold_the_mean_of_the_drift() -> None:
     """The loss of a frame is the integral of the saw-tooth over it, whatever begins or ends in the frame."""
-    start, lasts, depth = (one[0] for one in DRIFTS.drifts(NUMBERS[:1], 3000.0, SEED))
+    start, lasts, depth = (one[0] for one in drifts(NUMBERS[:1], 3000.0, SEED))
 
     def lost(time_s: float) -> float:
         inside = (time_s >= start) & (time_s < start + lasts)
         return float(np.sum(inside * depth * (time_s - start) / lasts))
 
     edges = np.arange(0.0, 3000.0, 5.0)
-    found = DRIFTS.losses(NUMBERS[:1], edges, 5.0, SEED)[0]
+    found = losses(NUMBERS[:1], edges, 5.0, SEED)[0]
     breaks = np.concatenate([start, start + lasts])
     for k in [*np.flatnonzero(found)[::7], *((breaks[breaks < 3000.0] // 5.0).astype(int))]:
         inner = [b for b in breaks if edges[k] < b < edges[k] + 5.0]
@@ -85,9 +88,9 @@ def test_frames_hold_the_mean_of_the_drift() -> None:
 
 
 def test_a_stare_depends_on_its_number_and_the_seed_alone() -> None:
-    some = DRIFTS.losses(NUMBERS[7:9], np.arange(0.0, 6000.0, 5.0), 5.0, SEED)
-    every = DRIFTS.losses(NUMBERS[:20], np.arange(0.0, 6000.0, 5.0), 5.0, SEED)
+    some = losses(NUMBERS[7:9], np.arange(0.0, 6000.0, 5.0), 5.0, SEED)
+    every = losses(NUMBERS[:20], np.arange(0.0, 6000.0, 5.0), 5.0, SEED)
     np.testing.assert_array_equal(some, every[7:9])
-    longer = DRIFTS.losses(NUMBERS[7:9], np.arange(0.0, 60_000.0, 5.0), 5.0, SEED)
+    longer = losses(NUMBERS[7:9], np.arange(0.0, 60_000.0, 5.0), 5.0, SEED)
     np.testing.assert_allclose(some, longer[:, :1200], atol=1e-12)
-    assert not np.array_equal(some, DRIFTS.losses(NUMBERS[7:9], np.arange(0.0, 6000.0, 5.0), 5.0, SEED + 1))
+    assert not np.array_equal(some, losses(NUMBERS[7:9], np.arange(0.0, 6000.0, 5.0), 5.0, SEED + 1))

@@ -9,7 +9,7 @@ from scipy import stats
 
 from mauvecl import CosmicRays, Engine, Normal, Processes, Study, Uniform, simulate
 from mauvecl.device import selftest
-from mauvecl.noise import layout, random_numbers, reference
+from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
 N = 20_000
@@ -168,14 +168,14 @@ def test_components_have_correct_sum_and_moments(engine: Engine, name: str, reci
 def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
     """List all counters of a run with all processes: none occurs twice in any realisation, frame or exposure."""
     seen: list[np.ndarray] = []
-    philox = random_numbers.philox
+    philox = reference.philox
 
     def recording(counter, seed: int):
         c = np.broadcast_arrays(*(np.asarray(word, np.uint64) for word in counter))
         seen.append(np.stack(c, axis=-1).reshape(-1, 4))
         return philox(counter, seed)
 
-    monkeypatch.setattr(random_numbers, "philox", recording)
+    monkeypatch.setattr(reference, "philox", recording)
     everything = Processes(
         cosmic_rays=CosmicRays(),
         jitter=Uniform(0.0, 0.05),

@@ -6,7 +6,6 @@ import exact
 import numpy as np
 import pytest
 from refusals import refused
-from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, Processes, Uniform
@@ -96,12 +95,3 @@ def test_mode_follows_least_light_of_prior() -> None:
     x = quiet(0.1, 100, photons=60.0)
     assert not prepare([x]).frames
     assert prepare([x], processes=Processes(qe_scale=Uniform(0.01, 1.0))).frames
-
-
-def test_payload_is_drawn_as_stack() -> None:
-    """Draw stacks, since the read noise of 12 DN smooths all rounding."""
-    for name in ("mauvesim", "mauve"):
-        for temperature in (-40.0, 21.0):
-            for exposure in (10.0, 500.0):
-                payload = instrument(name, part=True, temperature_c=temperature)
-                assert not prepare(star(payload=payload, exposure=exposure)).frames

@@ -269,12 +269,15 @@ def test_answers_through_a_calibrated_instrument_state_its_modes(answer: Any, tm
 
 
 def test_measurements_state_the_error_of_the_throughput(grey: str) -> None:
-    """Light alike at all wavelengths moves fluxes by 5 %, and no temperature."""
+    """Light alike at all wavelengths moves fluxes by 5 %, no temperature, and a limit by 5 % of the light each way."""
     settings = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", f"observation.instrument={grey}"]
     table = mauvecl.measure(paper(*settings, "run.realisations=10")).table
     found = {row["quantity"]: row["error_throughput"] / row["perfect"] for row in table}
     assert found["flux 200-700 nm"] == pytest.approx(np.expm1(0.05), rel=0.01)
     assert found["temperature"] < 1e-3
+    moves = mauvecl.what_matters(paper(*settings, "run.statistics=['matched']"))
+    (mode,) = (row for row in moves if row["assumption"] == "calibration, mode 1")
+    assert float(mode["span"]) == pytest.approx(2 * 2.5 * 0.05 * np.log10(np.e), rel=0.02)
 
 
 def relative(answer: Any, true: Instrument) -> tuple[Any, Any]:

@@ -39,8 +39,7 @@ def results(name: str, count: int) -> dict[str, NDArray[Any]]:
     unknown = Nuisances.of(quiet, how["nuisances"]) if how.get("nuisances") else None
     hypotheses = requests.Hypotheses(quiet, (flare,), names, both, nuisances=unknown)
     plan = requests.plan_channels(hypotheses, range(1), first=True)
-    smoothed = statistics.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
-    sums = statistics.statistics(both, index, seed, plan, pair="chi2_pair" in names, smoothed=smoothed)
+    sums = statistics.statistics(hypotheses, plan, index, seed)
     values = statistics.marginalise(sums, plan.subtractions)
     tally = counts.Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
     counted, moments, _ = statistics.tally(values, tally.packed)

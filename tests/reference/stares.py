@@ -1,19 +1,19 @@
 """NumPy reference implementation of the stare kernels, with the same counters, arithmetic and order of summation."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares import stare_scene
-from mauvecl.noise import layout, random_numbers, reference
+from mauvecl.noise import layout, reference
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.uint64]
 
 Flares, StareScene, SumTable = stare_scene.Flares, stare_scene.StareScene, stare_scene.SumTable
-fma = random_numbers.fma
+fma = reference.fma
 
 
 def exponential_less_one(x: Floats) -> Floats:
@@ -33,14 +33,12 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: 
     """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
     if scene.stare_job["jittered"]:
-        drawn = random_numbers.four_normals(
-            reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed)
-        )
+        drawn = reference.four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
         for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):
             moved[name] = z * scene.stare_job[f"{name}_jitter"]
     for u, kind in enumerate(scene.kinds):
         name = layout.MOVED[kind]
-        z = random_numbers.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
+        z = reference.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
     star, star_less_one, sky, sky_less_one, dark, dark_less_one, near, near_less_one, _ = scene.known[:, frame]
     light = moved["light"]
@@ -68,7 +66,7 @@ def _normals(scene: StareScene, numbers: Numbers, frame: int, stream: str, seed:
     """Draw a normal per statistic, rounded up to groups of four, shape (n_stare,) each."""
     groups = range(-(-len(scene.weights) // 4))
     words = [reference.words_at(numbers, int(scene.numbers[frame]), stream, group, seed) for group in groups]
-    return [z for each in words for z in random_numbers.four_normals(each)]
+    return [z for each in words for z in reference.four_normals(each)]
 
 
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
@@ -77,15 +75,25 @@ def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, 
     return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
 
 
+def _conditions(
+    scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int
+) -> Iterator[tuple[int, dict[str, Floats], list[list[Floats]]]]:
+    """Yield each frame with its coefficients of steady components, and of the flares of each scenario."""
+    lost = scene.losses(numbers, seed)
+    for frame in frames:
+        steady = strengths(scene, numbers, frame, seed, lost)
+        every = range(len(flares.amplitudes))
+        yield frame, steady, [_coefficients(scene, flares, frame, k, steady["light"]) for k in every]
+
+
 def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
     """Draw statistics by the method "pixels", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
-    out, lost = [], scene.losses(numbers, seed)
-    for frame in frames:
-        conditions = strengths(scene, numbers, frame, seed, lost)
+    out = []
+    for frame, steady, of_flares in _conditions(scene, flares, numbers, frames, seed):
         drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), seed)
-        sums = np.zeros((4, len(flares.amplitudes), len(scene.weights), len(numbers)), np.float32)
-        for k in range(len(flares.amplitudes)):
-            v = _counts(scene, drawn.z, conditions, _coefficients(scene, flares, frame, k, conditions["light"]))
+        sums = np.zeros((4, len(of_flares), len(scene.weights), len(numbers)), np.float32)
+        for k, flare in enumerate(of_flares):
+            v = _counts(scene, drawn.z, steady, flare)
             for electrons in drawn.added.values():
                 v = fma(electrons, scene.scene.pixels["electron_gain"][:, None], v)
             x = reference.digitise(v, scene.scene.edges[0, :, None], clip=scene.scene.clip)
@@ -123,16 +131,10 @@ def _counts(scene: StareScene, z: Floats, conditions: dict[str, Floats], flare: 
 
 def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
     """Draw statistics by the method "cumulants", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
-    table = SumTable.of(scene.components)
-    out, lost = [], scene.losses(numbers, seed)
-    for frame in frames:
-        conditions = strengths(scene, numbers, frame, seed, lost)
+    table, out = SumTable.of(scene.components), []
+    for frame, steady, of_flares in _conditions(scene, flares, numbers, frames, seed):
         z = _normals(scene, numbers, frame, "stare_sums", seed)
-        rows = []
-        for k in range(len(flares.amplitudes)):
-            flare = _coefficients(scene, flares, frame, k, conditions["light"])
-            rows.append(_sums(scene, table, z, conditions, flare))
-        out.append(rows)
+        out.append([_sums(scene, table, z, steady, flare) for flare in of_flares])
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
 
 

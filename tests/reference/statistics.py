@@ -2,46 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection import chi2, snr
-from mauvecl.noise import layout, random_numbers, reference
+from mauvecl.noise import layout, reference
 
 if TYPE_CHECKING:
     from mauvecl.detection import requests
 
 Floats = NDArray[np.float32]
 
-fma = random_numbers.fma
+fma = reference.fma
 
 
 def statistics(
-    scene: Any,
-    realisation: NDArray[np.uint64],
-    seed: int,
-    plan: requests.ChannelPlan,
-    *,
-    pair: bool = True,
-    smoothed: Smoothed | None = None,
+    hypotheses: requests.Hypotheses, plan: requests.ChannelPlan, realisation: NDArray[np.uint64], seed: int
 ) -> NDArray[np.float32]:
     """Compute all channels of the kernels `statistics` and `comparison`, in their order.
 
-    Parameters
-    ----------
-    realisation : ndarray of uint64, shape (n,)
-    pair : bool
-        Whether to compute `chi2_pair`; its rows are zero otherwise.
-    smoothed : Smoothed, optional
-        Input of the statistic `paper`, if it is computed.
-
-    Returns
-    -------
-    ndarray of float32, shape (3 n_scenario + n_linear + n_smoothed, n)
+    The shape is (3 n_scenario + n_linear + n_smoothed, n_realisation). Rows of `chi2_pair` are zero if it is not asked.
     """
+    scene: Any = hypotheses.scene
+    pair, smoothed = "chi2_pair" in hypotheses.statistics, len(plan.scales) > 0
+    rows = chi2.Paper().smoothing(hypotheses.setting).rows.astype(np.float32) if smoothed else np.zeros((0, 0))
     n_scenario, fixed = len(scene.levels), len(layout.FIXED_STATISTICS)
     weights, linear_end, pixels_end = plan.weights, plan.linear_end, plan.pixels_end
     constants = scene.constants(weights, linear_end, pixels_end)
@@ -49,7 +35,7 @@ def statistics(
     added, scale = scene.job["reference_weight"], scene.job["pair_scale"]
     out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
     x = _above_reference(scene, reference.observed(scene, realisation, seed))
-    drawn = max(exposures, 1) if exposures or pair or smoothed is not None else 0
+    drawn = max(exposures, 1) if exposures or pair or smoothed else 0
     others = [
         _above_reference(scene, reference.observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
         for number in range(drawn)
@@ -93,8 +79,9 @@ def statistics(
                 row = row + constants[n_scenario + linear]
             out[fixed * n_scenario + linear] = row
         begin = int(linear_end[k])
-        if smoothed is not None:
-            finished += smoothed.sums(raw - others[0][t], k)
+        if smoothed:
+            scales = plan.scales[plan.scale_end[k - 1] if k else 0 : plan.scale_end[k]]
+            finished += _smoothed_sums(rows, scales, raw - others[0][t])
     return np.concatenate([out, np.array(finished, np.float32).reshape(len(finished), len(realisation))])
 
 
@@ -138,33 +125,16 @@ def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """Input of the statistic `paper`."""
-
-    rows: NDArray[np.float32]  # weights of each centre, shape (n_centre, n_padded)
-    scales: NDArray[np.float32]  # factors of squares, as in `ChannelPlan`
-    scale_end: NDArray[np.uint32]
-
-    @classmethod
-    def of(cls, hypotheses: requests.Hypotheses, plan: requests.ChannelPlan) -> Smoothed:
-        """Return the input for a detection's channels."""
-        smoothing = chi2.Paper().smoothing(hypotheses.setting)
-        rows = np.zeros((len(smoothing.rows), len(hypotheses.scene.pixels)), np.float32)
-        rows[:, : hypotheses.scene.n_pixel] = smoothing.rows
-        return cls(rows, plan.scales, plan.scale_end)
-
-    def sums(self, difference: Floats, k: int) -> list[Floats]:
-        """Return the smoothed statistics of a scenario, each of shape (n,)."""
-        begin = int(self.scale_end[k - 1]) if k else 0
-        out = [np.zeros(difference.shape[1], np.float32) for _ in range(begin, int(self.scale_end[k]))]
-        for centre, row in enumerate(self.rows):
-            value = np.zeros(difference.shape[1], np.float32)
-            for p in np.flatnonzero(row):
-                value = fma(difference[p], row[p], value)
-            square = value * value
-            out = [fma(square, self.scales[begin + i, centre], one) for i, one in enumerate(out)]
-        return out
+def _smoothed_sums(rows: Floats, scales: NDArray[np.float32], difference: Floats) -> list[Floats]:
+    """Return the smoothed statistics of a scenario, each of shape (n,); `rows` holds the weights of each centre."""
+    out = [np.zeros(difference.shape[1], np.float32) for _ in scales]
+    for centre, row in enumerate(rows):
+        value = np.zeros(difference.shape[1], np.float32)
+        for p in np.flatnonzero(row):
+            value = fma(difference[p], row[p], value)
+        square = value * value
+        out = [fma(square, scale[centre], one) for one, scale in zip(out, scales, strict=True)]
+    return out
 
 
 def _above_reference(scene: Any, counts: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -211,21 +181,10 @@ def histograms(
 def tally(
     values: NDArray[np.float32], grids: NDArray[np.void]
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64], NDArray[np.uint32]]:
-    """Count values on grids as the kernel `tally` does.
+    """Count values, shape (n_channel, n), on grids as the kernel `tally` does.
 
-    Parameters
-    ----------
-    values : ndarray of float32, shape (n_channel, n)
-    grids : ndarray of layout.GRID, shape (n_grid,)
-
-    Returns
-    -------
-    histogram : ndarray of uint32, shape (n_grid, BINS)
-        The first and last bins include all values outside.
-    sums : ndarray of int64, shape (n_grid, 2)
-        Sums of fine steps and of their squares, without values outside.
-    outside : ndarray of uint32, shape (n_grid,)
-        Number of values outside.
+    Return histograms, shape (n_grid, BINS), whose first and last bins include all values outside; sums of fine steps
+    and of their squares without those, shape (n_grid, 2); and numbers of values outside, shape (n_grid,).
     """
     bins = layout.BINS
     histogram = np.zeros((len(grids), bins), np.uint32)
