@@ -6,6 +6,7 @@ Studies contain priors, so this module imports NumPy only when a quantile is com
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
@@ -30,16 +31,60 @@ if TYPE_CHECKING:
 NEGLIGIBLE = 2.0**-40
 
 
+@validated
+class AdditiveProcess(Section, ABC):
+    """Charge that each pixel collects independently in each draw, and the study section that describes it.
+
+    Kernels draw it from a table of `charge` in a separate stream, multiply it by the gain, and add it to the other
+    noise of the pixel. Subclasses are listed in `ADDITIVE` by their study keys.
+    """
+
+    #: Number of the random stream in `layout.STREAMS`, and name in messages and tables.
+    stream: ClassVar[int]
+    label: ClassVar[str]
+
+    @abstractmethod
+    def charge(self, seconds: float) -> Float:
+        """Return the probabilities of 0, 1, 2, ... electrons in a pixel in a time, shape (n,).
+
+        The omitted tail has a probability below `NEGLIGIBLE`.
+        """
+
+    @abstractmethod
+    def most_electrons(self, seconds: float) -> int:
+        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
+
+    def variance_dn2(self, quiet: Expectation) -> Float:
+        """Return the added variance of each pixel in a frame, DN^2, shape (n_pixel,)."""
+        import numpy as np
+
+        charge = self.charge(quiet.frame_s)
+        electrons = np.arange(charge.size)
+        variance = float(charge @ electrons**2 - (charge @ electrons) ** 2)
+        return np.asarray(variance * quiet.gain_dn_per_electron**2)
+
+    @property
+    def particles_per_cm2_s(self) -> float | None:
+        """Rate of incident particles, or None if the process is not caused by particles from outside."""
+        return None
+
+    def with_particles(self, rate_per_cm2_s: float) -> Self:
+        """Return the process at another rate of incident particles."""
+        return self
+
+    @property
+    def assumption(self) -> tuple[str, str, str]:
+        """Row of a table of assumptions: quantity, value and source."""
+        return (self.label, "", "the study")
+
+
 #: Rate of hits per area.
 ParticleRate = Annotated[float, Unit("1 / (cm2 s)"), Range(0, 1e6)]
 
 
 @validated
-class CosmicRays(Section):
+class CosmicRays(AdditiveProcess):
     """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
-
-    Each pixel collects charge independently in each draw: kernels draw it from a table of `charge` in a separate
-    stream, multiply it by the gain, and add it to the other noise of the pixel.
 
     Attributes
     ----------
@@ -55,7 +100,6 @@ class CosmicRays(Section):
         Relative probabilities of the integers in this range; equal by default.
     """
 
-    #: Number of the random stream in `layout.STREAMS`, and name in messages and tables.
     stream: ClassVar[int] = 3
     label: ClassVar[str] = "cosmic rays"
 
@@ -75,10 +119,7 @@ class CosmicRays(Section):
                 raise InputError.of("weights", self.weights, f"{wanted} numbers of at least 0", where="cosmic rays")
 
     def charge(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> Float:
-        """Return the probabilities of 0, 1, 2, ... electrons in a pixel in a time, shape (n,).
-
-        The distribution is compound Poisson; the omitted tail has a probability below `NEGLIGIBLE`.
-        """
+        """Return the distribution of the charge that a pixel collects in a time, a compound Poisson distribution."""
         import numpy as np
 
         low, high = (int(e) for e in self.electrons)
@@ -97,7 +138,6 @@ class CosmicRays(Section):
         return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
 
     def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:
-        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
         from scipy import special
 
         hits = self._hits(seconds)
@@ -105,15 +145,6 @@ class CosmicRays(Section):
         while special.pdtrc(most, hits) > NEGLIGIBLE:
             most += 1
         return most * int(self.electrons[1])
-
-    def variance_dn2(self, quiet: Expectation) -> Float:
-        """Return the added variance of each pixel in a frame, DN^2, shape (n_pixel,)."""
-        import numpy as np
-
-        charge = self.charge(quiet.frame_s)
-        electrons = np.arange(charge.size)
-        variance = float(charge @ electrons**2 - (charge @ electrons) ** 2)
-        return np.asarray(variance * quiet.gain_dn_per_electron**2)
 
     def _hits(self, seconds: float) -> float:
         """Return the mean number of hits in one pixel."""
@@ -125,19 +156,16 @@ class CosmicRays(Section):
         return self.rate_per_cm2_s
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
-        """Return the process at another rate of incident particles."""
         return self.model_copy(update={"rate_per_cm2_s": rate_per_cm2_s})
 
     @property
     def assumption(self) -> tuple[str, str, str]:
-        """Row of a table of assumptions: quantity, value and source."""
         low, high = self.electrons
         return ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise")
 
 
-#: Additive processes: fields of `Processes`, keys of studies' ``processes``. Another one is a section with the same
-#: methods.
-ADDITIVE: dict[str, type[CosmicRays]] = {"cosmic_rays": CosmicRays}
+#: Additive processes: fields of `Processes`, keys of studies' ``processes``.
+ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
 
 
 @validated

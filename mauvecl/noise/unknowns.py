@@ -16,7 +16,7 @@ from pydantic import create_model
 
 from mauvecl.noise.disturbances import (
     ADDITIVE,
-    CosmicRays,
+    AdditiveProcess,
     Normal,
     ParticleRate,
     PointingDrifts,
@@ -363,7 +363,7 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
     """
 
     @property
-    def additive(self) -> dict[str, CosmicRays]:
+    def additive(self) -> dict[str, AdditiveProcess]:
         """Enabled additive processes by name."""
         return {name: process for name in ADDITIVE if (process := getattr(self, name)) is not None}
 
@@ -379,19 +379,20 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
         return copy
 
     @property
-    def particle_processes(self) -> list[CosmicRays]:
+    def particle_processes(self) -> list[AdditiveProcess]:
         """Enabled processes that incident particles cause."""
-        return list(self.additive.values())
+        return [process for process in self.additive.values() if process.particles_per_cm2_s is not None]
 
     @property
     def particles_per_cm2_s(self) -> float:
         """Largest rate of incident particles of the enabled processes; zero without any."""
-        return max((process.particles_per_cm2_s for process in self.particle_processes), default=0.0)
+        return max((process.particles_per_cm2_s or 0.0 for process in self.particle_processes), default=0.0)
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
         every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
-        update = {name: process.with_particles(rate_per_cm2_s) for name, process in every.items()}
+        caused = {name: process for name, process in every.items() if process.particles_per_cm2_s is not None}
+        update = {name: process.with_particles(rate_per_cm2_s) for name, process in caused.items()}
         copy: Self = self.model_copy(update=update)
         return copy
 

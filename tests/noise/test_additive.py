@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 import mauvecl.noise.disturbances as additive
 
-class Bursts(additive.CosmicRays):
+class Bursts(additive.AdditiveProcess):
     "Bursts of the dark current: a Poisson number of bursts with exponentially distributed electrons."
     stream: ClassVar[int] = 40
     label: ClassVar[str] = "bursts"
@@ -68,6 +68,7 @@ print(json.dumps({
     "stares": bool((frames == slow).all()),
     "added": float(np.mean((hit - clean) / gain)), "mean": mean,
     "sd": float(np.sqrt((charge @ electrons**2 - mean**2) / (N * 64))),
+    "particles": [p.label for p in bursts.with_particles(5.0).particle_processes],
     "column": "bursts" in simulate(study).observations[0][2].colnames,
 }))
 """
@@ -83,6 +84,7 @@ def test_another_process_needs_its_class_and_row_only() -> None:
     assert found["same"]
     assert found["stares"]
     assert found["column"]
+    assert found["particles"] == ["cosmic rays"]
     # Rounding adds 0.03 electrons at most; five standard errors fail once in 2e6.
     assert abs(found["added"] - found["mean"]) < 5 * found["sd"] + 0.03
     assert "bursts" not in layout.STREAMS
