@@ -235,7 +235,7 @@ def scheduler_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 OTHER_CODE = {
     "version": "shards.VERSION = '0.9.0'; identity.cache_clear()",
     "kernels": "shards.DRAWING_PACKAGES = ('kernels',); identity.cache_clear()",
-    "none stated": "cluster.Counted = lambda sums, code: sums; del shards.code_identity",
+    "none stated": "answer = lambda sums, code: sums; del shards.code_identity",
     "request unreadable": "count = None; shards.VERSION = '0.9.0'; identity.cache_clear()",
 }
 #: Script that a worker reads when it starts; Dask runs it twice.
@@ -243,11 +243,13 @@ PRELOAD = """
 from mauvecl.runs import checkpoint as shards, cluster
 if not hasattr(cluster, "changed"):
     cluster.changed, count, identity = True, cluster._count, shards.code_identity
+    answer = lambda *counted: counted
     {change}
     def wrong(*given):
         counted = count(*given)
-        return answer({{key: value + 1 for key, value in getattr(counted, "sums", counted).items()}}, identity())
-    cluster._count, answer = wrong, cluster.Counted
+        sums = counted[0] if isinstance(counted, tuple) else counted
+        return answer({{key: value + 1 for key, value in sums.items()}}, identity())
+    cluster._count = wrong
 """
 
 
