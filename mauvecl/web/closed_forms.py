@@ -86,7 +86,7 @@ class Question:
         values = self.values
         data: dict[str, Any] = {}
         for name, page_field in FIELDS.items():
-            if page_field.path and self._applies(name) and (value := self._value(name, folder)) is not None:
+            if page_field.path and (value := self._value(name, folder)) is not None:
                 set_key(data, [*page_field.path], value, name)
         star = {"library": values["star"]}
         if self.uploaded is not None:
@@ -110,9 +110,12 @@ class Question:
             data.setdefault("plan", {})["targets"] = list(values["targets"])
         return data
 
-    def _applies(self, name: str) -> bool:
-        """Return whether a study has the key of a field, which may depend on the value or file of another field."""
-        values, uploads = self.values, self.uploads
+    def _value(self, name: str, folder: Path) -> Any:
+        """Return the value of a field's key, whose file is written to a folder.
+
+        It is None if the field is empty, or if another field's value or file leaves its key out of a study.
+        """
+        values, uploads, page_field = self.values, self.uploads, FIELDS[name]
         conditions: dict[str, bool] = {
             # Files are written in nm.
             **dict.fromkeys(itertools.chain(*WITH_FILE.values()), False),
@@ -124,14 +127,8 @@ class Question:
             **dict.fromkeys(("pointing_duration", "pointing_depth"), values["pointing_rate"] is not None),
             "hours": bool(values["targets"]),
         }
-        return conditions.get(name, True)
-
-    def _value(self, name: str, folder: Path) -> Any:
-        """Return the value of a field's key, or None if it is empty; its file is written to a folder."""
-        page_field, value = FIELDS[name], self.values[name]
-        if page_field.kind in ("file", "upload"):
-            value = self.uploads.get(name)
-        if value is None:
+        value = uploads.get(name) if page_field.kind in ("file", "upload") else values[name]
+        if value is None or not conditions.get(name, True):
             return None
         if page_field.kind == "upload":
             written = value.written(folder)
@@ -300,7 +297,14 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             assumed = closed.assuming(unknown)
             answer: DetectAnswer | None = answers.get("detection" if assumed is closed else OTHER)
             if answer is None:
-                chance = Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
+                how = "in closed form"
+                if not (assumed.study.nuisances.usual or assumed.slow or assumed.chance != assumed.chance):
+                    # Computed at once.
+                    lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
+                    ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), sky=True)]
+                    how += f"; {chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower "
+                    how += "or higher"
+                chance = Chance(unknown, assumed.chance, how)
             else:
                 (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
                 drawn = f"of {closed.question.realisations[0]:,} simulated"
@@ -311,14 +315,6 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             chance = Chance(unknown, float("nan"), sentence(error))
         all_chances.append(chance)
     return all_chances
-
-
-def _spread(closed: ClosedForms) -> str:
-    """Describe the effect of the throughput's uncertainty on a chance, where that is computed at once."""
-    if closed.study.nuisances.usual or closed.slow or closed.chance != closed.chance:
-        return ""
-    ends = [odds.probability for much in (-1, 1) for odds in closed.at(1 + much * THROUGHPUT, np.ones(1), sky=True)]
-    return f"; {chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
 class Wording(NamedTuple):

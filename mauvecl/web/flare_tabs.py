@@ -449,8 +449,6 @@ MEASUREMENT = Tab(
     simulations={"measure": "Simulate fits"},
     files=dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure"),
     own_view=measured,
-    # Measurements along a stare are made on request.
-    optional=True,
 )
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, TypeAdapter
 
+from mauvecl.answers.answer import has_table, write_table
 from mauvecl.answers.verbs import VERBS
 from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
@@ -160,7 +161,6 @@ class Tab:
     #: Tables that can be downloaded, with the simulation that each needs, or none.
     files: Mapping[str, str | None] = field(default_factory=dict)
     own_table: Callable[[ClosedForms, Answers], Table] | None = None  # table of its only file, if no answer has it
-    optional: bool = False  # whether an answer may lack some of `files`
     #: Documents of answers that can be downloaded, by file name, with the simulation that each needs.
     documents: Mapping[str, str] = field(default_factory=dict)
 
@@ -190,7 +190,10 @@ class Tab:
     def offers(self, name: str, answers: Answers) -> bool:
         """Return whether one of `files` can be downloaded: whether the answer it needs is simulated and has it."""
         needed = self.files[name]
-        return needed is None or (needed in answers and not (self.optional and name not in answers[needed].tables))
+        # An answer may lack tables of what was not asked.
+        return needed is None or (
+            needed in answers and (self.own_table is not None or has_table(answers[needed], name))
+        )
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`."""
@@ -347,8 +350,6 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     The ending is "ecsv", "fits" or "study", and empty for a document. Raises InputError if there is no such file, or it
     is not simulated yet.
     """
-    from mauvecl.answers.answer import write_table
-
     if name in tab.documents and tab.documents[name] in answers:
         # Matplotlib's settings are those of the process.
         with _drawing:

@@ -61,6 +61,10 @@ MOST_TOML_BYTES, MOST_NAME = 2**18, 100
 BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
+#: Error of an archive of observations.
+refusal = partial(InputError, key="observations")
+
+
 @dataclass(frozen=True)
 class Observations:
     """A visitor's archive with frames of standard stars."""
@@ -92,21 +96,16 @@ def unpacked(content: bytes) -> dict[str, bytes]:
         entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
         entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
         if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
-            raise InputError(
-                f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
-                key="observations",
-            )
+            raise refusal(f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all")
         if any(entry.compress_type not in BOUNDED for entry in entries):
-            raise InputError(
-                "the archive is packed in an unusual way; use a zip archive with deflate", key="observations"
-            )
+            raise refusal("the archive is packed in an unusual way; use a zip archive with deflate")
         files = {}
         for entry, name in entries.items():
             # A stated size that is too small ends the reading, and the checksum then differs.
             with archive.open(entry) as file:
                 files[name] = file.read(entry.file_size)
     if len(files) < len(entries):
-        raise InputError("two files of the archive have the same name, but names must differ", key="observations")
+        raise refusal("two files of the archive have the same name, but names must differ")
     return files
 
 
@@ -114,10 +113,9 @@ def _name(path: str) -> str:
     """Return the name of a file of an archive without folders."""
     parts = PureWindowsPath(path)
     if parts.anchor or ".." in parts.parts or not parts.name.isprintable() or not 0 < len(parts.name) <= MOST_NAME:
-        raise InputError(
+        raise refusal(
             f"the archive holds a file named {shortened(path)}, but its files must lie in folders of the archive and "
-            f"have printable names of at most {MOST_NAME} characters",
-            key="observations",
+            f"have printable names of at most {MOST_NAME} characters"
         )
     return parts.name
 
@@ -129,42 +127,32 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
     """
     studies = [rows for name, file in files.items() if name.endswith(".toml") and (rows := _observations(name, file))]
     if len(studies) != 1:
-        raise InputError(
-            f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}",
-            key="observations",
-        )
+        raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}")
     (rows,) = studies
     if len(rows) > MOST_FILES:
-        raise InputError(
-            f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}", key="observations"
-        )
+        raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
     for row in rows:
         for key in PATHS:
             if isinstance(row.get(key), str):
-                name = PureWindowsPath(row[key]).name
+                row[key] = name = PureWindowsPath(row[key]).name
                 if name not in files:
-                    held = ", ".join(sorted(files))
-                    raise InputError(f"the archive needs {shortened(name)}, but holds {held}", key="observations")
-                row[key] = name
+                    raise refusal(f"the archive needs {shortened(name)}, but holds {', '.join(sorted(files))}")
     return built(CalibrateQuestion, {"observations": rows}, "the archive").observations
 
 
 def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
     """Return the rows of a file's table of observations; empty if it has none."""
     if len(content) > MOST_TOML_BYTES:
-        raise InputError(
-            f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB", key="observations"
-        )
+        raise refusal(f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB")
     study = toml(as_text(content, shortened(name)), shortened(name))
     section = study.get("calibrate")
     if not isinstance(section, dict) or "observations" not in section:
         return []
     others = [*(study.keys() - {"calibrate"}), *(f"calibrate.{key}" for key in section.keys() - {"observations"})]
     if others:
-        raise InputError(
+        raise refusal(
             f"{shortened(name)} sets {shortened(min(others))}, but must set calibrate.observations alone; fields set "
-            "the rest",
-            key="observations",
+            "the rest"
         )
     rows = section["observations"]
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []

@@ -73,14 +73,6 @@ def _engine(progress: Callable[[int, int], None]) -> Engine:
     return engine
 
 
-def limit_arenas() -> None:
-    """Let the threads share two pools of glibc's malloc, since each pool keeps what its threads have freed."""
-    change = getattr(ctypes.CDLL(None), "mallopt", None)
-    if change is not None:
-        # M_ARENA_MAX of glibc's malloc.h.
-        change(-8, 2)
-
-
 def release_memory() -> None:
     """Free what simulations leave: arrays in reference cycles, which Python finds late, and pages that malloc keeps."""
     gc.collect()
@@ -277,10 +269,8 @@ class Visitor(WebSocketHandler):
     # State and answers
 
     def state(self, link: str) -> State:
-        """Enter values."""
-        state = State(UPLOADED.of(self, "upload"))
-        state.follow(link)
-        return state
+        """Enter the values of a link."""
+        return State(link, UPLOADED.of(self, "upload"))
 
     def _ask_answer(self, asked: dict[str, Any]) -> None:
         """Send the answer and a tab's pictures; a later question replaces a waiting one."""
