@@ -23,7 +23,7 @@ from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
 from mauvecl.study.study import Study, set_key
 from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
-from mauvecl.web.uploads import write_spectrum, write_table
+from mauvecl.web.uploads import VisitorFile, write_spectrum
 
 if TYPE_CHECKING:
     from mauvecl.answers.detect import DetectAnswer
@@ -33,13 +33,10 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Names of uploaded spectra by field, and of a table of neighbours, in the folder of their study.
+#: Names of uploaded spectra by field, in the folder of their study.
 SPECTRA = {
-    "star": "star.ecsv",
-    "flare_file": "flare.ecsv",
-    "flare_quiescent": "quiescent.ecsv",
-    "change_file": "added.ecsv",
-}
+    "star": "star.ecsv", "flare_file": "flare.ecsv", "flare_quiescent": "quiescent.ecsv", "change_file": "added.ecsv",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +133,7 @@ class Question:
         if page_field.kind == "file":
             return str(write_spectrum(value, folder, SPECTRA[name]))
         if page_field.kind == "table":
-            return str(write_table(value, folder))
+            return str(VisitorFile("neighbours.csv", value.encode()).written(folder))
         value = value if page_field.scale == 1.0 else value / page_field.scale
         # A single flare.
         return [value] if page_field.path[-1] == "amplitudes" else value

@@ -242,8 +242,8 @@ class State:
                     faults[name] = sentence(error)
         return faults
 
-    def asked(self, names: Collection[str] = tuple(FIELDS)) -> tuple[str, ...]:
-        """Return the text of the named fields on which an answer depends, by default of all."""
+    def asked(self, names: Collection[str]) -> tuple[str, ...]:
+        """Return the text of the named fields, on which an answer depends."""
         return tuple(self.entered[name] for name in FIELDS if name in names)
 
     def question(self, names: Collection[str] = tuple(FIELDS)) -> Question:

@@ -138,11 +138,9 @@ class BoundedServer(HTTPServer):
         """Serve a new connection."""
         self.streams = [stream for stream in self.streams if not stream.closed()]
         if len(self.streams) >= self.max_connections:
+            # There are fewer pages than connections.
             pages = {id(page.ws_connection.stream) for page in Visitor.here if page.ws_connection is not None}
-            oldest = next((other for other in self.streams if id(other) not in pages), stream)
-            oldest.close()
-            if oldest is stream:
-                return
+            next(other for other in self.streams if id(other) not in pages).close()
         self.streams.append(stream)
         super().handle_stream(stream, address)
 

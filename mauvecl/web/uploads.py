@@ -36,9 +36,6 @@ from mauvecl.web.sandboxed_reader import read_limited
 
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
-#: Name of a table of neighbours in its folder.
-NEIGHBOURS_FILE = "neighbours.csv"
-
 
 def content_folder(folder: Path, content: bytes, files: Callable[[], Mapping[str, bytes]]) -> Path:
     """Return the subfolder for some content, named after its digest; the first call writes its files."""
@@ -93,8 +90,19 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     """
     remedy = "give a TOML file and the files that it names, in a sound zip archive without a password"
     with parsing("the archive", remedy), zipfile.ZipFile(io.BytesIO(content)) as archive:
-        entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
-        entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
+        entries = dict[zipfile.ZipInfo, str]()
+        for entry in archive.infolist():
+            if entry.is_dir():
+                continue
+            path = PureWindowsPath(entry.filename)
+            name = path.name
+            if path.anchor or ".." in path.parts or not name.isprintable() or not 0 < len(name) <= MOST_NAME:
+                raise refusal(
+                    f"the archive holds a file named {shortened(entry.filename)}, but its files must lie in folders of "
+                    f"the archive and have printable names of at most {MOST_NAME} characters"
+                )
+            if not name.startswith("."):
+                entries[entry] = name
         if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
             raise refusal(f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all")
         if any(entry.compress_type not in BOUNDED for entry in entries):
@@ -107,17 +115,6 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     if len(files) < len(entries):
         raise refusal("two files of the archive have the same name, but names must differ")
     return files
-
-
-def _name(path: str) -> str:
-    """Return the name of a file of an archive without folders."""
-    parts = PureWindowsPath(path)
-    if parts.anchor or ".." in parts.parts or not parts.name.isprintable() or not 0 < len(parts.name) <= MOST_NAME:
-        raise refusal(
-            f"the archive holds a file named {shortened(path)}, but its files must lie in folders of the archive and "
-            f"have printable names of at most {MOST_NAME} characters"
-        )
-    return parts.name
 
 
 def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation, ...]:
@@ -156,11 +153,6 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
         )
     rows = section["observations"]
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-
-
-def write_table(text: str, folder: Path) -> Path:
-    """Write a table of neighbours to a file, once per text, and return its path."""
-    return content_folder(folder, text.encode(), lambda: {NEIGHBOURS_FILE: text.encode()}) / NEIGHBOURS_FILE
 
 
 def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:

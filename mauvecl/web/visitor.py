@@ -185,6 +185,7 @@ UNUSED = 4000
 #: What replies to requests hold if these are refused.
 REFUSED: dict[str, dict[str, Any]] = {
     "solve": {"solved": ""}, "pinned": {"pins": {}}, "columns": {"columns": []}, "file": {"file": ""},
+    "simulate": {"ended": ""},
 }  # fmt: skip
 #: Fields of the section `data`, which say how files of frames are read.
 DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
@@ -423,22 +424,18 @@ class Visitor(WebSocketHandler):
 
         self._begin(draw(self._drawing))
 
-    def _ask_simulate(self, asked: dict[str, Any]) -> None:
+    async def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
         n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
         if self.job is not None or kind not in SIMULATIONS or state.faults_of(reads_of(kind)):
-            self.send(n=n, ended="", refused="a simulation is running already, or there is nothing to simulate")
-            return
-        self._begin(self._or_why(self._simulate(n, kind, state), n=n, ended=""))
-
-    async def _simulate(self, n: int, kind: str, state: State) -> None:
+            raise InputError("a simulation is running already, or there is nothing to simulate")
         key = kind, self._key(state, reads_of(kind))
         question, tab = state.question(reads_of(kind)), SIMULATIONS[kind]
         given = await _in_thread(self.given, state, tab)
         made = partial(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
         closed = await _in_thread(made)
         if self.job is not None:
-            raise InputError("a simulation is running already: wait until it ends", key="simulate")
+            raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
         unit = VERBS[main].counts
         # Several verbs count the realisations of all in the pool.
