@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bokeh.document import Document
+from bokeh.models import ColorBar, ColumnDataSource
 from commands import run
 from marks import long_but
 from scipy.interpolate import RegularGridInterpolator
@@ -307,15 +309,6 @@ async def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(ta
 
 async def test_every_picture_has_its_data(talk: Talk, server: Server, words: dict[str, Any]) -> None:
     """A figure's sources and the data that come have the same names and columns, in both themes and on all axes."""
-
-    def models(node: Any) -> list[dict[str, Any]]:
-        if isinstance(node, list):
-            return [one for each in node for one in models(each)]
-        if not isinstance(node, dict):
-            return []
-        own = [node] if node.get("type") == "object" else []
-        return own + [one for each in node.values() for one in models(each)]
-
     for tab, seen in words["tabs"].items():
         drawn = (await talk.answer("", tab))["pictures"]
         assert [one["name"] for one in seen["pictures"]] == list(drawn)
@@ -327,14 +320,13 @@ async def test_every_picture_has_its_data(talk: Talk, server: Server, words: dic
                 status, text = await server.got(f"figures/{theme}/{one['name']}.json?log={log}")
                 assert status == 200
                 figure = json.loads(text)
-                found = models(figure["item"]["doc"]["roots"])
-                named = {model["attributes"].get("name"): model for model in found if "attributes" in model}
+                models = list(Document.from_json(figure["item"]["doc"]).models)
+                found = {model.name: model.data.keys() for model in models if isinstance(model, ColumnDataSource)}
                 for source, columns in data["sources"].items():
-                    entries = named[source]["attributes"]["data"]["entries"]
-                    assert {entry[0] for entry in entries} == columns.keys(), (one["name"], source)
-                assert data["props"].keys() <= named.keys()
+                    assert found[source] == columns.keys(), (one["name"], source)
+                assert data["props"].keys() <= {model.name for model in models}
                 # A map explains itself by its colour bar.
-                assert figure["legend"] or any(model["name"] == "ColorBar" for model in found)
+                assert figure["legend"] or any(isinstance(model, ColorBar) for model in models)
 
 
 def test_last_of_several_questions_is_answered(server: Server) -> None:
