@@ -210,8 +210,8 @@ class Pool:
         self._stopping = False
 
     def expect(self, realisations: Annotated[int, Range(0)]) -> None:
-        """Announce the total number of realisations, for an estimate of the remaining time."""
-        self._expected = self._total + realisations
+        """Announce a number of further realisations, for an estimate of the remaining time; the largest total holds."""
+        self._expected = max(self._expected, self._total + realisations)
 
     def stop(self) -> None:
         """Stop all work in progress, including that of other threads."""

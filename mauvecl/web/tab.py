@@ -106,9 +106,8 @@ def simulate(
     wanted = [(name, main, asked), *((verb, verb, asked) for verb in more)]
     if name == "detection":
         wanted.append((OTHER, main, _changed(asked, nuisances={"usual": not asked.nuisances.usual})))
-    counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
-    if counted > 1:
-        pool.expect(counted * asked.run.realisations)
+    # Each verb announces its own realisations alone.
+    pool.expect(asked.run.realisations * sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted))
     answers: dict[str, Any] = {}
     for called, verb, of in wanted:
         try:

@@ -217,7 +217,7 @@ class Visitor(WebSocketHandler):
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
     def check_origin(self, origin: str) -> bool:
-        """Accept every origin, since `access.AccessMatcher` has checked it."""
+        """Accept every origin, since `server.AccessMatcher` has checked it."""
         return True
 
     def open(self, *args: str, **kwargs: str) -> None:

@@ -397,7 +397,7 @@ def test_visitor_simulates_shares_and_compares(visit: Visit, page: Window) -> No
     page.press("Start afresh")
     page.enter(realisations="4000000")
     page.button("Simulate").click()
-    page.get_by_text(re.compile(r"of 8,000,000 realisations, about .* s left")).wait_for()
+    page.get_by_text(re.compile(r"of 12,000,000 realisations, about .* s left")).wait_for()
     second = visit("?fap=0.05&realisations=10000")
     second.enter(magnitude="12")
     assert "of 10,000 simulated" in second.simulate()
