@@ -22,7 +22,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
 from mauvecl.study.study import Study, set_key
-from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
+from mauvecl.web.fields import ASKED_UNDER, FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
 from mauvecl.web.uploads import VisitorFile, write_spectrum
 
 if TYPE_CHECKING:
@@ -118,8 +118,7 @@ class Question:
             **dict.fromkeys(itertools.chain(*WITH_FILE.values()), False),
             **dict.fromkeys(("continue_at_k", "flare_quiescent", "as_observed"), "flare_file" in uploads),
             "change_band": "change_file" in uploads,
-            "sky_brightness": values["sky"] == "brightness",
-            **dict.fromkeys(("target", "time"), values["sky"] == "target and time"),
+            **{key: values["sky"] == text for key, (other, text) in ASKED_UNDER.items() if other == "sky"},
             "second_area": values["second_temperature_k"] is not None,
             **dict.fromkeys(("pointing_duration", "pointing_depth"), values["pointing_rate"] is not None),
             "hours": bool(values["targets"]),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import shlex
 import tempfile
 import threading
@@ -311,15 +312,9 @@ def _text(value: str | float) -> str:
 
 
 def _toml(value: Any) -> str:
-    """Return a value as TOML on one line."""
-    if isinstance(value, dict):
-        plain = (
-            (key if key.isidentifier() and key.isascii() else json.dumps(key), item) for key, item in value.items()
-        )
-        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in plain) + "}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value, ensure_ascii=False)
+    """Return a value as TOML on one line: as JSON with another separator, and bare keys."""
+    text = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
+    return re.sub(r'"(\w+)" = ', r"\1 = ", text, flags=re.ASCII)
 
 
 #: Held while matplotlib draws.
