@@ -324,16 +324,12 @@ class Wording(NamedTuple):
 
 #: Words for limits by their quantity.
 LIMITS = {
-    "amplitude": Wording(
-        "of at least", lambda value: f"{short(100 * value)} %", "of no amplitude",
-        "of an amplitude that takes a simulation",
-    ),
-    "magnitude": Wording(
-        "to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude that takes a simulation",
-    ),
-    "exposure": Wording(
-        "in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure that takes a simulation"
-    ),
+    "amplitude": Wording("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude",
+                         "of an amplitude that takes a simulation"),
+    "magnitude": Wording("to {band} =", lambda value: f"{value:.2f}", "at no magnitude",
+                         "to a magnitude that takes a simulation"),
+    "exposure": Wording("in", lambda value: f"{short(value)} s", "in no exposure",
+                        "in an exposure that takes a simulation"),
 }  # fmt: skip
 
 

@@ -206,9 +206,10 @@ class State:
                     self._values[name] = self._read(name, given[name])
             except InputError as error:
                 self._invalid[name] = sentence(error)
-        for name in SEEN.keys() & self._invalid.keys():
-            self.entered[name] = SEEN[name].first
-            self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
+        for name, field in SEEN.items():
+            if name in self._invalid:
+                self.entered[name] = field.first
+                self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
 
     def _read(self, name: str, text: str) -> Any:
         """Enter a text, and return its value."""
