@@ -21,6 +21,7 @@ from mauvecl.host.stars.library import listed_note, resolve
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
+from mauvecl.schema.fields import as_typed
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, Question, chances, short
 from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
@@ -291,8 +292,5 @@ def _target(row: dict[str, Any]) -> dict[str, str]:
     except InputError as error:
         return {"fault": sentence(error)}
     facts = {"spectral_type": star.spectral_type, "V": star.magnitude, "distance_pc": star.distance_pc}
-    target = {
-        key: "" if value is None else f"{value:g}" if isinstance(value, float) else value
-        for key, value in facts.items()
-    }
+    target = {key: as_typed(value) for key, value in facts.items()}
     return target | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}
