@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, TypeAdapter
 
 from mauvecl.answers.answer import has_table, write_table
-from mauvecl.answers.verbs import VERBS
+from mauvecl.answers.verbs import VERBS, Progress
 from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
@@ -91,12 +91,7 @@ DRAWN_UNITS = ("realisations", "steps", "cells")
 
 
 def simulate(
-    name: str,
-    study: Study,
-    pool: Pool,
-    progress: Callable[[int, int], None] | None = None,
-    *,
-    given: Mapping[str, Any] | None = None,
+    name: str, study: Study, pool: Pool, progress: Progress = None, *, given: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the answers to a question by name; its first verb reports its progress and takes the contents of files.
 
