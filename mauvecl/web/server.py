@@ -29,7 +29,6 @@ from mako.lookup import TemplateLookup
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
 from tornado.iostream import IOStream
-from tornado.routing import Matcher, Rule
 from tornado.web import Application, HTTPError, RequestHandler
 
 from mauvecl.answers.verbs import GROUPS
@@ -107,25 +106,26 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     return frozenset(plain(netloc(host, port)) for host in own) | named
 
 
-class AccessMatcher(Matcher):
-    """Matcher of requests that are rejected, as they do not come from pages of the allowed `hosts`."""
+class PageApplication(Application):
+    """Application that refuses requests which do not come from pages of the allowed `hosts`."""
 
-    def __init__(self, allowed: frozenset[str]) -> None:
-        self._allowed = allowed
+    allowed: frozenset[str]
 
-    def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
-        """Return status and message for an unknown host name (DNS rebinding) or another server's page, or None."""
+    def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
+        """Return the handler of a request, or of a refusal: unknown names (DNS rebinding) and other servers' pages."""
         origins, talks = request.headers.get_list("Origin"), request.path == "/live"
         status, why = 403, ""
-        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self._allowed]:
+        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self.allowed]:
             why = "The page is not served under this host name; see `mauvecl serve --allow-origin`."
-        elif any(plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed for given in origins):
+        elif any(plain(re.sub(r"^https?://", "", given.lower())) not in self.allowed for given in origins):
             why = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
         elif talks and not origins:
             why = "Expected a connection from the page."
         elif (talks or request.path == "/") and len(Visitor.here) >= MAX_VISITORS:
             status, why = 503, "Too many visitors are here at the moment; please come again in some minutes."
-        return {"target_kwargs": {"status": status, "why": why}} if why else None
+        if why:
+            return self.get_handler_delegate(request, RefusalHandler, {"status": status, "why": why})
+        return super().find_handler(request, **kwargs)
 
 
 class BoundedServer(HTTPServer):
@@ -199,8 +199,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     def asked_figure(handler: RequestHandler, theme: str, name: str) -> bytes | None:
         return figure(theme, name, "".join(sorted(set(handler.get_query_argument("log", ""))))[:2])
 
-    let_in = hosts(address, port, allowed)
-    application = Application(
+    application = PageApplication(
         [
             (r"/", ContentHandler, {"content": lambda _: front(), "kind": "html"}),
             (r"/live", Visitor),
@@ -214,8 +213,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
         default_handler_args={"status": 404, "why": "There is no such page."},
         log_function=lambda handler: None,
     )
-    # Access control comes first.
-    application.default_router.rules.insert(0, Rule(AccessMatcher(let_in), RefusalHandler))
+    application.allowed = hosts(address, port, allowed)
     limits = {"max_body_size": BODY, "max_buffer_size": MESSAGE}
     server = BoundedServer(application, **limits, idle_connection_timeout=REQUEST_S, body_timeout=REQUEST_S)
     server.max_connections, server.streams = MAX_CONNECTIONS, []

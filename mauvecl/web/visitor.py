@@ -217,7 +217,7 @@ class Visitor(WebSocketHandler):
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
     def check_origin(self, origin: str) -> bool:
-        """Accept every origin, since `server.AccessMatcher` has checked it."""
+        """Accept every origin, since `server.PageApplication` has checked it."""
         return True
 
     def open(self, *args: str, **kwargs: str) -> None:
@@ -504,21 +504,22 @@ class Visitor(WebSocketHandler):
 
     async def _ask_file(self, asked: dict[str, Any]) -> None:
         """Send a table, document or study."""
-        which = (str(asked.get(word)) for word in ("tab", "name", "ending"))
-        file, content = await _in_thread(self.file, self.state(asked["link"]), *which)
-        self.send(content, n=asked["n"], file=file)
+        tab, name, ending = (str(asked.get(word)) for word in ("tab", "name", "ending"))
+        state = self.state(asked["link"])
 
-    def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
-        """Return the name and content of a table, document or study of the question."""
-        if tab in TABS:
-            return as_file(TABS[tab], name, ending, self.closed(state, TABS[tab]), self.answers(state))
-        # The page asks for the study of a question by its name alone.
-        front = next((tab for tab in TABS.values() if name in tab.questions), None)
-        if front is None:
-            raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab", key="name")
-        # A simulation asks what its own answers depend on, which their tables state.
-        question = state.question(reads_of(name) if name in SIMULATIONS else front.reads)
-        return study_file(QUESTIONS[name].study(question.case(Path(self._folder.name)).study), "study")
+        def make() -> tuple[str, bytes]:
+            if tab in TABS:
+                return as_file(TABS[tab], name, ending, self.closed(state, TABS[tab]), self.answers(state))
+            # The page asks for the study of a question by its name alone.
+            front = next((tab for tab in TABS.values() if name in tab.questions), None)
+            if front is None:
+                raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab")
+            # A simulation asks what its own answers depend on, which their tables state.
+            question = state.question(reads_of(name) if name in SIMULATIONS else front.reads)
+            return study_file(QUESTIONS[name].study(question.case(Path(self._folder.name)).study), "study")
+
+        file, content = await _in_thread(make)
+        self.send(content, n=asked["n"], file=file)
 
     async def _ask_export(self, asked: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""
