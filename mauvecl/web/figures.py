@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from bokeh import models
+from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.plotting import figure
 
 from mauvecl.charts.chart import (
@@ -135,7 +136,7 @@ class Canvas:
     def share_colours(self, title: str) -> models.LinearColorMapper:
         """Add the colour bar of a share, and return its colours."""
         text, mapper = self.ink["text"], models.LinearColorMapper(palette="Cividis256", low=0, high=1)
-        bar = models.ColorBar(
+        bar = ColorBar(
             color_mapper=mapper, width=10, title=title, background_fill_color=None, major_label_text_color=text,
             title_text_color=text, major_tick_line_color=text, title_text_font_style="normal",
             title_text_font="system-ui", major_label_text_font="system-ui",
@@ -149,7 +150,7 @@ class Canvas:
             # Its position is set later.
             dimension: Literal["height", "width"] = "height" if series.along == "x" else "width"
             look: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
-            self.plot.add_layout(models.Span(dimension=dimension, location=None, name=series.key, **look))
+            self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **look))
         if isinstance(series, Rule | Listed):
             self._list(series)
             return
@@ -237,9 +238,9 @@ class Canvas:
             how: dict[str, Any] = {"tags": ["more marks" if more else "marks"], "visible": not more}
             line: dict[str, Any] = {"line_color": colour, "line_alpha": 0.35, "line_width": 1, "line_dash": "dotted"}
             for place in places:
-                self.plot.add_layout(models.Span(dimension="height", location=place, **line, **how))
+                self.plot.add_layout(Span(dimension="height", location=place, **line, **how))
             self.plot.add_layout(
-                models.Label(
+                Label(
                     x=sum(places) / len(places), y=0, y_units="screen", y_offset=2, x_offset=3, text=name, angle=1.5708,
                     text_font="system-ui", text_font_size="10px", text_color=colour, text_alpha=0.8, **how,
                 )
