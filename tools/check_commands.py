@@ -88,8 +88,7 @@ def possible_question(
     With `quick`, so are questions with an unknown spectrum of one's own, whose closed forms may take a minute.
     """
     while True:
-        state = State()
-        state.follow(random_link(generator))
+        state = State(random_link(generator))
         if quick and state.entered["own_unknown"]:
             continue
         try:

@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from playwright.sync_api import sync_playwright  # noqa: E402
-from web.visits import CHROMIUM, Server, fresh, link, settled  # noqa: E402
+from web.visits import CHROMIUM, Server, Window, link  # noqa: E402
 
 #: By the name of the file: size of the window, other options of the browser, and entries of the link.
 SHOTS: dict[str, tuple[tuple[int, int], dict[str, Any], dict[str, str]]] = {
@@ -28,10 +28,10 @@ def main() -> None:
         server = Server(Path(folder) / "log")
         browser = playwright.chromium.launch(executable_path=CHROMIUM)
         for name, ((width, height), how, entries) in SHOTS.items():
-            page = fresh(browser, server.address + link(**entries), viewport={"width": width, "height": height}, **how)
+            page = Window(browser, server.address + link(**entries), viewport={"width": width, "height": height}, **how)
             # Pictures are drawn after the answer.
             page.wait_for_timeout(10_000)
-            settled(page)
+            page.settled()
             page.screenshot(path=ROOT / "docs" / "images" / f"{name}.png")
         browser.close()
         server.kill()

@@ -136,6 +136,11 @@ def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
     return get(answer) if callable(get) else attrgetter(get)(answer)
 
 
+def has_table(answer: Answer, file: str) -> bool:
+    """Return whether an answer has the table of a file, without making it."""
+    return file in (table.file for table in answer._declared())
+
+
 def metadata_of(answer: Answer, *paths: str) -> dict[str, object]:
     """Return attributes of an answer by the last names of their paths; "study" is the text of the study."""
     values = {path.rpartition(".")[2]: attrgetter(path)(answer) for path in paths}

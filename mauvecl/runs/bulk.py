@@ -57,21 +57,10 @@ def draw(
     count: Realisations,
     out: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
-    """Draw rows of an array without a store.
+    """Draw `count` rows of an array, raw DN, without a store; `out` is an array of shape (count, *scene.row) to fill.
 
-    Parameters
-    ----------
-    study : Study
-        Study that gives seed, mode, recipe and processes.
-    start, count : int
-        Range of realisations, `start` to `start + count - 1`.
-    out : ndarray, shape (count, *scene.row), optional
-        Array to fill, and to return.
-
-    Returns
-    -------
-    ndarray of uint16 or int32, shape (count, n_pixel), or (count, n_frame, n_pixel) if single frames are stored
-        Raw DN.
+    Without single frames the shape is (count, n_pixel), else (count, n_frame, n_pixel), of uint16 or int32. The study
+    gives seed, mode, recipe and processes.
     """
     how = Case(study).draw_options | {"start": start, "count": count, "seed": study.run.seed}
     if scene.frames is None:

@@ -49,14 +49,6 @@ class _Attempt:
     workers: list[str] | None  # those that may count it; None for all
 
 
-@dataclass(frozen=True, eq=False)
-class Counted:
-    """Answer of a worker."""
-
-    sums: Arrays
-    code: tuple[str, str]  # see `code_identity`
-
-
 @validated
 class DaskWorkers:
     """Workers of a Dask cluster, each with its own engine.
@@ -148,16 +140,12 @@ class DaskWorkers:
                     self._given[task.key] = self._client.submit(bytes, content, key=key)
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
-                attempt = _Attempt(awaited, task, self._ours())
-                sent = self._client.submit(
-                    _count,
-                    self._given[task.key],
-                    task.shard,
-                    self._device,
-                    key=f"mauvecl-{task.name}-{self._sends}",
-                    workers=attempt.workers,
-                    pure=False,
-                )
+                # Workers with our code; all if none has other code, or those with our code have left.
+                present = self._client.nthreads() if self._strangers else ()
+                ours = [worker for worker in present if worker not in self._strangers] or None
+                attempt, key = _Attempt(awaited, task, ours), f"mauvecl-{task.name}-{self._sends}"
+                given = self._given[task.key], task.shard, self._device
+                sent = self._client.submit(_count, *given, key=key, workers=ours, pure=False)
             except (OSError, RuntimeError) as error:
                 # Dask raises either if its client has lost the scheduler.
                 awaited.set_exception(self._gone().with_traceback(error.__traceback__))
@@ -165,11 +153,6 @@ class DaskWorkers:
             self._sent[sent] = attempt
         sent.add_done_callback(partial(self._came, attempt))
         return awaited
-
-    def _ours(self) -> list[str] | None:
-        """Return the addresses of workers with our code; None for all, also if those with our code have left."""
-        present = self._client.nthreads() if self._strangers else ()
-        return [worker for worker in present if worker not in self._strangers] or None
 
     def _find_strangers(self) -> bool:
         """Ask all workers for their code, and return whether more of them have other code than before."""
@@ -217,8 +200,10 @@ class DaskWorkers:
         """Return the counts of a task that has ended, or raise why there are none."""
         if sent.status == "finished":
             answer = _result(sent)
-            if isinstance(answer, Counted) and answer.code == code_identity():
-                return answer.sums
+            # Workers with older code answer without theirs.
+            if isinstance(answer, tuple) and answer[1] == code_identity():
+                sums: Arrays = answer[0]
+                return sums
         error = sent.exception() if sent.status == "error" else None
         if sent.status in ("finished", "error") and self._find_strangers():
             raise ShardLost("counted by a worker with other code", failed=False)
@@ -320,18 +305,10 @@ def _local_cluster(n_workers: int, distributed: Any) -> Any:
     except ImportError as error:
         raise missing_package("cryptography", "a cluster of this machine", "cluster") from error
     return distributed.LocalCluster(
-        n_workers=n_workers,
-        threads_per_worker=1,
-        processes=True,
-        host="127.0.0.1",
-        dashboard_address=None,
-        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-        security=security,
-        preload=__name__,
-        memory_limit=0,
-        silence_logs=logging.CRITICAL,
-        env=dict.fromkeys(THREADS, str(threads)),
-    )
+        n_workers=n_workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"}, security=security, preload=__name__, memory_limit=0,
+        silence_logs=logging.CRITICAL, env=dict.fromkeys(THREADS, str(threads)),
+    )  # fmt: skip
 
 
 def _is_address(where: str) -> bool:
@@ -379,9 +356,10 @@ def _introduce(device: str | None, dask_worker: Any = None) -> tuple[tuple[str, 
         return code_identity(), _engine_here(device, dask_worker.state.nthreads).device
 
 
-def _count(content: bytes, shard: Shard, device: str | None) -> Counted:
+def _count(content: bytes, shard: Shard, device: str | None) -> tuple[Arrays, tuple[str, str]]:
+    """Return the counts of a shard, and the code that counted them."""
     from distributed import get_worker
 
     with _one_at_a_time:
         engine = _engine_here(device, get_worker().state.nthreads)
-        return Counted(engine.count(_request(content), shard), code_identity())
+        return engine.count(_request(content), shard), code_identity()

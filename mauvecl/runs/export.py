@@ -135,17 +135,11 @@ def _fits(selection: Selection) -> HDUList:
         here = [scene for scene in selection.scenes if scene.group == group]
         table = _calibration(here[0])
         parts += [*(_image(selection, scene, table.name) for scene in here), table]
-    return fits.HDUList([primary, *parts, _study(store.study.toml())])
-
-
-def _study(text: str) -> BinTableHDU:
-    """Make a table of a study's lines, which may exceed the 72 characters of a FITS card."""
-    from astropy.io import fits
-
-    # FITS is restricted to ASCII; TOML strings accept escapes of other characters.
-    lines = [re.sub(r"[^\x00-\x7f]", lambda letter: f"\\U{ord(letter[0]):08X}", line) for line in text.splitlines()]
+    # Its lines may exceed the 72 characters of a card. FITS is restricted to ASCII; TOML strings accept escapes.
+    text = re.sub(r"[^\x00-\x7f]", lambda letter: f"\\U{ord(letter[0]):08X}", store.study.toml())
+    lines = text.splitlines()
     column = fits.Column("LINE", f"{max(map(len, lines))}A", array=lines)
-    return fits.BinTableHDU.from_columns([column], name="STUDY")
+    return fits.HDUList([primary, *parts, fits.BinTableHDU.from_columns([column], name="STUDY")])
 
 
 def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:

@@ -210,8 +210,8 @@ class Pool:
         self._stopping = False
 
     def expect(self, realisations: Annotated[int, Range(0)]) -> None:
-        """Announce the total number of realisations, for an estimate of the remaining time."""
-        self._expected = self._total + realisations
+        """Announce a number of further realisations, for an estimate of the remaining time; the largest total holds."""
+        self._expected = max(self._expected, self._total + realisations)
 
     def stop(self) -> None:
         """Stop all work in progress, including that of other threads."""
@@ -270,29 +270,29 @@ class Pool:
 
     def _add_up(self, request: DetectRequest | SnrRequest | StaresRequest, sums: Sums) -> Sums:
         """Count all shards of a request and return their sums."""
-        key = fingerprint(request)
-        todo = shards(request)
+        key, todo = fingerprint(request), shards(request)
         with self._lock:
             self._total += sum(shard.count for shard in todo)
             self._of += len(todo)
         self._report_progress()
-        tasks = (Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}")) for shard in todo)
-        for task, counted in self._counted(self._without_resumed(tasks, sums)):
+
+        def left() -> Iterator[Task]:
+            """Add shards of the checkpoint to the sums, and yield the others."""
+            for shard in todo:
+                task = Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}"))
+                resumed = None if self.checkpoint is None else self.checkpoint.get(task.name)
+                if resumed is None:
+                    yield task
+                else:
+                    sums.add(shard.part, resumed)
+                    self._finished(task, resumed=True)
+
+        for task, counted in self._counted(left()):
             sums.add(task.shard.part, counted)
             if self.checkpoint is not None:
                 self.checkpoint.put(task.name, counted)
             self._finished(task)
         return sums
-
-    def _without_resumed(self, tasks: Iterable[Task], sums: Sums) -> Iterator[Task]:
-        """Add shards of the checkpoint to the sums, and yield the others."""
-        for task in tasks:
-            resumed = None if self.checkpoint is None else self.checkpoint.get(task.name)
-            if resumed is None:
-                yield task
-            else:
-                sums.add(task.shard.part, resumed)
-                self._finished(task, resumed=True)
 
     def _counted(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Arrays]]:
         """Count tasks with all workers, and yield them with their arrays, in the order in which they are finished."""

@@ -434,26 +434,21 @@ class Store:
             return False
         return chunk.key in self.digests and size == chunk.n_bytes
 
-    def owns(self, key: str) -> bool:
-        """Return whether a path in the store is that of a chunk."""
-        path, _, name = key.partition("/c/")
-        scene = next((scene for scene in self.scenes if scene.path == path), None)
-        # Twenty digits suffice for any chunk; int() of a very long name would be slow.
-        number = re.match("[0-9]{1,20}(?=/)", name)
-        if scene is None or number is None:
-            return False
-        return int(number[0]) in scene.chunk_numbers() and key == scene.chunk(int(number[0])).key
-
     def files(self) -> Iterator[tuple[str, bool]]:
         """Yield every file and link in the folder, and whether it belongs to this store."""
-        described = self.description()
-        lists = {f"{scene.path}/{DIGESTS}" for scene in self.scenes}
+        scenes = {scene.path: scene for scene in self.scenes}
+        described = {*self.description(), *(f"{path}/{DIGESTS}" for path in scenes)}
         for folder, folders, names in os.walk(self.path):
             here = Path(folder).relative_to(self.path)
             linked = [name for name in folders if (Path(folder) / name).is_symlink()]
             for name in sorted([*names, *linked]):
                 whole = str(here / name.removeprefix(UNFINISHED))
-                yield str(here / name), whole in described or whole in lists or self.owns(whole)
+                # Twenty digits suffice for any chunk; int() of a very long name would be slow.
+                chunk = re.match("(.+)/c/([0-9]{1,20})/", whole)
+                own = whole in described
+                if chunk is not None and (scene := scenes.get(chunk[1])) is not None:
+                    own |= int(chunk[2]) in scene.chunk_numbers() and whole == scene.chunk(int(chunk[2])).key
+                yield str(here / name), own
 
     def clear(self) -> None:
         """Remove all files but not the folder; the study is last, so that an interrupted removal leaves a store.

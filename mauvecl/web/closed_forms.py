@@ -22,8 +22,8 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
 from mauvecl.study.study import Study, set_key
-from mauvecl.web.fields import FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
-from mauvecl.web.uploads import write_spectrum, write_table
+from mauvecl.web.fields import ASKED_UNDER, FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
+from mauvecl.web.uploads import VisitorFile, write_spectrum
 
 if TYPE_CHECKING:
     from mauvecl.answers.detect import DetectAnswer
@@ -33,13 +33,10 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Names of uploaded spectra by field, and of a table of neighbours, in the folder of their study.
+#: Names of uploaded spectra by field, in the folder of their study.
 SPECTRA = {
-    "star": "star.ecsv",
-    "flare_file": "flare.ecsv",
-    "flare_quiescent": "quiescent.ecsv",
-    "change_file": "added.ecsv",
-}
+    "star": "star.ecsv", "flare_file": "flare.ecsv", "flare_quiescent": "quiescent.ecsv", "change_file": "added.ecsv",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +83,7 @@ class Question:
         values = self.values
         data: dict[str, Any] = {}
         for name, page_field in FIELDS.items():
-            if page_field.path and self._applies(name) and (value := self._value(name, folder)) is not None:
+            if page_field.path and (value := self._value(name, folder)) is not None:
                 set_key(data, [*page_field.path], value, name)
         star = {"library": values["star"]}
         if self.uploaded is not None:
@@ -110,28 +107,24 @@ class Question:
             data.setdefault("plan", {})["targets"] = list(values["targets"])
         return data
 
-    def _applies(self, name: str) -> bool:
-        """Return whether a study has the key of a field, which may depend on the value or file of another field."""
-        values, uploads = self.values, self.uploads
+    def _value(self, name: str, folder: Path) -> Any:
+        """Return the value of a field's key, whose file is written to a folder.
+
+        It is None if the field is empty, or if another field's value or file leaves its key out of a study.
+        """
+        values, uploads, page_field = self.values, self.uploads, FIELDS[name]
         conditions: dict[str, bool] = {
             # Files are written in nm.
             **dict.fromkeys(itertools.chain(*WITH_FILE.values()), False),
             **dict.fromkeys(("continue_at_k", "flare_quiescent", "as_observed"), "flare_file" in uploads),
             "change_band": "change_file" in uploads,
-            "sky_brightness": values["sky"] == "brightness",
-            **dict.fromkeys(("target", "time"), values["sky"] == "target and time"),
+            **{key: values["sky"] == text for key, (other, text) in ASKED_UNDER.items() if other == "sky"},
             "second_area": values["second_temperature_k"] is not None,
             **dict.fromkeys(("pointing_duration", "pointing_depth"), values["pointing_rate"] is not None),
             "hours": bool(values["targets"]),
         }
-        return conditions.get(name, True)
-
-    def _value(self, name: str, folder: Path) -> Any:
-        """Return the value of a field's key, or None if it is empty; its file is written to a folder."""
-        page_field, value = FIELDS[name], self.values[name]
-        if page_field.kind in ("file", "upload"):
-            value = self.uploads.get(name)
-        if value is None:
+        value = uploads.get(name) if page_field.kind in ("file", "upload") else values[name]
+        if value is None or not conditions.get(name, True):
             return None
         if page_field.kind == "upload":
             written = value.written(folder)
@@ -139,7 +132,7 @@ class Question:
         if page_field.kind == "file":
             return str(write_spectrum(value, folder, SPECTRA[name]))
         if page_field.kind == "table":
-            return str(write_table(value, folder))
+            return str(VisitorFile("neighbours.csv", value.encode()).written(folder))
         value = value if page_field.scale == 1.0 else value / page_field.scale
         # A single flare.
         return [value] if page_field.path[-1] == "amplitudes" else value
@@ -300,7 +293,14 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             assumed = closed.assuming(unknown)
             answer: DetectAnswer | None = answers.get("detection" if assumed is closed else OTHER)
             if answer is None:
-                chance = Chance(unknown, assumed.chance, f"in closed form{_spread(assumed)}")
+                how = "in closed form"
+                if not (assumed.study.nuisances.usual or assumed.slow or assumed.chance != assumed.chance):
+                    # Computed at once.
+                    lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
+                    ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), sky=True)]
+                    how += f"; {chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower "
+                    how += "or higher"
+                chance = Chance(unknown, assumed.chance, how)
             else:
                 (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
                 drawn = f"of {closed.question.realisations[0]:,} simulated"
@@ -311,14 +311,6 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             chance = Chance(unknown, float("nan"), sentence(error))
         all_chances.append(chance)
     return all_chances
-
-
-def _spread(closed: ClosedForms) -> str:
-    """Describe the effect of the throughput's uncertainty on a chance, where that is computed at once."""
-    if closed.study.nuisances.usual or closed.slow or closed.chance != closed.chance:
-        return ""
-    ends = [odds.probability for much in (-1, 1) for odds in closed.at(1 + much * THROUGHPUT, np.ones(1), sky=True)]
-    return f"; {chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
 class Wording(NamedTuple):
@@ -332,16 +324,12 @@ class Wording(NamedTuple):
 
 #: Words for limits by their quantity.
 LIMITS = {
-    "amplitude": Wording(
-        "of at least", lambda value: f"{short(100 * value)} %", "of no amplitude",
-        "of an amplitude that takes a simulation",
-    ),
-    "magnitude": Wording(
-        "to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude that takes a simulation",
-    ),
-    "exposure": Wording(
-        "in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure that takes a simulation"
-    ),
+    "amplitude": Wording("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude",
+                         "of an amplitude that takes a simulation"),
+    "magnitude": Wording("to {band} =", lambda value: f"{value:.2f}", "at no magnitude",
+                         "to a magnitude that takes a simulation"),
+    "exposure": Wording("in", lambda value: f"{short(value)} s", "in no exposure",
+                        "in an exposure that takes a simulation"),
 }  # fmt: skip
 
 

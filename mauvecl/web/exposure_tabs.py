@@ -38,7 +38,6 @@ from mauvecl.web.figures import strips
 from mauvecl.web.tab import Tab
 
 if TYPE_CHECKING:
-    from astropy.table import Table
     from bokeh.models.sources import ColumnDataSource
 
     from mauvecl.web.closed_forms import ClosedForms
@@ -55,13 +54,6 @@ def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(f"Most of the noise's power comes from {most.called}: {share:.0f} % over all pixels.", series)
 
 
-def budget_table(closed: ClosedForms, answers: Answers) -> Table:
-    """Return the closed-form table of `mauvecl snr`."""
-    study = closed.study
-    parts = [({"star": star_label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
-    return stacked([star_column()], parts, realisations=study.run.realisations, study=study.ideal().text())
-
-
 NOISE = Tab(
     name="noise",
     title="Noise",
@@ -69,7 +61,13 @@ NOISE = Tab(
     pictures=(budget,),
     questions=("snr",),
     files={"noise-budget": None},
-    own_table=budget_table,
+    # The closed-form table of `mauvecl snr`.
+    own_table=lambda closed, answers: stacked(
+        [star_column()],
+        [({"star": star_label(closed.study.star[0], closed.quiet)}, closed.quiet.noise_budget())],
+        realisations=closed.study.run.realisations,
+        study=closed.study.ideal().text(),
+    ),
 )
 
 

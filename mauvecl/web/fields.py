@@ -72,18 +72,18 @@ class Number:
         accepted = self.range.words(self.unit, whole=self.whole)
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
         if not text.strip():
-            raise InputError(f"nothing is entered; {accepted} is needed", key="number")
+            raise InputError(f"nothing is entered; {accepted} is needed")
         try:
             measure = None if self.whole else with_unit(text, self.unit)
         except ValueError:
-            raise InputError(f"{shortened(text)} has another unit: enter {accepted}", key="number") from None
+            raise InputError(f"{shortened(text)} has another unit: enter {accepted}") from None
         text = text if measure is None else repr(self.scale * measure)
         if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
             point = ", with a point for decimals" if "," in text else ""
-            raise InputError(f"{shortened(text)} is not {kind}: enter {accepted}{point}", key="number")
+            raise InputError(f"{shortened(text)} is not {kind}: enter {accepted}{point}")
         value = int(text) if self.whole else float(text)
         if value not in self.range:
-            raise InputError(f"{shortened(text.strip())} is out of range: enter {accepted}", key="number")
+            raise InputError(f"{shortened(text.strip())} is out of range: enter {accepted}")
         return value
 
 
@@ -97,7 +97,7 @@ class Choice:
     def __call__(self, text: str) -> Any:
         """Parse the value; an error states what is accepted."""
         if text not in self.options:
-            raise InputError(f"{shortened(text)} is not a choice: use one of {', '.join(self.options)}", key="choice")
+            raise InputError(f"{shortened(text)} is not a choice: use one of {', '.join(self.options)}")
         return self.made(text)
 
 
@@ -105,11 +105,9 @@ def read_points(text: str, what: str) -> tuple[tuple[float, float], ...]:
     """Read the spectrum of a nuisance parameter: lines of nm and DN of the exposure; `what` names it in messages."""
     points = columns(what, text, "nm and DN", "nm")
     if not 2 <= len(points) <= MOST_POINTS:
-        raise InputError(
-            f"{what} must have 2 to {MOST_POINTS} pairs of nm and DN, but has {len(points)}", key="own_unknown"
-        )
+        raise InputError(f"{what} must have 2 to {MOST_POINTS} pairs of nm and DN, but has {len(points)}")
     if not np.isfinite(points).all() or (np.diff(points[:, 0]) <= 0).any():
-        raise InputError(f"{what} must have pairs in ascending order of nm", key="own_unknown")
+        raise InputError(f"{what} must have pairs in ascending order of nm")
     return tuple((float(nm), float(dn)) for nm, dn in points)
 
 
@@ -127,7 +125,7 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     share = Number(range_of(LineFraction))
     fractions = tuple((EmissionLine.named(name).name, float(share(value))) for name, _, value in pairs)
     if len(dict(fractions)) < len(fractions):
-        raise InputError(f"{shortened(text)} contains a line twice, but each must be given once", key="lines")
+        raise InputError(f"{shortened(text)} contains a line twice, but each must be given once")
     return fractions
 
 
@@ -142,7 +140,7 @@ def star_name(text: str) -> str:
     if text == UPLOADED:
         return UPLOADED
     if not text.strip():
-        raise InputError("no star is chosen: give a name of the library, or upload a spectrum", key="star")
+        raise InputError("no star is chosen: give a name of the library, or upload a spectrum")
     named_star(text, own=False)
     return text.strip()
 
@@ -155,9 +153,9 @@ def day(text: str) -> str:
     try:
         date = datetime.date.fromisoformat(text.strip())
     except ValueError:
-        raise InputError(f"{shortened(text)} is not a day: {remedy}", key="start") from None
+        raise InputError(f"{shortened(text)} is not a day: {remedy}") from None
     if not YEARS[0] <= date.year < YEARS[1]:
-        raise InputError(f"{date} is out of range: {remedy}", key="start")
+        raise InputError(f"{date} is out of range: {remedy}")
     return date.isoformat()
 
 
@@ -175,10 +173,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
         quoted = (line.replace('"', "") for line in lines)
         lines = ["name", *(f'"{line}"' for line in quoted)]
     if len(lines) - 1 > MOST_TARGETS:
-        raise InputError(
-            f"{len(lines) - 1} targets are too many: give at most {MOST_TARGETS}, or use the command line",
-            key="targets",
-        )
+        raise InputError(f"{len(lines) - 1} targets are too many: give at most {MOST_TARGETS}, or use the command line")
     rows = targets_in(text_table("\n".join(lines), "the table", commas=True), "the table")
     if not check:
         return tuple(rows)
@@ -189,8 +184,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
             like = ", ".join(near_names(row["name"], stars_only=True))
             raise InputError(
                 f"the position of {shortened(row['name'])} (target {number}) is unknown: give a name such as {like}, "
-                "or coordinates such as 53.23 -9.46",
-                key="targets",
+                "or coordinates such as 53.23 -9.46"
             ) from error
     check_different([row["name"] for row in rows], "the target", "targets")
     return tuple(rows)
@@ -203,16 +197,12 @@ def neighbours(text: str) -> str | None:
     if not text.strip():
         return None
     if text.startswith("# %ECSV"):
-        raise InputError(
-            "the table of neighbours is ECSV, but must be CSV on this page; the command line reads both",
-            key="neighbours",
-        )
+        raise InputError("the table of neighbours is ECSV, but must be CSV on this page; the command line reads both")
     names = {name.strip().lower() for name in text_table(text, "the table of neighbours", commas=True).colnames}
     if files := names & {*FILES}:
         raise InputError(
             f"the table of neighbours has a column {min(files)}, but must have spectral_type instead; the command line "
-            "reads files of spectra",
-            key="neighbours",
+            "reads files of spectra"
         )
     return text
 
@@ -271,18 +261,21 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     return Field(**(vars(widget) | own), path=path)
 
 
+#: Readers of fields by the kind of their widget.
+READERS: dict[str, Callable[[str], Any]] = {
+    "day": day,
+    "table": neighbours,
+    "library": lambda text: named_star(text, own=False).nearest if text.strip() else None,
+    **dict.fromkeys(("file", "upload"), Choice(("", UPLOADED_FILE), lambda text: text or None)),
+}
+
+
 def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> Callable[[str], Any]:
     choices = widget.choices or (get_args(field.annotation) if get_origin(field.annotation) is Literal else ())
     if choices:
         return Choice(choices)
-    if widget.kind == "day":
-        return day
-    if widget.kind in ("file", "upload"):
-        return Choice(("", UPLOADED_FILE), lambda text: text or None)
-    if widget.kind == "library":
-        return lambda text: named_star(text, own=False).nearest if text.strip() else None
-    if widget.kind == "table":
-        return neighbours
+    if widget.kind in READERS:
+        return READERS[widget.kind]
     if field.annotation is bool:
         return Choice(("no", "yes"), lambda text: text == "yes")
     flag = first(field, Flag)

@@ -6,21 +6,8 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from bokeh.models import (
-    BasicTickFormatter,
-    BoxZoomTool,
-    DataRange1d,
-    HoverTool,
-    LinearColorMapper,
-    NoOverlap,
-    Range1d,
-    ResetTool,
-    Scatter,
-    Step,
-    WheelZoomTool,
-)
+from bokeh import models
 from bokeh.models.annotations import ColorBar, Label, Span
-from bokeh.models.sources import ColumnDataSource
 from bokeh.plotting import figure
 
 from mauvecl.charts.chart import (
@@ -111,7 +98,7 @@ class Canvas:
             # Half of a label at the end of the axis, which is else moved over its neighbour.
             min_border_right=14,
             # The wheel alone scrolls the page; two fingers zoom.
-            tools=[BoxZoomTool(), WheelZoomTool(modifiers={"ctrl": True}), ResetTool()],
+            tools=[models.BoxZoomTool(), models.WheelZoomTool(modifiers={"ctrl": True}), models.ResetTool()],
             active_scroll="auto",
             toolbar_location=None,
             background_fill_color=None,
@@ -125,9 +112,9 @@ class Canvas:
                 axis_label_text_font_style="normal", axis_label_text_font="system-ui", axis_label_text_font_size="12px",
                 axis_label_text_color=text, major_label_text_font="system-ui", major_label_text_font_size="11px",
                 major_label_text_color=text, axis_line_color=text, major_tick_line_color=text,
-                minor_tick_line_color=None, major_label_policy=NoOverlap(),
+                minor_tick_line_color=None, major_label_policy=models.NoOverlap(),
             )  # fmt: skip
-            if isinstance(axis.formatter, BasicTickFormatter):
+            if isinstance(axis.formatter, models.BasicTickFormatter):
                 axis.formatter.power_limit_high = 7
         plot.xaxis.name, plot.yaxis.name = "x axis", "y axis"
         plot.grid.grid_line_color = self.ink["grid"]
@@ -138,17 +125,17 @@ class Canvas:
         """Return the range of an axis, or None for Bokeh's own."""
         if axis.kind == "wavelength":
             # All figures with wavelengths share one range.
-            return Range1d(start=SHOWN_NM[0], end=SHOWN_NM[1], bounds=SHOWN_NM)
+            return models.Range1d(start=SHOWN_NM[0], end=SHOWN_NM[1], bounds=SHOWN_NM)
         if axis.kind == "names":
             return ["nothing"]
         if axis.limits is not None:
             return axis.log_limits if axis.log_limits is not None and name in self.logs else axis.limits
         # Hidden marks do not affect the range; without data, the range is a default one.
-        return DataRange1d(only_visible=True, default_span=2.0) if name == "y" else None
+        return models.DataRange1d(only_visible=True, default_span=2.0) if name == "y" else None
 
-    def share_colours(self, title: str) -> LinearColorMapper:
+    def share_colours(self, title: str) -> models.LinearColorMapper:
         """Add the colour bar of a share, and return its colours."""
-        text, mapper = self.ink["text"], LinearColorMapper(palette="Cividis256", low=0, high=1)
+        text, mapper = self.ink["text"], models.LinearColorMapper(palette="Cividis256", low=0, high=1)
         bar = ColorBar(
             color_mapper=mapper, width=10, title=title, background_fill_color=None, major_label_text_color=text,
             title_text_color=text, major_tick_line_color=text, title_text_font_style="normal",
@@ -173,7 +160,7 @@ class Canvas:
                     Line(f"target {k + 1}", colour, f"{series.key} {k}", width=2, dash=series.dash, tips=series.tips)
                 )
             return
-        source = ColumnDataSource({column: [] for column in series.columns}, name=series.key)
+        source = models.ColumnDataSource({column: [] for column in series.columns}, name=series.key)
         if isinstance(series, Custom):
             if series.draw is not None:
                 series.draw(self, source)
@@ -188,23 +175,22 @@ class Canvas:
         if isinstance(series, Dots) and series.alone:
             self.plot.y_range.update(renderers=[made])
 
-    def _drawn(self, series: Series, source: ColumnDataSource) -> Any:
+    def _drawn(self, series: Series, source: models.ColumnDataSource) -> Any:
         """Return the renderer of a series."""
         plot, colour, columns = self.plot, self.ink.get(series.colour, series.colour), series.columns
         line: dict[str, Any] = {
             "line_color": colour, "line_width": series.width, "line_dash": series.dash or "solid",
             "line_alpha": series.alpha,
         }  # fmt: skip
+        fill: dict[str, Any] = {"source": source, "fill_color": colour, "fill_alpha": series.alpha}
         match series:
             case Band():
-                return plot.varea(*columns, source=source, fill_color=colour, fill_alpha=series.alpha)
+                return plot.varea(*columns, **fill)
             case Strips():
                 hatch = {"hatch_pattern": "/", "hatch_color": colour, "hatch_alpha": 0.5} if series.hatched else {}
-                look = {"fill_color": colour, "fill_alpha": series.alpha, "line_color": None}
-                return plot.vstrip(*columns, source=source, **look, **hatch)
+                return plot.vstrip(*columns, line_color=None, **fill, **hatch)
             case Bars():
-                look = {"fill_color": colour, "fill_alpha": series.alpha, "line_color": None}
-                return plot.quad("left", "right", "top", 1e-9 if "y" in self.logs else 0, source=source, **look)
+                return plot.quad("left", "right", "top", 1e-9 if "y" in self.logs else 0, line_color=None, **fill)
             case Own():
                 return plot.scatter(*columns, source=source, size=13, marker="circle", fill_color=colour,
                                     line_color=self.ink["ground"], line_width=2)  # fmt: skip
@@ -230,13 +216,13 @@ class Canvas:
         columns = [column for _, column in lines]
         rows = "".join(f"<div>{name}: <b>@{column}{{%.4g}}</b></div>" for name, column in lines)
         over = made
-        if isinstance(made.glyph, Step):
+        if isinstance(made.glyph, models.Step):
             # BokehJS finds no steps below the pointer.
             over = self.plot.line("x", "y", source=made.data_source, line_alpha=0)
         self.plot.add_tools(
-            HoverTool(
+            models.HoverTool(
                 renderers=[over],
-                mode="mouse" if isinstance(made.glyph, Scatter) else along,
+                mode="mouse" if isinstance(made.glyph, models.Scatter) else along,
                 point_policy="snap_to_data",
                 line_policy="nearest",
                 tooltips=f"<b>{made.name}</b>{rows}",
@@ -246,20 +232,17 @@ class Canvas:
 
     def _mark(self) -> None:
         """Add marks of spectral lines."""
+        colour = self.ink["text"]
         for name, places in MARKS.items():
-            show = "more marks" if name in MORE_MARKS else "marks"
+            more = name in MORE_MARKS
+            how: dict[str, Any] = {"tags": ["more marks" if more else "marks"], "visible": not more}
+            line: dict[str, Any] = {"line_color": colour, "line_alpha": 0.35, "line_width": 1, "line_dash": "dotted"}
             for place in places:
-                self.plot.add_layout(
-                    Span(
-                        dimension="height", location=place, line_color=self.ink["text"], line_alpha=0.35, line_width=1,
-                        line_dash="dotted", tags=[show], visible=name not in MORE_MARKS,
-                    )
-                )  # fmt: skip
+                self.plot.add_layout(Span(dimension="height", location=place, **line, **how))
             self.plot.add_layout(
                 Label(
-                    x=sum(places) / len(places), y=0, y_units="screen", y_offset=2, x_offset=3, text=name, tags=[show],
-                    visible=name not in MORE_MARKS, text_font="system-ui", text_font_size="10px", angle=1.5708,
-                    text_color=self.ink["text"], text_alpha=0.8,
+                    x=sum(places) / len(places), y=0, y_units="screen", y_offset=2, x_offset=3, text=name, angle=1.5708,
+                    text_font="system-ui", text_font_size="10px", text_color=colour, text_alpha=0.8, **how,
                 )
             )  # fmt: skip
 

@@ -208,12 +208,7 @@ def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
     text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
     if not closed.slow:
         x, y, p = _kept(_map, closed)
-        series |= {
-            "map": _image(x, y, p),
-            "contours": _contours(x, y, p, 0.1, 0.9),
-            "half": _contours(x, y, p, 0.5),
-            "labels": _labels(x, y, p),
-        }
+        series |= _map_series(x, y, p)
         share = 100 * float(np.mean(p >= 0.5))
         text = (
             f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
@@ -227,29 +222,29 @@ def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series)
 
 
-def _image(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
-    """Return the image of a map, and the edges of cells around its points."""
+def _map_series(x: Float, y: Float, p: Float) -> dict[str, Any]:
+    """Return the data of a map, its contours, and their names, each at another part of its line: lines are close."""
     half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
     wide, high = x[-1] - x[0] + 2 * half_x, y[-1] - y[0] + 2 * half_y
     percent = np.repeat(10 ** y[:, None], x.size, axis=1)
-    return [p], [percent], [x[0] - half_x], [y[0] - half_y], [wide], [high]
-
-
-def _contours(x: Float, y: Float, p: Float, *levels: float) -> tuple[Any, Any]:
-    lines: list[Any] = [line for level in levels for line in contour_generator(x, y, p).lines(level)]
-    return [line[:, 0].tolist() for line in lines], [line[:, 1].tolist() for line in lines]
-
-
-def _labels(x: Float, y: Float, p: Float) -> tuple[Any, ...]:
-    """Return the names of contours, each at another part of its line: the lines are close to each other."""
-    labels = []
+    contours, labels = contour_generator(x, y, p), []
+    lines: dict[float, list[Any]] = {level: list(contours.lines(level)) for level in LABELLED}
     for level, part in LABELLED.items():
-        lines: list[Any] = list(contour_generator(x, y, p).lines(level))
-        if lines:
-            longest = max(lines, key=len)
+        if lines[level]:
+            longest = max(lines[level], key=len)
             at = longest[np.argsort(longest[:, 0])][int(part * (len(longest) - 1))]
             labels.append((float(at[0]), float(at[1]), f"{100 * level:g} %"))
-    return tuple(zip(*labels, strict=True)) or ([], [], [])
+
+    def columns(*levels: float) -> list[list[list[float]]]:
+        each = [line for level in levels for line in lines[level]]
+        return [[line[:, axis].tolist() for line in each] for axis in (0, 1)]
+
+    return {
+        "map": ([p], [percent], [x[0] - half_x], [y[0] - half_y], [wide], [high]),
+        "contours": columns(0.1, 0.9),
+        "half": columns(0.5),
+        "labels": tuple(zip(*labels, strict=True)) or ([], [], []),
+    }
 
 
 LIMIT = Tab(
@@ -449,8 +444,6 @@ MEASUREMENT = Tab(
     simulations={"measure": "Simulate fits"},
     files=dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure"),
     own_view=measured,
-    # Measurements along a stare are made on request.
-    optional=True,
 )
 
 

@@ -109,8 +109,11 @@ def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
         flux, used = analysis.flux, analysis.level.used
         chosen = thinned(analysis.level.level, MOST_POINTS)
         series["level"] = minutes(frames, frames.time_s[chosen]), analysis.level.level[chosen]
-        text = _summary(answer.rows, analysis)
-        half = frames.cadence_s / 2
+        verdicts, half = [row.verdict for row in answer.rows], frames.cadence_s / 2
+        named = [verdict for verdict in VERDICTS if verdict != "undecided" or verdict in verdicts]
+        counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in named)
+        text = f"Events in {short(analysis.days)} star-days: {counts}; detected above an S/N of "
+        text += f"{analysis.threshold:.2f}."
         for verdict in VERDICTS:
             ends = [(row.event.first, row.event.last) for row in answer.rows if row.verdict == verdict]
             times = analysis.survey.time_s[np.reshape(np.array(ends, int), (-1, 2))]
@@ -120,14 +123,6 @@ def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
         chosen = chosen[thinned(flux[chosen], MOST_POINTS)]
         series[name] = minutes(frames, frames.time_s[chosen]), flux[chosen]
     return ChartData(text, series, {"y axis": {"axis_label": f"flux ({frames.unit})" if frames.unit else "flux"}})
-
-
-def _summary(rows: Any, analysis: Analysis) -> str:
-    """Return the numbers of events in words."""
-    verdicts = [row.verdict for row in rows]
-    named = [verdict for verdict in VERDICTS if verdict != "undecided" or verdict in verdicts]
-    counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in named)
-    return f"Events in {short(analysis.days)} star-days: {counts}; detected above an S/N of {analysis.threshold:.2f}."
 
 
 def _image(canvas: Canvas, source: ColumnDataSource) -> None:
@@ -223,8 +218,6 @@ ANALYSE = Tab(
     needs="frames",
     given=read_frames,
     words=name_of("frames", "no file of frames yet"),
-    # Some tables exist only for spectra.
-    optional=True,
 )
 
 

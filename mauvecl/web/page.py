@@ -7,7 +7,7 @@ text of all fields, their errors, and the question if all are valid.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -21,6 +21,7 @@ from mauvecl.host.stars.library import listed_note, resolve
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
+from mauvecl.schema.fields import as_typed
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, Question, chances, short
 from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
@@ -81,9 +82,11 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
     """
     messages = answers[tab.answer].messages if tab.answer in answers else []
+    # The first sentence of the command line's output.
+    names = (tab.answer, *tab.questions, *tab.simulations)
     plain = {
         "chance": tab.chance,
-        "headline": _headline(tab, answers),
+        "headline": next((str(answers[name].headline) for name in names if name in answers), ""),
         "numbers": [],
         "chosen": "",
         "shown": tab.title,
@@ -95,13 +98,7 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "files": [f"{each.name} {name}" for each in TABS.values() for name in each.files if each.offers(name, answers)]
         + [f"{each.name} {name}" for each in TABS.values() for name, of in each.documents.items() if of in answers],
     }
-    return plain | (_with_chance(tab, closed, answers) if tab.chance else {})
-
-
-def _headline(tab: Tab, answers: Answers) -> str:
-    """Return the first sentence of the command line's output for the tab's simulated answer; empty without one."""
-    names = (tab.answer, *tab.questions, *tab.simulations)
-    return next((str(answers[name].headline) for name in names if name in answers), "")
+    return plain | (_with_chance(str(plain["headline"]), closed, answers) if tab.chance else {})
 
 
 def _estimate(closed: ClosedForms, both: list[Chance]) -> str:
@@ -115,7 +112,8 @@ def _estimate(closed: ClosedForms, both: list[Chance]) -> str:
     return f"{seen}, by the estimate before a simulation."
 
 
-def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+    """Return the entries of a card with the chance of detection."""
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
     told = [message for name in TOLD if name in answers for message in answers[name].messages]
@@ -136,7 +134,7 @@ def _with_chance(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, A
         f"per test, with the payload {q.instrument}."
     )
     return {
-        "headline": _headline(tab, answers) or _estimate(closed, both),
+        "headline": headline or _estimate(closed, both),
         "numbers": [
             {
                 "unknown": unknown,
@@ -167,9 +165,7 @@ def _several(text: str) -> tuple[str, ...]:
     """Parse names of simulations, without repetitions."""
     names = [name for name in text.split(",") if name]
     if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
-        raise InputError(
-            f"{shortened(text)} is not a simulation: use some of {', '.join(SIMULATIONS)}", key="simulated"
-        )
+        raise InputError(f"{shortened(text)} is not a simulation: use some of {', '.join(SIMULATIONS)}")
     return tuple(dict.fromkeys(names))
 
 
@@ -186,37 +182,46 @@ FIRST = {name: field.read(field.first) for name, field in ENTRIES.items()}
 
 
 class State:
-    """State of a page: the text of each field in `entered`, valid or not, and the visitor's files in `uploads`.
+    """State of a page that a link gives: the text of each field in `entered`, valid or not, and the visitor's files.
 
-    `stray` is the message on entries of the last link that are no fields.
+    `stray` is the message on entries of the link that are no fields, or that the page has no field to correct.
     """
 
-    def __init__(self, uploads: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, link: str = "", uploads: Mapping[str, Any] | None = None) -> None:
+        self.uploads, self.stray, query = dict(uploads or {}), "", link.removeprefix("?")
+        if len(query) > MOST_LINKED:
+            query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
+        given = dict(parse_qsl(query, keep_blank_values=True, errors="replace"))
+        if strange := sorted(given.keys() - ENTRIES.keys()):
+            self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
+        if given.get("unknown") in FORMER_VALUES["unknown"]:
+            self.stray += " The link is of version 1: its payload and unknowns have other names today."
+            given |= {
+                name: words.get(given[name], given[name]) for name, words in FORMER_VALUES.items() if name in given
+            }
         self.entered = {name: field.first for name, field in ENTRIES.items()}
-        self._values = dict(FIRST)
-        self._invalid: dict[str, str] = {}
-        self.stray = ""
-        self.uploads = dict(uploads or {})
-
-    def enter(self, given: Mapping[str, str]) -> None:
-        """Enter text into fields."""
-        for name, text in given.items():
-            field = ENTRIES[name]
-            self.entered[name] = text[: field.characters]
-            self._invalid.pop(name, None)
+        self._values, self._invalid = dict(FIRST), dict[str, str]()
+        for name in ENTRIES:
             try:
-                if len(text) > field.characters:
-                    raise InputError(
-                        f"{shortened(text)} is too long: enter at most {field.characters} characters", key=name
-                    )
-                value = field.read(text)
-                if self._holds_file(name) and name not in self.uploads:
-                    raise InputError(
-                        f"the {text} is not here: give its file again, since links do not hold it", key=name
-                    )
-                self._values[name] = value
+                if name in given:
+                    self._values[name] = self._read(name, given[name])
             except InputError as error:
                 self._invalid[name] = sentence(error)
+        for name, field in SEEN.items():
+            if name in self._invalid:
+                self.entered[name] = field.first
+                self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
+
+    def _read(self, name: str, text: str) -> Any:
+        """Enter a text, and return its value."""
+        field = ENTRIES[name]
+        self.entered[name] = text[: field.characters]
+        if len(text) > field.characters:
+            raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
+        value = field.read(text)
+        if self._holds_file(name) and name not in self.uploads:
+            raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
+        return value
 
     def _holds_file(self, name: str) -> bool:
         return name in UPLOADS and self.entered[name] == UPLOADS[name].entered
@@ -224,25 +229,23 @@ class State:
     def faults_of(self, names: Collection[str]) -> dict[str, str]:
         """Return the error messages of some fields, with those of values that cannot be together."""
         faults = {name: why for name, why in self._invalid.items() if name in names}
-        for name in ("realisations", "target", "time"):
+        checks: dict[str, Callable[[], Any]] = {}
+        if "fap" not in self._invalid:
+            checks["realisations"] = lambda: check_fap(self._values["fap"], *self._values["realisations"])
+        if self.entered["sky"] == "target and time":
+            checks["target"] = lambda: parse_position(self.entered["target"])
+            checks["time"] = lambda: parse_time(self.entered["time"])
+        for name, check in checks.items():
             if name in names and name not in faults:
                 try:
-                    self._check(name)
+                    with offline():
+                        check()
                 except InputError as error:
                     faults[name] = sentence(error)
         return faults
 
-    def _check(self, name: str) -> None:
-        """Raise InputError for a value that cannot be together with those of other fields."""
-        if name == "realisations":
-            if "fap" not in self._invalid:
-                check_fap(self._values["fap"], *self._values["realisations"])
-        elif self.entered["sky"] == "target and time":
-            with offline():
-                (parse_position if name == "target" else parse_time)(self.entered[name])
-
-    def asked(self, names: Collection[str] = tuple(FIELDS)) -> tuple[str, ...]:
-        """Return the text of the named fields on which an answer depends, by default of all."""
+    def asked(self, names: Collection[str]) -> tuple[str, ...]:
+        """Return the text of the named fields, on which an answer depends."""
         return tuple(self.entered[name] for name in FIELDS if name in names)
 
     def question(self, names: Collection[str] = tuple(FIELDS)) -> Question:
@@ -258,29 +261,6 @@ class State:
         return Question(
             values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
         )
-
-    def follow(self, link: str) -> None:
-        """Enter the values of a link, and defaults for all others."""
-        query = link.removeprefix("?")
-        self.stray = ""
-        if len(query) > MOST_LINKED:
-            query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
-        pairs = parse_qsl(query, keep_blank_values=True, errors="replace")
-        strange = sorted({name for name, _ in pairs} - set(ENTRIES))
-        if strange:
-            self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
-        given = {name: text for name, text in pairs if name in ENTRIES}
-        if given.get("unknown") in FORMER_VALUES["unknown"]:
-            self.stray += " The link is of version 1: its payload and unknowns have other names today."
-            given |= {
-                name: words.get(given[name], given[name]) for name, words in FORMER_VALUES.items() if name in given
-            }
-        first = {name: field.first for name, field in ENTRIES.items()}
-        self.enter(first | given)
-        for name in SEEN.keys() & self._invalid.keys():
-            # The page has no field to correct them.
-            self.stray += f" The link's {name}: {self._invalid[name]}; it was left out."
-            self.enter({name: SEEN[name].first})
 
 
 def known(state: State) -> dict[str, Any]:
@@ -312,8 +292,5 @@ def _target(row: dict[str, Any]) -> dict[str, str]:
     except InputError as error:
         return {"fault": sentence(error)}
     facts = {"spectral_type": star.spectral_type, "V": star.magnitude, "distance_pc": star.distance_pc}
-    target = {
-        key: "" if value is None else f"{value:g}" if isinstance(value, float) else value
-        for key, value in facts.items()
-    }
+    target = {key: as_typed(value) for key, value in facts.items()}
     return target | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}

@@ -93,27 +93,19 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
     raise InputError(f"the upload ended its reader; give {other}", key="upload")
 
 
-def _limit(memory_mib: int, seconds: int) -> None:
-    """Limit memory, time and files of this process permanently."""
+def _main() -> int:
+    """Run the reading process: files in its folder, arrays on standard output, errors on standard error."""
     import resource
 
-    for kind, value in (
-        (resource.RLIMIT_AS, memory_mib << 20),
-        (resource.RLIMIT_CPU, seconds),
-        (resource.RLIMIT_FSIZE, 64 << 20),
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_NPROC, 0),
-    ):
+    memory_mib, seconds, words = sys.argv[1:]
+    asked = json.loads(words)
+    # Memory, time and files are limited permanently.
+    limits = {"AS": int(memory_mib) << 20, "CPU": int(seconds), "FSIZE": 64 << 20, "CORE": 0, "NPROC": 0}
+    for name, value in limits.items():
+        kind = getattr(resource, f"RLIMIT_{name}")
         _, hard = resource.getrlimit(kind)
         value = value if hard == resource.RLIM_INFINITY else min(value, hard)
         resource.setrlimit(kind, (value, value))
-
-
-def _main() -> int:
-    """Run the reading process: files in its folder, arrays on standard output, errors on standard error."""
-    memory_mib, seconds, words = sys.argv[1:]
-    asked = json.loads(words)
-    _limit(int(memory_mib), int(seconds))
     try:
         content = resolve_name(asked["reader"])(Path(asked["file"]), **asked["options"])
         values = {field.name: getattr(content, field.name) for field in fields(content)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import gc
 import gzip
 import hashlib
@@ -28,7 +29,6 @@ from mako.lookup import TemplateLookup
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
 from tornado.iostream import IOStream
-from tornado.routing import Matcher, Rule
 from tornado.web import Application, HTTPError, RequestHandler
 
 from mauvecl.answers.verbs import GROUPS
@@ -42,7 +42,7 @@ from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
-from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, limit_arenas, release_memory, shown
+from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, release_memory, shown
 
 if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
@@ -106,47 +106,42 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     return frozenset(plain(netloc(host, port)) for host in own) | named
 
 
-class AccessMatcher(Matcher):
-    """Matcher of requests that are rejected, as they do not come from pages of the allowed `hosts`."""
+class PageApplication(Application):
+    """Application that refuses requests which do not come from pages of the allowed `hosts`."""
 
-    def __init__(self, allowed: frozenset[str]) -> None:
-        self._allowed = allowed
+    allowed: frozenset[str]
 
-    def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
-        """Return status and message for an unknown host name (DNS rebinding) or another server's page, or None."""
+    def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
+        """Return the handler of a request, or of a refusal: unknown names (DNS rebinding) and other servers' pages."""
         origins, talks = request.headers.get_list("Origin"), request.path == "/live"
         status, why = 403, ""
-        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self._allowed]:
+        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self.allowed]:
             why = "The page is not served under this host name; see `mauvecl serve --allow-origin`."
-        elif any(plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed for given in origins):
+        elif any(plain(re.sub(r"^https?://", "", given.lower())) not in self.allowed for given in origins):
             why = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
         elif talks and not origins:
             why = "Expected a connection from the page."
         elif (talks or request.path == "/") and len(Visitor.here) >= MAX_VISITORS:
             status, why = 503, "Too many visitors are here at the moment; please come again in some minutes."
-        return {"target_kwargs": {"status": status, "why": why}} if why else None
+        if why:
+            return self.get_handler_delegate(request, RefusalHandler, {"status": status, "why": why})
+        return super().find_handler(request, **kwargs)
 
 
 class BoundedServer(HTTPServer):
     """HTTP server that closes the oldest connection without a visitor's page if there are too many."""
 
     max_connections: int
-
-    def initialize(self, *args: Any, **options: Any) -> None:
-        """Create a server without connections."""
-        super().initialize(*args, **options)
-        self._streams: list[IOStream] = []
+    streams: list[IOStream]  # of all connections
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         """Serve a new connection."""
-        self._streams = [stream for stream in self._streams if not stream.closed()]
-        if len(self._streams) >= self.max_connections:
+        self.streams = [stream for stream in self.streams if not stream.closed()]
+        if len(self.streams) >= self.max_connections:
+            # There are fewer pages than connections.
             pages = {id(page.ws_connection.stream) for page in Visitor.here if page.ws_connection is not None}
-            oldest = next((other for other in self._streams if id(other) not in pages), stream)
-            oldest.close()
-            if oldest is stream:
-                return
-        self._streams.append(stream)
+            next(other for other in self.streams if id(other) not in pages).close()
+        self.streams.append(stream)
         super().handle_stream(stream, address)
 
 
@@ -204,8 +199,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     def asked_figure(handler: RequestHandler, theme: str, name: str) -> bytes | None:
         return figure(theme, name, "".join(sorted(set(handler.get_query_argument("log", ""))))[:2])
 
-    let_in = hosts(address, port, allowed)
-    application = Application(
+    application = PageApplication(
         [
             (r"/", ContentHandler, {"content": lambda _: front(), "kind": "html"}),
             (r"/live", Visitor),
@@ -219,16 +213,10 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
         default_handler_args={"status": 404, "why": "There is no such page."},
         log_function=lambda handler: None,
     )
-    # Access control comes first.
-    application.default_router.rules.insert(0, Rule(AccessMatcher(let_in), RefusalHandler))
-    server = BoundedServer(
-        application,
-        max_body_size=BODY,
-        max_buffer_size=MESSAGE,
-        idle_connection_timeout=REQUEST_S,
-        body_timeout=REQUEST_S,
-    )
-    server.max_connections = MAX_CONNECTIONS
+    application.allowed = hosts(address, port, allowed)
+    limits = {"max_body_size": BODY, "max_buffer_size": MESSAGE}
+    server = BoundedServer(application, **limits, idle_connection_timeout=REQUEST_S, body_timeout=REQUEST_S)
+    server.max_connections, server.streams = MAX_CONNECTIONS, []
     server.listen(port, address)
     return server
 
@@ -251,7 +239,13 @@ def warm() -> None:
     for tab in TABS.values():
         shown(tab, closed, {})
     Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
-    prepare()
+    # What every visitor requests; pictures of other tabs follow on request. The page's digest packs the other assets.
+    for content in (front(), asset("bokeh.min.js")):
+        packed(content or b"")
+    for picture in next(iter(TABS.values())).pictures:
+        usual = "".join(axis.lower() for axis in picture.logs if axis.isupper())
+        for theme in INKS:
+            packed(figure(theme, picture.name, usual) or b"")
     # Objects that exist now are permanent, so garbage collection need not scan them again.
     gc.collect()
     gc.freeze()
@@ -283,7 +277,9 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
                 visitor.on_close()
 
     install()
-    limit_arenas()
+    # Threads share two pools of glibc's malloc, since each pool keeps what its threads have freed; -8 is M_ARENA_MAX.
+    if (change := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        change(-8, 2)
     asyncio.run(run())
 
 
@@ -396,18 +392,6 @@ def figure(theme: str, name: str, logs: str) -> bytes | None:
         return None
     canvas = Canvas(picture, theme, frozenset(logs))
     return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
-
-
-def prepare() -> None:
-    """Render and compress the content that every visitor requests; pictures of other tabs follow on request."""
-    packed(front())
-    for path in _FOLDER.iterdir():
-        packed(asset(path.name) or b"")
-    packed(asset("bokeh.min.js") or b"")
-    for picture in next(iter(TABS.values())).pictures:
-        usual = "".join(axis.lower() for axis in picture.logs if axis.isupper())
-        for theme in ("light", "dark"):
-            packed(figure(theme, picture.name, usual) or b"")
 
 
 class RefusalHandler(RequestHandler):

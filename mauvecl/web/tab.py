@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import shlex
 import tempfile
 import threading
@@ -18,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from mauvecl.answers.verbs import VERBS
+from mauvecl.answers.answer import has_table, write_table
+from mauvecl.answers.verbs import VERBS, Progress
 from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
@@ -89,12 +91,7 @@ DRAWN_UNITS = ("realisations", "steps", "cells")
 
 
 def simulate(
-    name: str,
-    study: Study,
-    pool: Pool,
-    progress: Callable[[int, int], None] | None = None,
-    *,
-    given: Mapping[str, Any] | None = None,
+    name: str, study: Study, pool: Pool, progress: Progress = None, *, given: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the answers to a question by name; its first verb reports its progress and takes the contents of files.
 
@@ -105,9 +102,8 @@ def simulate(
     wanted = [(name, main, asked), *((verb, verb, asked) for verb in more)]
     if name == "detection":
         wanted.append((OTHER, main, _changed(asked, nuisances={"usual": not asked.nuisances.usual})))
-    counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
-    if counted > 1:
-        pool.expect(counted * asked.run.realisations)
+    # Each verb announces its own realisations alone.
+    pool.expect(asked.run.realisations * sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted))
     answers: dict[str, Any] = {}
     for called, verb, of in wanted:
         try:
@@ -160,7 +156,6 @@ class Tab:
     #: Tables that can be downloaded, with the simulation that each needs, or none.
     files: Mapping[str, str | None] = field(default_factory=dict)
     own_table: Callable[[ClosedForms, Answers], Table] | None = None  # table of its only file, if no answer has it
-    optional: bool = False  # whether an answer may lack some of `files`
     #: Documents of answers that can be downloaded, by file name, with the simulation that each needs.
     documents: Mapping[str, str] = field(default_factory=dict)
 
@@ -190,7 +185,10 @@ class Tab:
     def offers(self, name: str, answers: Answers) -> bool:
         """Return whether one of `files` can be downloaded: whether the answer it needs is simulated and has it."""
         needed = self.files[name]
-        return needed is None or (needed in answers and not (self.optional and name not in answers[needed].tables))
+        # An answer may lack tables of what was not asked.
+        return needed is None or (
+            needed in answers and (self.own_table is not None or has_table(answers[needed], name))
+        )
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`."""
@@ -309,15 +307,9 @@ def _text(value: str | float) -> str:
 
 
 def _toml(value: Any) -> str:
-    """Return a value as TOML on one line."""
-    if isinstance(value, dict):
-        plain = (
-            (key if key.isidentifier() and key.isascii() else json.dumps(key), item) for key, item in value.items()
-        )
-        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in plain) + "}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value, ensure_ascii=False)
+    """Return a value as TOML on one line: as JSON with another separator, and bare keys."""
+    text = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
+    return re.sub(r'"(\w+)" = ', r"\1 = ", text, flags=re.ASCII)
 
 
 #: Held while matplotlib draws.
@@ -347,8 +339,6 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     The ending is "ecsv", "fits" or "study", and empty for a document. Raises InputError if there is no such file, or it
     is not simulated yet.
     """
-    from mauvecl.answers.answer import write_table
-
     if name in tab.documents and tab.documents[name] in answers:
         # Matplotlib's settings are those of the process.
         with _drawing:

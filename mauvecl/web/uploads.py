@@ -36,9 +36,6 @@ from mauvecl.web.sandboxed_reader import read_limited
 
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
-#: Name of a table of neighbours in its folder.
-NEIGHBOURS_FILE = "neighbours.csv"
-
 
 def content_folder(folder: Path, content: bytes, files: Callable[[], Mapping[str, bytes]]) -> Path:
     """Return the subfolder for some content, named after its digest; the first call writes its files."""
@@ -59,6 +56,10 @@ MOST_FILES, MOST_BYTES = 40, 64 * 2**20
 MOST_TOML_BYTES, MOST_NAME = 2**18, 100
 #: Packings that are read to the stated size and no further; others, such as LZMA, unpack to any size.
 BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+#: Error of an archive of observations.
+refusal = partial(InputError, key="observations")
 
 
 @dataclass(frozen=True)
@@ -89,37 +90,31 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     """
     remedy = "give a TOML file and the files that it names, in a sound zip archive without a password"
     with parsing("the archive", remedy), zipfile.ZipFile(io.BytesIO(content)) as archive:
-        entries = {entry: _name(entry.filename) for entry in archive.infolist() if not entry.is_dir()}
-        entries = {entry: name for entry, name in entries.items() if not name.startswith(".")}
+        entries = dict[zipfile.ZipInfo, str]()
+        for entry in archive.infolist():
+            if entry.is_dir():
+                continue
+            path = PureWindowsPath(entry.filename)
+            name = path.name
+            if path.anchor or ".." in path.parts or not name.isprintable() or not 0 < len(name) <= MOST_NAME:
+                raise refusal(
+                    f"the archive holds a file named {shortened(entry.filename)}, but its files must lie in folders of "
+                    f"the archive and have printable names of at most {MOST_NAME} characters"
+                )
+            if not name.startswith("."):
+                entries[entry] = name
         if len(entries) > MOST_FILES or sum(entry.file_size for entry in entries) > MOST_BYTES:
-            raise InputError(
-                f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all",
-                key="observations",
-            )
+            raise refusal(f"the archive must hold at most {MOST_FILES} files of {MOST_BYTES // 2**20} MiB in all")
         if any(entry.compress_type not in BOUNDED for entry in entries):
-            raise InputError(
-                "the archive is packed in an unusual way; use a zip archive with deflate", key="observations"
-            )
+            raise refusal("the archive is packed in an unusual way; use a zip archive with deflate")
         files = {}
         for entry, name in entries.items():
             # A stated size that is too small ends the reading, and the checksum then differs.
             with archive.open(entry) as file:
                 files[name] = file.read(entry.file_size)
     if len(files) < len(entries):
-        raise InputError("two files of the archive have the same name, but names must differ", key="observations")
+        raise refusal("two files of the archive have the same name, but names must differ")
     return files
-
-
-def _name(path: str) -> str:
-    """Return the name of a file of an archive without folders."""
-    parts = PureWindowsPath(path)
-    if parts.anchor or ".." in parts.parts or not parts.name.isprintable() or not 0 < len(parts.name) <= MOST_NAME:
-        raise InputError(
-            f"the archive holds a file named {shortened(path)}, but its files must lie in folders of the archive and "
-            f"have printable names of at most {MOST_NAME} characters",
-            key="observations",
-        )
-    return parts.name
 
 
 def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation, ...]:
@@ -129,50 +124,35 @@ def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation,
     """
     studies = [rows for name, file in files.items() if name.endswith(".toml") and (rows := _observations(name, file))]
     if len(studies) != 1:
-        raise InputError(
-            f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}",
-            key="observations",
-        )
+        raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}")
     (rows,) = studies
     if len(rows) > MOST_FILES:
-        raise InputError(
-            f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}", key="observations"
-        )
+        raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
     for row in rows:
         for key in PATHS:
             if isinstance(row.get(key), str):
-                name = PureWindowsPath(row[key]).name
+                row[key] = name = PureWindowsPath(row[key]).name
                 if name not in files:
-                    held = ", ".join(sorted(files))
-                    raise InputError(f"the archive needs {shortened(name)}, but holds {held}", key="observations")
-                row[key] = name
+                    raise refusal(f"the archive needs {shortened(name)}, but holds {', '.join(sorted(files))}")
     return built(CalibrateQuestion, {"observations": rows}, "the archive").observations
 
 
 def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
     """Return the rows of a file's table of observations; empty if it has none."""
     if len(content) > MOST_TOML_BYTES:
-        raise InputError(
-            f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB", key="observations"
-        )
+        raise refusal(f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB")
     study = toml(as_text(content, shortened(name)), shortened(name))
     section = study.get("calibrate")
     if not isinstance(section, dict) or "observations" not in section:
         return []
     others = [*(study.keys() - {"calibrate"}), *(f"calibrate.{key}" for key in section.keys() - {"observations"})]
     if others:
-        raise InputError(
+        raise refusal(
             f"{shortened(name)} sets {shortened(min(others))}, but must set calibrate.observations alone; fields set "
-            "the rest",
-            key="observations",
+            "the rest"
         )
     rows = section["observations"]
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-
-
-def write_table(text: str, folder: Path) -> Path:
-    """Write a table of neighbours to a file, once per text, and return its path."""
-    return content_folder(folder, text.encode(), lambda: {NEIGHBOURS_FILE: text.encode()}) / NEIGHBOURS_FILE
 
 
 def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:

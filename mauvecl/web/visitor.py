@@ -73,14 +73,6 @@ def _engine(progress: Callable[[int, int], None]) -> Engine:
     return engine
 
 
-def limit_arenas() -> None:
-    """Let the threads share two pools of glibc's malloc, since each pool keeps what its threads have freed."""
-    change = getattr(ctypes.CDLL(None), "mallopt", None)
-    if change is not None:
-        # M_ARENA_MAX of glibc's malloc.h.
-        change(-8, 2)
-
-
 def release_memory() -> None:
     """Free what simulations leave: arrays in reference cycles, which Python finds late, and pages that malloc keeps."""
     gc.collect()
@@ -193,6 +185,7 @@ UNUSED = 4000
 #: What replies to requests hold if these are refused.
 REFUSED: dict[str, dict[str, Any]] = {
     "solve": {"solved": ""}, "pinned": {"pins": {}}, "columns": {"columns": []}, "file": {"file": ""},
+    "simulate": {"ended": ""},
 }  # fmt: skip
 #: Fields of the section `data`, which say how files of frames are read.
 DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
@@ -224,7 +217,7 @@ class Visitor(WebSocketHandler):
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
     def check_origin(self, origin: str) -> bool:
-        """Accept every origin, since `access.AccessMatcher` has checked it."""
+        """Accept every origin, since `server.PageApplication` has checked it."""
         return True
 
     def open(self, *args: str, **kwargs: str) -> None:
@@ -277,10 +270,8 @@ class Visitor(WebSocketHandler):
     # State and answers
 
     def state(self, link: str) -> State:
-        """Enter values."""
-        state = State(UPLOADED.of(self, "upload"))
-        state.follow(link)
-        return state
+        """Enter the values of a link."""
+        return State(link, UPLOADED.of(self, "upload"))
 
     def _ask_answer(self, asked: dict[str, Any]) -> None:
         """Send the answer and a tab's pictures; a later question replaces a waiting one."""
@@ -433,22 +424,18 @@ class Visitor(WebSocketHandler):
 
         self._begin(draw(self._drawing))
 
-    def _ask_simulate(self, asked: dict[str, Any]) -> None:
+    async def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
         n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
         if self.job is not None or kind not in SIMULATIONS or state.faults_of(reads_of(kind)):
-            self.send(n=n, ended="", refused="a simulation is running already, or there is nothing to simulate")
-            return
-        self._begin(self._or_why(self._simulate(n, kind, state), n=n, ended=""))
-
-    async def _simulate(self, n: int, kind: str, state: State) -> None:
+            raise InputError("a simulation is running already, or there is nothing to simulate")
         key = kind, self._key(state, reads_of(kind))
         question, tab = state.question(reads_of(kind)), SIMULATIONS[kind]
         given = await _in_thread(self.given, state, tab)
         made = partial(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
         closed = await _in_thread(made)
         if self.job is not None:
-            raise InputError("a simulation is running already: wait until it ends", key="simulate")
+            raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
         unit = VERBS[main].counts
         # Several verbs count the realisations of all in the pool.
@@ -517,21 +504,22 @@ class Visitor(WebSocketHandler):
 
     async def _ask_file(self, asked: dict[str, Any]) -> None:
         """Send a table, document or study."""
-        which = (str(asked.get(word)) for word in ("tab", "name", "ending"))
-        file, content = await _in_thread(self.file, self.state(asked["link"]), *which)
-        self.send(content, n=asked["n"], file=file)
+        tab, name, ending = (str(asked.get(word)) for word in ("tab", "name", "ending"))
+        state = self.state(asked["link"])
 
-    def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
-        """Return the name and content of a table, document or study of the question."""
-        if tab in TABS:
-            return as_file(TABS[tab], name, ending, self.closed(state, TABS[tab]), self.answers(state))
-        # The page asks for the study of a question by its name alone.
-        front = next((tab for tab in TABS.values() if name in tab.questions), None)
-        if front is None:
-            raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab", key="name")
-        # A simulation asks what its own answers depend on, which their tables state.
-        question = state.question(reads_of(name) if name in SIMULATIONS else front.reads)
-        return study_file(QUESTIONS[name].study(question.case(Path(self._folder.name)).study), "study")
+        def make() -> tuple[str, bytes]:
+            if tab in TABS:
+                return as_file(TABS[tab], name, ending, self.closed(state, TABS[tab]), self.answers(state))
+            # The page asks for the study of a question by its name alone.
+            front = next((tab for tab in TABS.values() if name in tab.questions), None)
+            if front is None:
+                raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab")
+            # A simulation asks what its own answers depend on, which their tables state.
+            question = state.question(reads_of(name) if name in SIMULATIONS else front.reads)
+            return study_file(QUESTIONS[name].study(question.case(Path(self._folder.name)).study), "study")
+
+        file, content = await _in_thread(make)
+        self.send(content, n=asked["n"], file=file)
 
     async def _ask_export(self, asked: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""

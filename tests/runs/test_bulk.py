@@ -111,26 +111,20 @@ def swap(a: Path, b: Path) -> None:
     b.write_bytes(a_bytes)
 
 
+DESCRIBED, LISTED = "star-1/flare-1/zarr.json", "star-1/quiescent/digests.txt"
+FIRST, THIRD = "star-1/quiescent/c/0/0", "star-1/quiescent/c/2/0"
+#: What happens to a store, and the states of its files that are then found; "?" for any.
 FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
     "flipped byte": (lambda p: flip(p / CHUNK), {CHUNK: "damaged"}),
     "flipped CRC": (lambda p: flip(p / LAST, -1), {LAST: "damaged"}),
     "cut short": (lambda p: (p / CHUNK).write_bytes((p / CHUNK).read_bytes()[:-10]), {CHUNK: "damaged"}),
     "missing": (lambda p: (p / CHUNK).unlink(), {CHUNK: "missing"}),
-    "swapped": (
-        lambda p: swap(p / CHUNK, p / "star-1/quiescent/c/2/0"),
-        {CHUNK: "foreign", "star-1/quiescent/c/2/0": "foreign"},
-    ),
-    "flipped byte in the list": (
-        lambda p: flip(p / "star-1/quiescent/digests.txt", 5),
-        {"star-1/quiescent/c/0/0": "unlisted"},
-    ),
+    "swapped": (lambda p: swap(p / CHUNK, p / THIRD), {CHUNK: "foreign", THIRD: "foreign"}),
+    "flipped byte in the list": (lambda p: flip(p / LISTED, 5), {FIRST: "unlisted"}),
     "flipped byte in the study": (lambda p: flip(p / "zarr.json", 40), {"zarr.json": "?"}),
-    "a missing description": (
-        lambda p: (p / "star-1/flare-1/zarr.json").unlink(),
-        {"star-1/flare-1/zarr.json": "missing"},
-    ),
+    "a missing description": (lambda p: (p / DESCRIBED).unlink(), {DESCRIBED: "missing"}),
     "flipped calibration": (lambda p: flip(p / "star-1/bias_dn/c/0"), {"star-1/bias_dn/c/0": "damaged"}),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", long_but(FAULTS, "flipped byte", "flipped byte in the study", "missing"))
@@ -154,10 +148,9 @@ def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, path: Path, e
     """Insert chunk and digest of another seed's store, which are consistent with each other."""
     other = tmp_path / "other.zarr"
     bulk.realise(study(run={"seed": 12}), other, engine)
-    for name in (CHUNK, "star-1/quiescent/digests.txt"):
+    for name in (CHUNK, LISTED):
         shutil.copy(other / name, path / name)
-    states = {fault.state for fault in bulk.verify(path)}
-    assert states == {"foreign"}, "the other chunks do not have the copied digests"
+    assert {f.state for f in bulk.verify(path)} == {"foreign"}, "the other chunks do not have the copied digests"
     (path / "star-1/quiescent/c").rename(tmp_path / "c")
     shutil.copytree(other / "star-1/quiescent/c", path / "star-1/quiescent/c")
     assert bulk.verify(path) == []
@@ -209,7 +202,9 @@ def test_full_disk_raises_and_is_resumed(
         full_after(300_000, patch)
         with refused("file", "No space left on device"):
             bulk.realise(study(1000), path, PAINTER)
-    assert len(list(path.glob("star-1/*/c/*/0"))) > 5, "what was written before is kept"
+    kept = {str(chunk.relative_to(path)) for chunk in path.glob("star-1/*/c/*/0")}
+    assert len(kept) > 5, "what was written before is kept"
+    assert kept == Store.open(path).digests.keys(), "a chunk that could not be written has no file"
     bulk.realise(study(1000), path, PAINTER)
     assert tree(path) == painted
 

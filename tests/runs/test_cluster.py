@@ -121,8 +121,7 @@ def test_strangers_cannot_connect(workers: DaskWorkers) -> None:
         assert b"PRIVATE" not in Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
-def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
-    """Check that errors which another try would not mend are raised at once."""
+def test_error_that_another_try_would_not_mend_is_raised_at_once(workers: DaskWorkers) -> None:
     pool = Pool(workers)
     (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
     with failed("failed", "realisations 0 to 9: mode must be 'frames' or 'auto'"):
@@ -235,7 +234,7 @@ def scheduler_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 OTHER_CODE = {
     "version": "shards.VERSION = '0.9.0'; identity.cache_clear()",
     "kernels": "shards.DRAWING_PACKAGES = ('kernels',); identity.cache_clear()",
-    "none stated": "cluster.Counted = lambda sums, code: sums; del shards.code_identity",
+    "none stated": "answer = lambda sums, code: sums; del shards.code_identity",
     "request unreadable": "count = None; shards.VERSION = '0.9.0'; identity.cache_clear()",
 }
 #: Script that a worker reads when it starts; Dask runs it twice.
@@ -243,11 +242,13 @@ PRELOAD = """
 from mauvecl.runs import checkpoint as shards, cluster
 if not hasattr(cluster, "changed"):
     cluster.changed, count, identity = True, cluster._count, shards.code_identity
+    answer = lambda *counted: counted
     {change}
     def wrong(*given):
         counted = count(*given)
-        return answer({{key: value + 1 for key, value in getattr(counted, "sums", counted).items()}}, identity())
-    cluster._count, answer = wrong, cluster.Counted
+        sums = counted[0] if isinstance(counted, tuple) else counted
+        return answer({{key: value + 1 for key, value in sums.items()}}, identity())
+    cluster._count = wrong
 """
 
 
@@ -297,10 +298,13 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
 
 
 class Leaves:
-    """A finished task whose worker leaves while the result is transferred."""
+    """A finished task whose worker, or scheduler, leaves while the result is transferred."""
 
     status = "finished"
     asked = 0
+
+    def __init__(self, who: str) -> None:
+        self.who = who
 
     def add_done_callback(self, came: Callable[[Any], None]) -> None:
         threading.Thread(target=came, args=(self,)).start()
@@ -308,34 +312,27 @@ class Leaves:
     def result(self, timeout: float) -> None:
         self.asked += 1
         self.status = "finished" if self.asked < 3 else "lost"
-        raise TimeoutError
+        raise TimeoutError if self.who == "worker" else ConnectionResetError("Connection reset by peer")
 
 
-class Disconnects(Leaves):
-    """A finished task whose scheduler leaves while the result is transferred."""
-
-    def result(self, timeout: float) -> None:
-        raise ConnectionResetError("Connection reset by peer")
-
-
-@pytest.mark.parametrize("kind", [Leaves, Disconnects])
+@pytest.mark.parametrize("who", ["worker", "scheduler"])
 def test_end_during_a_transfer_is_noticed(
-    kind: type[Leaves], scheduler_file: str, engine: Engine, scene: list[Expectation]
+    who: str, scheduler_file: str, engine: Engine, scene: list[Expectation]
 ) -> None:
     """Send a shard again whose worker leaves with its result, and report a scheduler that is lost."""
-    workers = DaskWorkers(scheduler_file)
-    submit, pool, given = workers._client.submit, Pool(workers), list[Leaves]()
+    workers, lost = DaskWorkers(scheduler_file), Leaves(who)
+    submit, pool = workers._client.submit, Pool(workers)
 
     def lose_the_first(work: Any, *arguments: Any, **how: Any) -> Any:
-        if work.__name__ != "_count" or given:
+        if work.__name__ != "_count":
             return submit(work, *arguments, **how)
-        given.append(kind())
-        return given[0]
+        workers._client.submit = submit
+        return lost
 
     workers._client.submit = lose_the_first
-    if kind is Leaves:
+    if who == "worker":
         same(detected(pool, scene), detected(engine, scene))
-        assert given[0].asked == 3
+        assert lost.asked == 3
         assert pool.standing.retries == 1
     else:
         with failed("lost"):
@@ -343,45 +340,38 @@ def test_end_during_a_transfer_is_noticed(
     workers.close()
 
 
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
-    """Start the documentation's example for batch systems; return its address and its file."""
-    pytest.importorskip("dask_jobqueue")
-    folder = tmp_path_factory.mktemp("cluster")
-    example, file = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py", folder / "scheduler.json"
-    words = ["local", "--jobs", "1", "--cores", "1", "--memory", "2GB"]
-    script = subprocess.Popen([sys.executable, example, *words], cwd=folder, stdout=subprocess.DEVNULL)
-    while not file.exists():
-        time.sleep(0.05)
-        assert script.poll() is None
-    yield json.loads(file.read_text())["address"], file
-    script.terminate()
-    script.wait(20)
-    assert not file.exists()
+#: The documentation's example for batch systems.
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py"
 
 
 @pytest.mark.parametrize(("system", "line"), [("slurm", "#SBATCH -p astro"), ("pbs", "#PBS -q astro")])
 def test_example_for_batch_systems_runs(system: str, line: str) -> None:
     pytest.importorskip("dask_jobqueue")
-    example = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py"
-    command = [sys.executable, example, system, "--queue", "astro", "--cores", "4", "--show"]
+    command = [sys.executable, EXAMPLE, system, "--queue", "astro", "--cores", "4", "--show"]
     reported = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert line in reported
-    assert "--nthreads 1" in reported
-    assert "--nworkers 4" in reported
+    for part in (line, "--nthreads 1", "--nworkers 4"):
+        assert part in reported
 
 
-@pytest.mark.parametrize("by", ["address", "file"])
-def test_existing_cluster_is_used(cluster: tuple[str, Path], by: str, tmp_path: Path) -> None:
-    """Name it by address and by scheduler file on the command line; tables equal those of one machine."""
+def test_existing_cluster_is_used(tmp_path: Path) -> None:
+    """Name the example by address and by scheduler file; tables equal those of one machine."""
+    pytest.importorskip("dask_jobqueue")
+    command = [sys.executable, EXAMPLE, "local", "--jobs", "1", "--cores", "1", "--memory", "2GB"]
+    script, file = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL), tmp_path / "scheduler.json"
+    while not file.exists():
+        time.sleep(0.05)
+        assert script.poll() is None
     (tmp_path / "study.toml").write_text(small().toml())
     words = ("detect", "study.toml", "--no-pictures", "--quiet")
-    where = cluster[0] if by == "address" else str(cluster[1])
     run(*words, "--output", "one", folder=tmp_path)
-    run(*words, "--output", "many", "--cluster", where, folder=tmp_path)
-    for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
-        assert (tmp_path / "many" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
-    assert '"retries": 0' in (tmp_path / "many/run.json").read_text()
+    for name, where in (("address", json.loads(file.read_text())["address"]), ("file", str(file))):
+        run(*words, "--output", name, "--cluster", where, folder=tmp_path)
+        for table in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
+            assert (tmp_path / name / table).read_bytes() == (tmp_path / "one" / table).read_bytes()
+        assert '"retries": 0' in (tmp_path / name / "run.json").read_text()
+    script.terminate()
+    script.wait(20)
+    assert not file.exists()
 
 
 def test_lost_scheduler_raises(tmp_path: Path, scene: list[Expectation]) -> None:

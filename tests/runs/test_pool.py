@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from answers import N, detected, same, same_snr, small
 from commands import run
+from marks import long_but
 from refusals import failed, refused
 from scenes import FIRST_STARE, N_STARES, flaring_stares, instrument, star
 from stores import flip, full_after
@@ -155,16 +156,19 @@ def working(make: Callable[[], Any]) -> Pool:
 
 
 def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> None:
-    calls, made = list[int](), itertools.count()
+    calls, made = list[int](), list[Failing]()
 
     def make() -> Failing:
-        next(made)
-        return Failing(engine, {2, 5, 6}, calls)
+        made.append(Failing(engine, {2, 5, 6}, calls))
+        return made[-1]
 
     pool = working(make)
     same(detected(pool, scene), detected(engine, scene))
     assert pool.standing.retries == 3
-    assert next(made) == 4, "each time with a new context"
+    assert len(made) == 4, "each time with a new context"
+    pool = working(lambda: Failing(engine, set(range(99)), []))
+    with failed("failed", "realisations 0 to 4095 failed 8 times", "OUT_OF_RESOURCES"):
+        detected(pool, scene)
 
 
 def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation]) -> None:
@@ -198,32 +202,22 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
     assert len(ends) == 1
 
 
-def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation]) -> None:
-    pool = working(lambda: Failing(engine, set(range(99)), []))
-    with failed("failed", "realisations 0 to 4095 failed 8 times", "OUT_OF_RESOURCES"):
-        detected(pool, scene)
-
-
 AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
 
 
-@pytest.mark.parametrize(
-    ("ask", "sections"),
-    [
-        (lambda s, e: mauvecl.detect(s, e).table, {}),
-        (lambda s, e: mauvecl.snr(s, e).element, {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
-        pytest.param(lambda s, e: mauvecl.limit(s, e).table, {}, marks=pytest.mark.long),
-        (lambda s, e: mauvecl.map(s, e).table, {"map": AXES}),
-        pytest.param(
-            lambda s, e: mauvecl.map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}, marks=pytest.mark.long
-        ),
-    ],
-    ids=["detect", "snr", "limit", "map", "unknowns"],
-)
-def test_pool_gives_the_table_of_the_engine(
-    engine: Engine, ask: Callable[[mauvecl.Study, Any], Any], sections: dict[str, Any]
-) -> None:
-    ours, theirs = ask(small(**sections), engine), ask(small(**sections), Pool(Shuffled(engine, 9)))
+#: Tables: verb, attribute of its answer, sections of the study.
+TABLES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "detect": ("detect", "table", {}), "limit": ("limit", "table", {}), "map": ("map", "table", {"map": AXES}),
+    "snr": ("snr", "element", {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
+    "unknowns": ("map", "table", {"map": AXES, "unknowns": {"draws": 3}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", long_but(TABLES, "detect", "map", "snr"))
+def test_pool_gives_the_table_of_the_engine(engine: Engine, name: str) -> None:
+    verb, table, sections = TABLES[name]
+    ask = getattr(mauvecl, verb)
+    ours, theirs = (getattr(ask(small(**sections), one), table) for one in (engine, Pool(Shuffled(engine, 9))))
     assert ours.colnames == theirs.colnames
     for name in ours.colnames:
         np.testing.assert_array_equal(np.asarray(ours[name]), np.asarray(theirs[name]), err_msg=name)
@@ -330,12 +324,8 @@ def shards_in(folder: Path) -> list[Path]:
     return sorted((folder / "checkpoint").glob("*.npz"))
 
 
-def change(folder: Path, text: str) -> None:
-    (folder / "checkpoint" / "manifest.json").write_text(text)
-
-
-def manifest_of(folder: Path) -> str:
-    return (folder / "checkpoint" / "manifest.json").read_text()
+def manifest(folder: Path) -> Path:
+    return folder / "checkpoint" / "manifest.json"
 
 
 #: What happens to the files of an interrupted run, and whether a shard, or the manifest, is then found to be damaged.
@@ -345,9 +335,9 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], bool, bool]] = {
     "flipped header": (lambda folder: flip(shards_in(folder)[0], 20), True, False),
     "flipped end": (lambda folder: flip(shards_in(folder)[0], -1), True, False),
     "misplaced": (lambda folder: shards_in(folder)[0].write_bytes(shards_in(folder)[1].read_bytes()), True, False),
-    "flipped manifest": (lambda folder: change(folder, manifest_of(folder).replace("7.4", "7.5")), False, True),
-    "empty manifest": (lambda folder: change(folder, ""), False, True),
-    "no manifest": (lambda folder: (folder / "checkpoint" / "manifest.json").unlink(), False, True),
+    "flipped manifest": (lambda folder: flip(manifest(folder), manifest(folder).read_text().index("7.4")), False, True),
+    "empty manifest": (lambda folder: manifest(folder).write_text(""), False, True),
+    "no manifest": (lambda folder: manifest(folder).unlink(), False, True),
 }
 
 
@@ -355,16 +345,17 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], bool, bool]] = {
 def test_interrupted_run_is_resumed_whatever_happens_to_its_files(
     begun: Path, engine: Engine, whole: Detection, damage: str
 ) -> None:
-    text = manifest_of(begun)
-    work, shard, manifest = DAMAGES[damage]
+    text = manifest(begun).read_text()
+    work, shard, in_manifest = DAMAGES[damage]
     work(begun)
     reported: list[tuple[int, int]] = []
     found, pool, checkpoint = at_work(begun, engine, lambda *standing: reported.append(standing), resume=True)
     same(found, whole)
     assert checkpoint.damaged == int(shard)
-    assert [("damaged or missing" in said) for said in checkpoint.messages if "manifest" in said] == [True] * manifest
+    about = [said for said in checkpoint.messages if "manifest" in said]
+    assert ["damaged or missing" in said for said in about] == [True] * in_manifest
     assert 16_000 - 4096 * shard < pool.standing.resumed < N
-    assert manifest_of(begun) == text
+    assert manifest(begun).read_text() == text
     # Progress includes what was resumed.
     assert (reported[0], reported[-1]) == ((0, N), (N, N))
     assert [done for done, _ in reported] == sorted(done for done, _ in reported)
@@ -383,19 +374,13 @@ def test_unfinished_run_is_not_overwritten(begun: Path, engine: Engine) -> None:
         at_work(begun, engine)
     _, pool, _ = at_work(begun, engine, restart=True)
     assert pool.standing.resumed == 0
-
-
-def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
-    manifest = json.loads(manifest_of(begun))
-    old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
-    change(begun, json.dumps(old | {"digest": hashlib.sha256(json.dumps(old, sort_keys=True).encode()).hexdigest()}))
+    # Neither are counts of another form read.
+    content = json.loads(manifest(begun).read_text())
+    old = {key: value for key, value in content.items() if key not in ("form", "digest")}
+    digest = hashlib.sha256(json.dumps(old, sort_keys=True).encode()).hexdigest()
+    manifest(begun).write_text(json.dumps(old | {"digest": digest}))
     with refused("restart", "form", "`restart=True`"):
         at_work(begun, engine, resume=True)
-
-
-def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
-    at_work(tmp_path, engine, patience_s=shards.PATIENCE_S)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -411,9 +396,11 @@ def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, monkeypatch: pytest.M
     assert usual == jumps
 
 
-def test_full_disk_raises_and_is_resumed(
+def test_short_run_leaves_no_files_and_full_disk_is_resumed(
     tmp_path: Path, engine: Engine, whole: Detection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    at_work(tmp_path, engine, patience_s=shards.PATIENCE_S)
+    assert list(tmp_path.iterdir()) == []
     with monkeypatch.context() as patch:
         full_after(400_000, patch)
         with refused("file"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,10 +11,10 @@ import pytest
 pytest.importorskip("bokeh")
 pytest.importorskip("tornado")
 
-from tests.web.visits import CHROMIUM, Server, fresh
+from tests.web.visits import CHROMIUM, Server, Window
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +58,13 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def page(browser: Browser, server: Server) -> Iterator[Page]:
-    found = fresh(browser, server.address)
-    yield found
-    found.context.close()
+def visit(browser: Browser, server: Server) -> Iterator[Callable[..., Window]]:
+    """Return a function that opens the page for a new visitor, with a link and options of the browser."""
+    yield lambda link="", **how: Window(browser, server.address + link, **how)
+    for context in browser.contexts:
+        context.close()
+
+
+@pytest.fixture
+def page(visit: Callable[..., Window]) -> Window:
+    return visit()

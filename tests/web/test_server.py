@@ -132,18 +132,9 @@ def test_connections_are_bounded_and_half_open_or_unused_ones_end(strict: Server
 
 
 NONSENSE = [
-    "{",
-    "[]",
-    '{"n": 1}',
-    '{"ask": "nothing"}',
-    '{"ask": "answer", "n": "x"}',
-    '{"ask": "answer", "link": 7}',
-    '{"ask": ["answer"]}',
-    '{"ask": "_init__"}',
-    "[" * 100_000,
-    "x" * 100_000,
-    b"bytes of no file",
-]
+    "{", "[]", '{"n": 1}', '{"ask": "nothing"}', '{"ask": "answer", "n": "x"}', '{"ask": "answer", "link": 7}',
+    '{"ask": ["answer"]}', '{"ask": "_init__"}', "[" * 100_000, "x" * 100_000, b"bytes of no file",
+]  # fmt: skip
 #: What is asked as the page asks, and for what is not there; and messages that hold only what they ask.
 POINTLESS = [
     {"ask": "simulate", "kind": "everything"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import io
 import json
 import os
 import re
@@ -12,17 +13,20 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Coroutine
+import zipfile
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlencode
 
 import numpy as np
+from astropy.table import Table
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Locator, Page
 
 T = TypeVar("T")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -186,6 +190,12 @@ class Talk:
         assert reported["file"], reported
         return reported["file"], await asyncio.wait_for(self.connection.read_message(), 60)
 
+    async def table(self, link: str, tab: str, name: str) -> Table:
+        """Return a downloaded table."""
+        _, content = await self.file(link=link, tab=tab, name=name, ending="ecsv")
+        assert b"mauvecl-page" not in content, "nothing names a folder of the server"
+        return Table.read(content.decode(), format="ascii.ecsv")
+
     async def simulate(self, kind: str, link: str) -> str:
         """Simulate to the end, and return what is reported of it."""
         return str((await self.ask("simulate", "ended", kind=kind, link=link))["ended"])
@@ -212,41 +222,123 @@ def column(drawn: dict[str, Any], picture: str, source: str, name: str) -> Any:
     return np.frombuffer(base64.b64decode(packed["f4"]), "<f4").reshape(packed["shape"])
 
 
-def fresh(browser: Browser, address: str, **how: Any) -> Page:
-    """Return a new visitor's page with its first answer; errors in it fail the test."""
-    page = browser.new_context(**how).new_page()
-    page.set_default_timeout(PATIENCE)
-    faults: list[str] = []
-    page.on("pageerror", lambda error: faults.append(str(error)))
-    # A browser says of a connection that it is lost; nothing else stands in its console.
-    page.on("console", lambda m: None if "WebSocket" in m.text else faults.append(f"{m.type}: {m.text}"))
-    page.faults = faults  # type: ignore[attr-defined]
-    page.goto(address)
-    settled(page)
-    return page
+class Window:
+    """Window of Chromium with a visitor's page and its first answer; what it lacks is playwright's, of the page."""
 
+    def __init__(self, browser: Browser, address: str, **how: Any) -> None:
+        self.page: Page = browser.new_context(**how).new_page()
+        self.page.set_default_timeout(PATIENCE)
+        self.faults: list[str] = []
+        self.on("pageerror", lambda error: self.faults.append(str(error)))
+        # A browser says of a connection that it is lost; nothing else stands in its console.
+        self.on("console", lambda m: None if "WebSocket" in m.text else self.faults.append(f"{m.type}: {m.text}"))
+        self.goto(address)
+        self.settled()
 
-def until(page: Page, true: Callable[[], bool]) -> None:
-    for _ in range(PATIENCE // 50):
-        if true():
-            return
-        page.wait_for_timeout(50)
-    raise AssertionError("never true")
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.page, name)
 
+    def until(self, true: Callable[[], bool]) -> None:
+        for _ in range(PATIENCE // 50):
+            if true():
+                return
+            self.wait_for_timeout(50)
+        raise AssertionError("never true")
 
-def settled(page: Page) -> None:
-    page.locator("#card[aria-busy=false]").wait_for(state="attached")
-    assert not page.faults, page.faults  # type: ignore[attr-defined]
+    def settled(self) -> None:
+        self.locator("#card[aria-busy=false]").wait_for(state="attached")
+        assert not self.faults, self.faults
 
+    def shown(self) -> str:
+        """Return the answer in the words of the card: a sentence, and both chances."""
+        self.settled()
+        return "\n".join(self.locator("#card :is(.message, .words)").all_inner_texts())
 
-def enter(page: Page, label: str, value: str) -> None:
-    """Open what is folded, enter a text, and wait for what comes of it."""
-    field = page.get_by_label(label, exact=True)
-    if not field.is_visible():
-        page.get_by_text("Advanced", exact=True).click()
-    if field.evaluate("e => e.tagName") == "SELECT":
-        field.select_option(value)
-    else:
-        field.fill(value)
-        field.press("Enter")
-    settled(page)
+    def says(self, words: str) -> None:
+        """Wait until the answer holds these words."""
+        self.until(lambda: words in self.shown())
+
+    def field(self, label: str) -> Locator:
+        return self.page.get_by_label(label, exact=True)
+
+    def button(self, name: str, within: str = "body") -> Locator:
+        return self.page.locator(within).get_by_role("button", name=name, exact=True)
+
+    def press(self, name: str, within: str = "body") -> None:
+        self.button(name, within).click()
+        self.settled()
+
+    def tab(self, name: str) -> None:
+        self.get_by_role("tab", name=name, exact=True).click()
+
+    def tabs(self) -> list[str]:
+        return [str(one.get_attribute("id")).removeprefix("tab-") for one in self.get_by_role("tab").all()]
+
+    def enter(self, **texts: str) -> None:
+        """Open what is folded, enter the texts of fields by name, and wait for what comes of each."""
+        for name, text in texts.items():
+            field = self.locator(f"#f-{name}")
+            if not field.is_visible():
+                self.get_by_text("Advanced", exact=True).click()
+            if field.evaluate("e => e.tagName") == "SELECT":
+                field.select_option(text)
+            else:
+                field.fill(text)
+                field.press("Enter")
+            self.settled()
+
+    def simulate(self, name: str = "Simulate") -> str:
+        self.button(name).click()
+        self.get_by_text("Done: ").wait_for()
+        return self.shown()
+
+    def download(self, label: str, within: str = "body") -> bytes:
+        with self.expect_download() as coming:
+            self.button(label, within).click()
+        return Path(coming.value.path()).read_bytes()
+
+    @contextmanager
+    def exporting(self) -> Iterator[None]:
+        """Open the dialog of exports, and close it."""
+        self.button("Share, export, cite").click()
+        self.locator("#export[open]").wait_for()
+        yield
+        self.keyboard.press("Escape")
+
+    def taken(self) -> dict[str, str]:
+        """Return the files of the downloaded study by name."""
+        with self.exporting(), zipfile.ZipFile(io.BytesIO(self.download("Study for the command line"))) as archive:
+            return {name: archive.read(name).decode() for name in archive.namelist()}
+
+    def give(self, name: str, content: bytes | str, file: str = "mine.txt") -> None:
+        """Choose a file for a field, or for the input of a selector."""
+        content = content.encode() if isinstance(content, str) else content
+        given: Any = {"name": file, "mimeType": "text/plain", "buffer": content}
+        self.locator(name if name.startswith("#") else f"[data-upload={name}]").set_input_files(given)
+
+    def answerless(self) -> None:
+        """Check that the page shows no answer, button or picture."""
+        self.get_by_text("No answer.", exact=True).wait_for()
+        buttons = [self.button("Simulate"), self.button("Pin"), *self.locator("[data-file]").all()]
+        assert all(one.is_disabled() for one in buttons)
+        assert self.locator(".pictures.dim").count() == self.locator(".pictures").count()
+
+    def ranges(self, picture: str) -> list[float]:
+        plot = f"page.pictures.all.{picture}.figure.plot"
+        return list(self.evaluate(f"[{plot}.x_range, {plot}.y_range].flatMap(range => [range.start, range.end])"))
+
+    def settled_ranges(self, picture: str) -> list[float]:
+        """Return the ends of a picture's axes once it is drawn."""
+        self.until(lambda: self.evaluate(f"page.pictures.all.{picture}.figure?.view?.has_finished() ?? false"))
+        return self.ranges(picture)
+
+    def centre(self, picture: str, x: float, y: float) -> tuple[float, float]:
+        """Scroll to a picture, and return a point of it by parts of its width and height."""
+        plot = self.locator(f"#plot-{picture}")
+        plot.scroll_into_view_if_needed()
+        box = plot.bounding_box()
+        return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+    def script(self, name: str, given: Any = None) -> Any:
+        """Return the value of a script of the folder `scripts`."""
+        return self.evaluate((Path(__file__).parent / "scripts" / f"{name}.js").read_text(encoding="utf-8"), given)
