@@ -19,7 +19,7 @@ from mauvecl.observations.frame_model import CleanedSpectra, FrameModel, clean_s
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import (
     CHANCE_DIP,
     NO_COLOUR_K,

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.observations.event_fits import flares_of
-from mauvecl.observations.process import Binned, Process, criterion_of_process, fit_process
+from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import REACH

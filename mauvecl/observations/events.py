@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -15,11 +15,8 @@ from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.process import UNREPORTED, Process, Steps
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
-
-if TYPE_CHECKING:
-    from mauvecl.observations.process import Process
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

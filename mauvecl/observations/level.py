@@ -9,8 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.process import MAX_TRIED, Binned, Process, criterion_of_process, fit_process
-from mauvecl.observations.progress import Steps
+from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]

@@ -37,8 +37,7 @@ from mauvecl.observations.level import (
     single_frames,
     spikes,
 )
-from mauvecl.observations.process import Binned, criterion_of_process, fit_process
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.process import UNREPORTED, Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 

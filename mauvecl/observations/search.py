@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.observations.level import LevelGiven
-from mauvecl.observations.process import Process, level_fit
+from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import Bank, Baseline, Templates
 
@@ -278,7 +277,7 @@ def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
     columns = []
     for process, column in zip(survey.processes, survey.sums.T, strict=True):
         covariance = process.covariance(survey.stare.start_s[quiet], survey.variance[quiet] * process.excess**2)
-        columns.append(level_fit(covariance, column[quiet]).left)
+        columns.append(level_fit(covariance, column[quiet])[2])
     return np.column_stack(columns)
 
 

@@ -29,7 +29,7 @@ from mauvecl.observations.frame_model import (
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, WHITE, Detection, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
