@@ -57,26 +57,19 @@ NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
 STILL_BRIGHT, END_FRAMES = 1.0, 4
 
 
-def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
+def _fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
     """Return a survey with the processes that fit its sums and its flux outside the frames of events, `taken`.
 
-    The terms of `start`, a survey of nearly the same frames, are kept. `steps` reports each fit.
+    The terms of `start`, a survey of nearly the same frames, are kept.
     """
-    quiet = ~taken
-    time, step = survey.stare.start_s[quiet], survey.stare.frame_s
-
-    def fitted(values: Float, variance: Float, before: Process | None) -> Process:
-        return fit_process(Binned.of(time, values[quiet], variance[quiet], step), before, steps)
-
-    processes = tuple(
-        fitted(column, survey.variance, None if start is None else start.processes[k])
-        for k, column in enumerate(survey.sums.T)
-    )
-    flux = processes[0]
+    quiet, fitted = ~taken, []
     # The flux of a light curve is its only sum.
-    if survey.weighted:
-        flux = fitted(survey.flux, survey.variance, None if start is None else start.flux_process)
-    return replace(survey, processes=processes, flux_process=flux)
+    columns = [*survey.sums.T, survey.flux] if survey.weighted else survey.sums.T
+    befores = [None] * len(columns) if start is None else [*start.processes, start.flux_process]
+    for column, before in zip(columns, befores, strict=False):
+        parts = (each[quiet] for each in (survey.stare.start_s, column, survey.variance))
+        fitted.append(fit_process(Binned.of(*parts, survey.stare.frame_s), before, steps))
+    return replace(survey, processes=tuple(fitted[: survey.sums.shape[1]]), flux_process=fitted[-1])
 
 
 def fit_quiet_light(
@@ -118,12 +111,12 @@ def light_of_events(survey: SeriesSurvey, taken: Bool) -> list[EventLight]:
     fits = []
     for event in detect_events(survey, PROVISIONAL)[0]:
         flares, scale, photon = flares_of(survey, taken, event)
-        lights = [_light_of(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
-        first, stop = min(rows.start for rows, _ in lights), max(rows.stop for rows, _ in lights)
-        total = np.zeros(stop - first)
-        for rows, flux in lights:
-            total[rows.start - first : rows.stop - first] += flux
-        fits.append(EventLight(event, slice(first, stop), scale * total, photon * total, len(flares)))
+        total = np.zeros(survey.stare.n_frames)
+        every = [_light_of(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
+        for rows, flux in every:
+            total[rows] += flux
+        rows = slice(min(rows.start for rows, _ in every), max(rows.stop for rows, _ in every))
+        fits.append(EventLight(event, rows, scale * total[rows], photon * total[rows], len(flares)))
     return fits
 
 
@@ -218,7 +211,7 @@ def alternate(
         # Rounds may come back to the same frames.
         key = taken.tobytes(), before
         if key not in rounds:
-            fitted = fit_processes(survey, taken, before, steps)
+            fitted = _fit_processes(survey, taken, before, steps)
             rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
         fitted, now = rounds[key]
         changed = float((now ^ taken).mean())
@@ -380,10 +373,8 @@ def _extended(
         stop = min(stop, sigma.size - 1, last + int(quiet.sum()) - MIN_QUIET)
         while last < stop and not taken[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > STILL_BRIGHT:
             last += 1
-        start = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0)
-        while (
-            first > start and not taken[first - 1] and sigma[max(0, first - END_FRAMES) : first].mean() > STILL_BRIGHT
-        ):
+        start, ends = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0), END_FRAMES
+        while first > start and not taken[first - 1] and sigma[max(0, first - ends) : first].mean() > STILL_BRIGHT:
             first -= 1
         longer.append((first, last))
     return longer

@@ -84,7 +84,6 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
     level = float(flux_level[peak]) * survey.scale / survey.level
     window = replace(Window.of(survey, taken, one), quiet_level=level if level > 0 else 1.0)
-    directions = _directions(survey, taken, one)
     fits = fit_event(window, survey.bank.shape)
     totals = np.array([fit.mixture.log_total for fit in fits])
     best = fits[int(np.argmax(totals))]
@@ -92,14 +91,17 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
     mixtures = [fit.mixture for fit in fits]
     if _p_value(chi2, dof) < POOR:
-        mixtures = _tempered(window, best, mixtures)
+        # What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the
+        # event (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
+        place = log_time(window.middle[window.inside], best.flares[0])
+        power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
+        mixtures = [replace(m, log_weight=m.log_weight + (power - 1) * (m.log_total - totals.max())) for m in mixtures]
     mixture = joined(mixtures)
     share = np.exp(np.array([one.log_total for one in mixtures]) - mixture.log_total)
     published = [fit for fit in fits if fit.shape.name != GENERAL]
-    if len(directions) > 1:
-        # Flares of other temperatures have another light for the same sum.
-        mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
-                           for weight, factor in directions])  # fmt: skip
+    # Flares of other temperatures have another light for the same sum.
+    mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
+                      for weight, factor in _directions(survey, taken, one)])  # fmt: skip
     level = float(plain.level_without(model))
     summed, error = _summed(survey, taken, flux_level, one)
     ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
@@ -117,18 +119,6 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
 def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
     """Return the likelihood of flares without departures from their shape, and their light in the bins, shape (n,)."""
     return Likelihood.of(window, fit.flares, fit.shape, 0.0), light_of(window, fit.shape, fit.flares)
-
-
-def _tempered(window: Window, best: Fit, mixtures: Sequence[Mixture]) -> list[Mixture]:
-    """Weaken the preference among fits of an event that no shape fits without departures.
-
-    What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the event
-    (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
-    """
-    place = log_time(window.middle[window.inside], best.flares[0])
-    power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
-    top = max(one.log_total for one in mixtures)
-    return [replace(one, log_weight=one.log_weight + (power - 1) * (one.log_total - top)) for one in mixtures]
 
 
 def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:

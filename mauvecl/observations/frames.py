@@ -87,13 +87,11 @@ class QualityBits:
 
 def decimal_flags(flags: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return flags as numbers; those that lightkurve 2 writes into CSV are the digits of binary numbers."""
-    finite = flags[np.isfinite(flags)]
-    if not (finite.size and finite.max() >= 2**32):
+    values, place = np.unique(flags, return_inverse=True)
+    texts = {value: f"{value:.0f}" for value in values[np.isfinite(values)].tolist()}
+    if max(texts, default=0.0) < 2**32 or set("".join(texts.values())) - {"0", "1"}:
         return flags
-    texts = {value: f"{value:.0f}" for value in np.unique(finite).tolist()}
-    if any(set(text) - {"0", "1"} for text in texts.values()):
-        return flags
-    return np.array([float(int(texts[value], 2)) if value in texts else value for value in flags.tolist()])
+    return np.array([float(int(texts[one], 2)) if one in texts else one for one in values.tolist()])[place]
 
 
 def _mask(chosen: str | int, names: Mapping[int, str], what: str) -> int:
@@ -139,14 +137,14 @@ class Reason(IntFlag):
     LOSS = 32  #: light is suddenly lost for some frames, as by pointing losses and eclipses
 
     @classmethod
-    def words(cls, value: int) -> str:
-        """Return the reasons in words."""
-        return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
+    def words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
+        """Return the reasons of frames in words."""
 
-    @classmethod
-    def all_words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
-        """Return the reasons of many frames in words."""
-        return np.array([*map(cache(cls.words), values.tolist())], np.str_)
+        @cache
+        def words(value: int) -> str:
+            return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
+
+        return np.array([*map(words, values.tolist())], np.str_)
 
 
 def _check_light(name: str, time: Float, light: Float) -> None:
@@ -163,16 +161,6 @@ def _check_light(name: str, time: Float, light: Float) -> None:
                    "finite times")  # fmt: skip
 
 
-def _whole_flags(name: str, quality: ArrayLike | None, n: int) -> NDArray[np.int64]:
-    """Return the quality flags of frames, zero without any; raise InputError if they are no whole numbers."""
-    if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
-        raise _bad(name, "quality", "a value that is not finite", "whole numbers")
-    flags = np.zeros(n, np.int64) if quality is None else np.asarray(quality, np.int64)
-    if flags.shape != (n,):
-        raise _bad(name, "quality", flags.shape, f"({n},)")
-    return flags
-
-
 def _cadence_of(name: str, time: Float) -> float:
     """Return the median step of ascending times; raise InputError for frames that overlap or are too far apart."""
     step = np.diff(time)
@@ -186,16 +174,6 @@ def _cadence_of(name: str, time: Float) -> float:
         most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
         raise _bad(name, "time", f"{span:g} s from the first frame to the last", most)
     return cadence
-
-
-def _exposures(name: str, given: ArrayLike | None, n: int, cadence: float) -> Float:
-    """Return the exposure time of each frame, by default the cadence; raise InputError for an impossible one."""
-    if given is not None and np.shape(given) not in ((), (1,), (n,)):
-        raise _bad(name, "exposure", np.shape(given), f"one exposure time, or one for each of {n} frames")
-    exposure = np.array(np.broadcast_to(np.asarray(cadence if given is None else given, np.float64), (n,)))
-    if not (np.isfinite(exposure) & (exposure > 0)).all():
-        raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-    return exposure
 
 
 @validated
@@ -287,28 +265,31 @@ class Frames:
         **how
             Other attributes.
         """
-        time = np.asarray(time_s, np.float64)
-        light = np.asarray(flux, np.float64)
-        n = time.size
+        time, light = np.asarray(time_s, np.float64), np.asarray(flux, np.float64)
         _check_light(name, time, light)
-        sd = None if error is None else np.asarray(error, np.float64)
-        if sd is not None and sd.shape != light.shape:
-            raise _bad(name, "error", sd.shape, f"the shape of the flux, {light.shape}")
-        flags = _whole_flags(name, quality, n)
-        order = np.argsort(time, kind="stable")
-        remarks: tuple[str, ...] = ()
+        n, order = time.size, np.argsort(time, kind="stable")
+        cadence = _cadence_of(name, time[order])
+        if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
+            raise _bad(name, "quality", "a value that is not finite", "whole numbers")
+        if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
+            raise _bad(name, "exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
+        exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
+        if not (np.isfinite(exposure) & (exposure > 0)).all():
+            raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+        each: dict[str, NDArray[Any] | None] = {"error": None, "temperature_c": None}
+        for key, given, shape in (
+            ("error", error, light.shape),
+            ("temperature_c", how.pop("temperature_c", None), (n,)),
+            ("quality", np.zeros(n) if quality is None else quality, (n,)),
+        ):
+            if given is not None:
+                values = np.asarray(given, np.int64 if key == "quality" else np.float64)
+                if values.shape != shape:
+                    raise _bad(name, key.removesuffix("_c"), values.shape, f"the shape {shape}")
+                each[key] = values[order]
+        made = cls(time[order], exposure[order], light[order], name=name, **each, **how)
         if (np.diff(time) < 0).any():
-            remarks = (f"the times of {name} are not ascending; its frames were sorted by time",)
-        exposure = _exposures(name, exposure_s, n, _cadence_of(name, time[order]))
-        if how.get("temperature_c") is not None:
-            temperature = np.asarray(how["temperature_c"], np.float64)
-            if temperature.shape != (n,):
-                raise _bad(name, "temperature", temperature.shape, f"({n},)")
-            how["temperature_c"] = temperature[order]
-        made = cls(
-            time[order], exposure[order], light[order], None if sd is None else sd[order], flags[order],
-            name=name, remarks=remarks, **how,
-        )  # fmt: skip
+            made = made.with_remarks((f"the times of {name} are not ascending; its frames were sorted by time",))
         wavelength = made.wavelength_nm
         if (wavelength is None) != (light.ndim == 1) or (wavelength is not None and wavelength.size != light.shape[1]):
             raise _bad(name, "wavelength", None if wavelength is None else wavelength.shape,
@@ -470,7 +451,13 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
         seconds = (when.tdb - first).to_value(u.s) + late
     remark = f"times are at the Solar System's barycentre (TDB) for {target.name} ({target.source})"
     if place is not None:
-        remark += f", {_accuracy(place, when)}"
+        days = float(np.abs(when.utc.jd - place.elements.epoch_jd).max())
+        if place.resolved_at(days) == "mean":
+            off_ms = 1e3 * place.elements.axis_km / LIGHT_KM_S
+            remark += f", good to {off_ms:.0f} ms: the place in the orbit is not known"
+        else:
+            off_ms = 1e3 * place.along_track_km(days) / LIGHT_KM_S
+            remark += f", good to {off_ms:.2g} ms along the track of {place.elements.source}"
     made = replace(frames, time_s=seconds, reference_mjd=float(first.mjd), scale="tdb", position="BARYCENTER")
     return replace(made, direction_deg=(target.ra_deg, target.dec_deg)).with_remarks((remark,))
 
@@ -498,12 +485,3 @@ def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:
             observer = EarthLocation(*earth_fixed.cartesian.xyz)
         star = SkyCoord(target.ra_deg, target.dec_deg, unit="deg")
         return np.asarray(utc.light_travel_time(star, "barycentric", location=observer).to_value(u.s))
-
-
-def _accuracy(orbit: Orbit, when: Time) -> str:
-    """Return the accuracy of the satellite's position, as a part of a sentence."""
-    days = float(np.abs(when.utc.jd - orbit.elements.epoch_jd).max())
-    if orbit.resolved_at(days) == "mean":
-        return f"good to {1e3 * orbit.elements.axis_km / LIGHT_KM_S:.0f} ms: the place in the orbit is not known"
-    off = 1e3 * orbit.along_track_km(days) / LIGHT_KM_S
-    return f"good to {off:.2g} ms along the track of {orbit.elements.source}"
