@@ -17,7 +17,6 @@ from mauvecl.observations.visits import (
     IndexValue,
     Recovery,
     Smallest,
-    covered_indices,
     error_of_change,
     error_of_index,
     flux_per_dn,
@@ -308,9 +307,11 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
 
 
 def _indices(case: Case) -> list[IndexRow]:
-    quiet, unknown = case.quiet, case.unknowns()
-    rows = []
-    for index in covered_indices(quiet):
+    quiet, unknown, rows = case.quiet, case.unknowns(), []
+    first, last = quiet.wavelength_nm[[0, -1]]
+    for index in INDICES.values():
+        if not first <= index.continuum_nm[0][0] < index.continuum_nm[-1][1] <= last:
+            continue
         value = IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
         error, known_error = (error_of_index(value.weights, quiet, nuisances) for nuisances in (unknown, None))
         lost = pixels_of(value.weights, quiet)

@@ -134,18 +134,10 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
 
 @dataclass(frozen=True, eq=False)
 class ReducedFrames:
-    """Spectra reduced to weighted sums.
+    """Spectra reduced to weighted sums."""
 
-    Attributes
-    ----------
-    light_curves : tuple of Frames
-        One for each row of the weights.
-    pixels : PixelStatistics
-        Light and noise of each pixel of the file.
-    """
-
-    light_curves: tuple[Frames, ...]
-    pixels: PixelStatistics
+    light_curves: tuple[Frames, ...]  #: one for each row of the weights
+    pixels: PixelStatistics  #: light and noise of each pixel of the file
 
 
 @validated

@@ -179,65 +179,26 @@ def _cadence_of(name: str, time: Float) -> float:
 @validated
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Observed frames of one star.
+    """Observed frames of one star."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (n_frame,)
-        Middle of each frame, in seconds from `reference_mjd`; ascending.
-    exposure_s : ndarray, shape (n_frame,)
-        Exposure time of each frame.
-    flux : ndarray, shape (n_frame,) or (n_frame, n_pixel)
-        Light in `unit`.
-    error : ndarray of the same shape, or None
-        Standard deviation of each value.
-    quality : ndarray, shape (n_frame,)
-        Zero for frames without a known fault.
-    quality_mask : int
-        Bits of `quality` that exclude a frame; by default all.
-    mission : str
-        Mission whose names the bits have, "Kepler" (and K2) or "TESS"; empty for other files.
-    wavelength_nm : ndarray, shape (n_pixel,), or None
-    temperature_c : ndarray, shape (n_frame,), or None
-        Temperature of the detector.
-    unit : str
-        Unit of the flux, in astropy's notation; empty if it is relative or unknown.
-    reference_mjd : float or None
-        Modified Julian date of time zero; None if the times have no date.
-    scale : str
-        Time scale of the dates, such as "utc" or "tdb"; empty if unknown.
-    position : str
-        Where the times are measured, in words of FITS TREFPOS, as "TOPOCENTER" or "BARYCENTER"; empty if unknown.
-    direction_deg : (float, float) or None
-        Right ascension and declination (ICRS) that barycentric times refer to.
-    name : str
-        Name of the star or the file.
-    instrument : str
-        Name of the instrument; empty if unknown.
-    net : bool
-        Whether dark current and bias are known to be subtracted, as from raw spectra that `mauvecl realise` wrote.
-    remarks : tuple of str
-        What was done while reading, such as sorting.
-    """
-
-    time_s: Annotated[Float, Unit("s")]
-    exposure_s: Annotated[Float, Unit("s")]
-    flux: Float
-    error: Float | None = None
-    quality: NDArray[np.int64] | None = None
-    quality_mask: int = ALL_BITS
-    mission: str = ""
-    wavelength_nm: Annotated[Float, Unit("nm")] | None = None
-    temperature_c: Annotated[Float, Unit("deg_C")] | None = None
-    unit: str = ""
-    reference_mjd: float | None = None
-    scale: str = ""
-    position: str = ""
-    direction_deg: tuple[float, float] | None = None
-    name: str = "frames"
-    instrument: str = ""
-    net: bool = False
-    remarks: tuple[str, ...] = ()
+    time_s: Annotated[Float, Unit("s")]  #: middle of each frame from `reference_mjd`, shape (n_frame,); ascending
+    exposure_s: Annotated[Float, Unit("s")]  #: of each frame, shape (n_frame,)
+    flux: Float  #: light in `unit`, shape (n_frame,) or (n_frame, n_pixel)
+    error: Float | None = None  #: standard deviation of each value, if known
+    quality: NDArray[np.int64] | None = None  #: shape (n_frame,); zero for frames without a known fault
+    quality_mask: int = ALL_BITS  #: bits of `quality` that exclude a frame; by default all
+    mission: str = ""  #: whose names the bits have, "Kepler" (and K2) or "TESS"; empty for other files
+    wavelength_nm: Annotated[Float, Unit("nm")] | None = None  #: shape (n_pixel,), of spectra
+    temperature_c: Annotated[Float, Unit("deg_C")] | None = None  #: of the detector, shape (n_frame,)
+    unit: str = ""  #: of the flux, in astropy's notation; empty if it is relative or unknown
+    reference_mjd: float | None = None  #: Modified Julian date of time zero; None if the times have no date
+    scale: str = ""  #: of the dates, such as "utc" or "tdb"; empty if unknown
+    position: str = ""  #: where the times hold, in words of FITS TREFPOS, as "TOPOCENTER"; empty if unknown
+    direction_deg: tuple[float, float] | None = None  #: right ascension and declination (ICRS) of barycentric times
+    name: str = "frames"  #: of the star or the file
+    instrument: str = ""  #: empty if unknown
+    net: bool = False  #: whether bias and dark current are known to be subtracted, as by `mauvecl realise`
+    remarks: tuple[str, ...] = ()  #: what was done while reading, such as sorting
 
     @classmethod
     def of(

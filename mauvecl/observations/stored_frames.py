@@ -289,23 +289,12 @@ Light = tuple[Float, Float | None, Float | None, tuple[str, ...]]
 
 @dataclass(frozen=True, eq=False)
 class PixelStatistics:
-    """Light and noise of each pixel over the frames without a fault, arrays of shape (n_pixel,).
+    """Light and noise of each pixel over the frames without a fault, arrays of shape (n_pixel,)."""
 
-    Attributes
-    ----------
-    count : ndarray of int
-        Frames in which the pixel is finite.
-    mean : ndarray
-    scatter : ndarray
-        Standard deviation of a frame, from differences of neighbouring frames: slow changes have no part in it.
-    stated : ndarray or None
-        Root of the mean of the squared errors that the file states.
-    """
-
-    count: NDArray[np.int64]
-    mean: Float
-    scatter: Float
-    stated: Float | None
+    count: NDArray[np.int64]  #: frames in which the pixel is finite
+    mean: Float  #: light of a frame
+    scatter: Float  #: standard deviation of a frame, from differences of neighbours: slow changes have no part in it
+    stated: Float | None  #: root of the mean of the squared errors that the file states
 
 
 @dataclass(frozen=True, eq=False)
