@@ -195,11 +195,6 @@ class Analysis:
         """Star-days of the searched frames."""
         return self.survey.stare.observed_s / DAY_S
 
-    @property
-    def unit(self) -> float:
-        """Level of the star in standard deviations of a frame, to which changes are relative."""
-        return self.survey.level / self.survey.scale
-
     @cached_property
     def light_misleads(self) -> bool:
         """True if the light that all pixels share changes suddenly and the search does not leave it out."""
@@ -308,9 +303,10 @@ class Analysis:
         if self.level.process.terms and not self.dark_misleads:
             # A light curve that shows few periods of a process has another standard deviation than the process.
             spread = self.level.level[self.level.used].std() / self.survey.level
+            terms = self.level.process.describe(self.survey.level / self.survey.scale)
             yield (
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
-                f"{100 * spread:.2g} %, by {self.level.process.describe(self.unit)}."
+                f"{100 * spread:.2g} %, by {terms}."
             )
         if self.spectra is not None and self.dark_misleads:
             series = self.spectra.series

@@ -160,12 +160,8 @@ def reduce_frames(
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
         given = None if weights is None else np.asarray(weights, np.float64)
         quality = _masked(found.quality, QualityBits.of(file.header, how.quality_bits, file.what))
-        sums = weighted_sums(flux, error, quality, given)
-        curves = tuple(
-            _frames_in(file, how, stem, lambda *_, k=k: sums.light(k, flux.what, quality))
-            for k in range(sums.sums.shape[1])
-        )
-        return ReducedFrames(curves, sums.pixels)
+        lights, pixels = weighted_sums(flux, error, quality, given)
+        return ReducedFrames(tuple(_frames_in(file, how, stem, lambda *_, one=one: one) for one in lights), pixels)
 
 
 @dataclass(frozen=True)

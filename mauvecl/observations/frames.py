@@ -309,9 +309,7 @@ class Frames:
             errors = self.error.reshape(self.n_frames, -1)
             # An error below the rounding of the number is none.
             finite &= (np.isfinite(errors) & (errors > 1e-16 * np.abs(values))).all(axis=1)
-        flagged = np.zeros(self.n_frames, np.bool_)
-        if self.quality is not None:
-            flagged = QualityBits(self.quality_mask).excluded(self.quality)
+        flagged = self.quality is not None and QualityBits(self.quality_mask).excluded(self.quality)
         return np.asarray(np.where(flagged, Reason.QUALITY, 0) | np.where(finite, 0, Reason.NOT_FINITE), np.int64)
 
     @property

@@ -362,11 +362,6 @@ class Binned:
         """Logarithm of this noise over the typical stated one."""
         return float(np.log(max(self.noise / float(np.sqrt(np.median(self.variance))), 1e-6)))
 
-    @cached_property
-    def period_s(self) -> float | None:
-        """Period of the highest peak of the periodogram, or None if it is noise."""
-        return _period(self, self.values, LONGEST)
-
     @classmethod
     def of(cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED) -> Binned:
         """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
@@ -445,7 +440,7 @@ def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
         return
     smooth = ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
     yield (smooth,)
-    if (period := data.period_s) is None:
+    if (period := _period(data, data.values, LONGEST)) is None:
         return
     for factor in (1.0, 2.0):
         yield (_rotation(spread, factor * period),)

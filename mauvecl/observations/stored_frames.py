@@ -297,27 +297,13 @@ class PixelStatistics:
     stated: Float | None  #: root of the mean of the squared errors that the file states
 
 
-@dataclass(frozen=True, eq=False)
-class WeightedSums:
-    """Weighted sums of the pixels of each frame."""
-
-    sums: Float  # shape (n_frame, n_weight); NaN for frames with a pixel that is not finite
-    errors: Float | None  # from the stated errors of the pixels, which are taken to be independent
-    pixels: PixelStatistics
-    dead: int  # number of pixels that are left out, because they are not finite in most frames
-
-    def light(self, number: int, what: str, quality: Values | None) -> Light:
-        """Return the sums of one weight with their errors, the quality of the frames and remarks."""
-        error = None if self.errors is None else self.errors[:, number]
-        return self.sums[:, number], error, _flags(quality), dead_pixel_remarks(self.dead, what)
-
-
 def weighted_sums(
     flux: Values, error: Values | None, quality: Values | None, weights: Float | None = None
-) -> WeightedSums:
+) -> tuple[list[Light], PixelStatistics]:
     """Reduce spectra to weighted sums, by default the sum over all pixels, reading them twice in pieces.
 
-    Quality has the shape of the flux or of its frames, and is zero where nothing is wrong.
+    Quality has the shape of the flux or of its frames, and is zero where nothing is wrong. Pixels that are not finite
+    in most frames are left out, other frames with one have no sum, and errors of pixels are taken to be independent.
     """
     n, n_pixel = flux.shape
     given = np.ones((1, n_pixel)) if weights is None else np.atleast_2d(np.asarray(weights, np.float64))
@@ -331,7 +317,9 @@ def weighted_sums(
         sums[part] = _piece(flux, quality, part)[:, live] @ given[:, live].T
         if error is not None and errors is not None:
             errors[part] = np.sqrt(error.rows(part.start, part.stop)[:, live] ** 2 @ given[:, live].T ** 2)
-    return WeightedSums(sums, errors, statistics, int((~live).sum()))
+    flags, remarks = _flags(quality), dead_pixel_remarks(int((~live).sum()), flux.what)
+    each = errors.T if errors is not None else [None] * len(given)
+    return [(light, sd, flags, remarks) for light, sd in zip(sums.T, each, strict=True)], statistics
 
 
 def _piece(flux: Values, quality: Values | None, part: slice) -> Float:
@@ -392,10 +380,9 @@ def whole_or_reduced(flux: Values, error: Values | None, quality: Values | None)
         for part in flux.pieces:
             light[part] = _piece(flux, quality, part)
         return light, None if error is None else error.numbers(), _flags(quality), ()
-    found = weighted_sums(flux, error, quality)
-    remarks = (
+    remark = (
         f"{flux.what} has {n_bytes / 2**20:.0f} MiB of spectra, more than {limit >> 20} MiB: they were summed over "
-        "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+        "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit"
     )
-    light, sd, flags, more = found.light(0, flux.what, quality)
-    return light, sd, flags, (*remarks, *more)
+    ((light, sd, flags, more),) = weighted_sums(flux, error, quality)[0]
+    return light, sd, flags, (remark, *more)

@@ -236,6 +236,10 @@ def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None
     return float(np.sqrt(variance))
 
 
+#: Mg II h and k with the continuum on both sides, for spectra of low resolution such as IUE's (0.6 nm), nm: an
+#: assumption; definitions of Mg II indices differ between experiments, and none for stars at this resolution was found.
+MG_II_NM = (278.5, 281.5)
+MG_II_CONTINUUM_NM = ((275.5, 278.0), (282.0, 284.5))
 #: Smallest number of pixels of the continuum, for a straight line and a sign of its scatter.
 MIN_CONTINUUM = 3
 

@@ -203,17 +203,6 @@ def test_rows_of_periods_are_those_of_their_cells() -> None:
     assert table["recovered"][most].mean() > table["recovered"][least].mean() + 0.3
 
 
-def test_answer_holds_every_change_and_magnitude() -> None:
-    answer = asked("sweep.axes=[{quantity='exposure', values=[50, 600]}]", "nuisances.dark=0.1",
-                   "change.of=['320-700', 'Mg II k', 'colour']")  # fmt: skip
-    names = list(dict.fromkeys(answer.table["change"]))
-    assert len(answer.table) == 2 * len(names)
-    short, long = (answer.table[answer.table["exposure"].value == seconds] for seconds in (50, 600))
-    assert np.all(np.asarray(short["smallest"]) > np.asarray(long["smallest"]))
-    assert len(answer.magnitude_table) == len(answer.table) * 17
-    assert np.all(answer.table["error"] >= answer.table["error_known"])
-
-
 @pytest.fixture(scope="module")
 def flat(tmp_path_factory: pytest.TempPathFactory) -> str:
     source = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")

@@ -211,17 +211,12 @@ class StoppedError(Exception):
     """Raised by a report to stop the work."""
 
 
-def test_a_report_may_stop_the_analysis() -> None:
-    def stop(done: int, total: int) -> None:
+def test_a_report_may_stop_the_analysis_and_events_that_wait_are_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
+
+    def after_begin(done: int, total: int) -> None:
         if done:
             raise StoppedError
-
-    with pytest.raises(StoppedError):
-        analyse(OFTEN, progress=stop, frames=few_frames())
-
-
-def test_events_that_wait_are_not_measured_once_the_analysis_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[Any] = []
 
     def slow(*given: Any) -> None:
         begun.append(given)
@@ -230,6 +225,8 @@ def test_events_that_wait_are_not_measured_once_the_analysis_is_stopped(monkeypa
     def stop(share: float) -> None:
         raise StoppedError
 
+    with pytest.raises(StoppedError):
+        analyse(OFTEN, progress=after_begin, frames=few_frames())
     monkeypatch.setattr(events, "measure_event", slow)
     survey: Any = SimpleNamespace(flux_level=lambda quiet: None)
     with pytest.raises(StoppedError):

@@ -247,23 +247,23 @@ def test_rotation_is_no_flare(period_d: float, cadence_s: float, noise: float) -
     assert float(np.median(analysis.level.error)) == pytest.approx(noise, rel=0.1)
 
 
-def test_standard_deviation_of_a_varying_star_is_that_of_its_light() -> None:
-    """The process of a star that shows three rotations may have another standard deviation."""
-    rng = np.random.default_rng(7)
-    time = np.arange(300) * 1800.0
-    flux = 1 + 0.021 * np.sin(2 * np.pi * time / (2 * 86_400)) + 2e-4 * rng.standard_normal(time.size)
-    messages = analysed(Frames.of(time, flux, np.full(time.size, 2e-4))).analysis.messages
-    (stated,) = [found for one in messages if (found := re.search(r"standard deviation of (\S+) %, by rotation", one))]
+@pytest.mark.parametrize(
+    ("seed", "n", "period_s", "sizes", "noise"),
+    [(7, 300, 172_800.0, (0.021, 0.0), 2e-4), (8, 600, 40_600.0, (0.022, 0.008), 8e-4)],
+)
+def test_process_of_a_varying_star_is_the_best_and_stated_with_the_scatter_of_its_light(
+    seed: int, n: int, period_s: float, sizes: tuple[float, float], noise: float
+) -> None:
+    """A star that shows three rotations may have another standard deviation than its process."""
+    rng, time = np.random.default_rng(seed), np.arange(n) * 1800.0
+    phase = 2 * np.pi * time / period_s
+    flux = 1 + sizes[0] * np.sin(phase) + sizes[1] * np.sin(2 * phase + 1.1) + noise * rng.standard_normal(n)
+    analysis = analysed(Frames.of(time, flux, np.full(n, noise))).analysis
+    texts = "\n".join(analysis.messages)
+    stated = re.search(r"standard deviation of (\S+) %, by (?:sharp )?rotation", texts)
+    assert stated
     assert float(stated[1]) == pytest.approx(100 * flux.std() / flux.mean(), rel=0.05)
-
-
-def test_fitted_process_is_the_best_of_those_that_were_tried() -> None:
-    """Fits begin at several points, of which the best counts."""
-    rng = np.random.default_rng(8)
-    time = np.arange(600) * 1800.0
-    phase = 2 * np.pi * time / 40_600.0
-    flux = 1 + 0.022 * np.cos(phase) + 0.008 * np.cos(2 * phase + 1.1) + 8e-4 * rng.standard_normal(time.size)
-    process = analysed(Frames.of(time, flux, np.full(time.size, 8e-4))).analysis.level.process
+    process = analysis.level.process
     assert min(process.bic, key=lambda one: one[1]) == (process.name, 0.0)
 
 
