@@ -106,17 +106,17 @@ def spread(nm: np.ndarray, flux: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.interp(at, fine, np.convolve(np.interp(fine, nm, flux), kernel / kernel.sum(), mode="same"))
 
 
-def _of(source: Source) -> tuple[np.ndarray, np.ndarray]:
-    return source.wavelength_nm, source.flux_flam
-
-
 @pytest.mark.parametrize("file", ["lp02123.txt", "lp09052.txt", "lp09126.txt"])
 def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str, tmp_path: Path) -> None:
     table = np.loadtxt(AU_MIC / file, skiprows=19, usecols=(0, 1))
     # A library star of its type continues it; only 258-302 nm and the reach of the line function matter.
     nm, flux, other = table[:, 0] / 10, table[:, 1], Source.from_library("M1V")
     beyond = other.wavelength_nm > nm[-1]
-    red = other.flux_flam[beyond] * flux[nm > 325].mean() / np.interp(nm[nm > 325], *_of(other)).mean()
+    red = (
+        other.flux_flam[beyond]
+        * flux[nm > 325].mean()
+        / np.interp(nm[nm > 325], other.wavelength_nm, other.flux_flam).mean()
+    )
     source = Source.from_arrays(
         np.concatenate([[170.0], nm, other.wavelength_nm[beyond]]), np.concatenate([flux[:1], flux, red]), name="AU Mic"
     )

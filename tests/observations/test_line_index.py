@@ -77,19 +77,15 @@ def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
 SHARE = 0.8
 
 
-@pytest.fixture
-def study(tmp_path: Path) -> Study:
-    (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
-    star = {"library": "M3V", "magnitude": 9.0, "neighbours": tmp_path / "near.csv", "neighbour_share": SHARE}
-    return Study.model_validate({"star": [star], "search": {"per": "day"}})
-
-
 def electrons(source: Source) -> float:
     return float(expect(source, Instrument.load("mauvesim"), exposure=50.0).source_electrons.sum())
 
 
-def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(study: Study) -> None:
+def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(tmp_path: Path) -> None:
     """The light of a flare of unit amplitude on each star, made by hand, says how large it must be."""
+    (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
+    star = {"library": "M3V", "magnitude": 9.0, "neighbours": tmp_path / "near.csv", "neighbour_share": SHARE}
+    study = Study.model_validate({"star": [star], "search": {"per": "day"}})
     rng = np.random.default_rng(3)
     time = np.arange(400) * 60.0
     flux = rng.normal(1000.0, 5.0, 400)

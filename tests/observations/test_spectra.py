@@ -248,21 +248,14 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
 
 
 @pytest.mark.long
-def test_one_pixel_of_several_frames_is_no_flare() -> None:
-    added = np.zeros((N, light().size))
+def test_one_pixel_of_several_frames_and_single_frames_are_no_flares() -> None:
+    """Only the weighted sums show the single frame of ultraviolet light."""
+    added, ultraviolet = np.zeros((N, light().size)), model().flares((30_000.0,))[0]
     added[300:306, 5] = 12 * np.sqrt(model().variance(light())[5])
-    analysis = analyse(STUDY, frames=drawn(np.random.default_rng(306), added)).analysis
-    near = [event for event in analysis.events if event.first <= 305 and event.last >= 300]
+    added[400] = 9 / np.sqrt((ultraviolet**2 / model().variance(light())).sum()) * ultraviolet
+    answer = analyse(STUDY, frames=drawn(np.random.default_rng(306), added))
+    near = [event for event in answer.analysis.events if event.first <= 305 and event.last >= 300]
     assert [event.kind for event in near] == ["cosmic ray"]
-
-
-@pytest.mark.long
-def test_single_frames_that_only_the_weighted_sums_show_are_flagged() -> None:
-    spike = np.zeros((N, 1))
-    spike[400] = 1.0
-    ultraviolet = model().flares((30_000.0,))[0]
-    size = 9 / np.sqrt((ultraviolet**2 / model().variance(light())).sum())
-    answer = analyse(STUDY, frames=drawn(np.random.default_rng(307), spike * size * ultraviolet))
     assert str(answer.frames["reason"][400]) == "spike"
 
 
