@@ -60,20 +60,18 @@ class Half:
 
     def before(self, tau: ArrayLike) -> Float:
         """Return the integral up to tau."""
-        return self._rest(tau) if self.decays else self._own(tau)
+        return self._integral(tau, whole=not self.decays)
 
     def after(self, tau: ArrayLike) -> Float:
         """Return the integral from tau on."""
-        return self._own(tau) if self.decays else self._rest(tau)
+        return self._integral(tau, whole=self.decays)
 
-    def _own(self, tau: ArrayLike) -> Float:
-        return self.integral(np.maximum(tau, 0.0) if self.decays else np.minimum(tau, 0.0))
-
-    def _rest(self, tau: ArrayLike) -> Float:
-        """Return the integral between the peak and tau."""
-        t = np.asarray(tau, np.float64)
-        shines = t > 0 if self.decays else t < 0
-        return self._own(0.0) - self._own(t) if shines.any() else np.zeros(t.shape)
+    def _integral(self, tau: ArrayLike, whole: bool) -> Float:
+        """Return the `whole` integral on the far side of tau from the peak, or that between the peak and tau."""
+        t = np.asarray(np.maximum(tau, 0.0) if self.decays else np.minimum(tau, 0.0))
+        if whole:
+            return self.integral(t)
+        return self.integral(np.zeros(())) - self.integral(t) if t.any() else np.zeros(t.shape)
 
 
 def _exponential(rate: float) -> Half:

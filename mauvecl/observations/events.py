@@ -67,16 +67,12 @@ class Energy:
     @property
     def p_value(self) -> float:
         """Probability of a chi-squared at least as large."""
-        return _p_value(self.chi2, self.dof)
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
 
     @property
     def poor(self) -> bool:
         """True if no shape fits without departures: the interval also includes the disagreement of the shapes."""
         return self.p_value < POOR
-
-
-def _p_value(chi2: float, dof: int) -> float:
-    return float(scipy.stats.chi2.sf(chi2, dof)) if dof > 0 else float("nan")
 
 
 def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: Detection) -> Energy:
@@ -90,7 +86,7 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     plain, model = _without_departures(window, best)
     chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
     mixtures = [fit.mixture for fit in fits]
-    if _p_value(chi2, dof) < POOR:
+    if scipy.stats.chi2.sf(chi2, dof) < POOR:
         # What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the
         # event (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
         place = log_time(window.middle[window.inside], best.flares[0])

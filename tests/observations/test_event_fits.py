@@ -56,31 +56,15 @@ def survey_of(n: int, model: processes.Process) -> searches.SeriesSurvey:
     return replace(survey, processes=(model,), flux_process=model)
 
 
-def event_of(survey: searches.SeriesSurvey) -> searches.Detection:
-    middle = survey.stare.n_frames // 2
-    return searches.Detection(100.0, 120.0, float(survey.stare.start_s[middle]), 0, 20.0, middle - 8, middle + 120)
+def watch(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, place: int, found: list[tuple[str, int]]) -> None:
+    """Record the size of an argument of a function, whenever it is called."""
+    original = getattr(owner, name)
 
+    def recorded(*given, **others):  # type: ignore[no-untyped-def]
+        found.append((name, np.size(given[place])))
+        return original(*given, **others)
 
-class Sizes:
-    """Numbers of values that functions are called with."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.monkeypatch, self.found = monkeypatch, list[tuple[str, int]]()
-
-    def watch(self, owner: object, name: str, place: int) -> None:
-        """Record the size of an argument of a function."""
-        original = getattr(owner, name)
-
-        def recorded(*given, **others):  # type: ignore[no-untyped-def]
-            self.found.append((name, np.size(given[place])))
-            return original(*given, **others)
-
-        self.monkeypatch.setattr(owner, name, recorded)
-
-    def taken(self) -> list[tuple[str, int]]:
-        """Return the sizes and forget them."""
-        found, self.found = self.found, []
-        return found
+    monkeypatch.setattr(owner, name, recorded)
 
 
 def test_general_family_has_the_same_bits_in_each_process() -> None:
@@ -96,19 +80,19 @@ def test_general_family_has_the_same_bits_in_each_process() -> None:
 def test_work_of_an_event_does_not_grow_with_the_light_curve(
     model: processes.Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sizes = Sizes(monkeypatch)
-    sizes.watch(event_windows, "_bins", 0)
-    sizes.watch(processes.Process, "covariance", 1)
-    sizes.watch(processes.Process, "times", 1)
-    sizes.watch(processes.Process, "at", 1)
-    measured, work = [], []
+    sizes, measured, work = list[tuple[str, int]](), [], []
+    watch(monkeypatch, event_windows, "_bins", 0, sizes)
+    for name in ("covariance", "times", "at"):
+        watch(monkeypatch, processes.Process, name, 1, sizes)
     for n in (SHORT, LONG):
         survey = survey_of(n, model)
-        one = event_of(survey)
+        start = float(survey.stare.start_s[n // 2])
+        one = searches.Detection(100.0, 120.0, start, 0, 20.0, n // 2 - 8, n // 2 + 120)
         taken = np.zeros(n, np.bool_)
         taken[one.first : one.last + 1] = True
         measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy)
-        work.append(sizes.taken())
+        work.append(sizes[:])
+        sizes.clear()
     assert work[0]
     assert work[0] == work[1]
     assert max(size for name, size in work[0] if name != "at") <= 2 * event_windows.WINDOW_FRAMES + 200
@@ -119,13 +103,13 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(
 def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sizes = Sizes(monkeypatch)
-    sizes.watch(processes.Covariance, "squared_norms", 1)
-    work = []
+    sizes, work = list[tuple[str, int]](), []
+    watch(monkeypatch, processes.Covariance, "squared_norms", 1, sizes)
     for n in (SHORT, LONG):
         found, _ = detect_events(survey_of(n, SMOOTH), 7.0)
         assert len(found) == 1
-        work.append(sum(size for _, size in sizes.taken()))
+        work.append(sum(size for _, size in sizes))
+        sizes.clear()
     assert work[1] == pytest.approx(work[0], rel=0.02)
 
 

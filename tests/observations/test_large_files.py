@@ -122,22 +122,17 @@ np.savez({{out!r}}, white=frames.flux, time=frames.time_s)
 """
 
 
-def _csv(path: Path, n: int) -> None:
-    """Write a table with a date and 512 columns of light in each row."""
-    start = np.datetime64("2026-03-01T00:00:00")
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
+def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
+    """A table with a date and 512 columns of light in each row."""
+    n, margin, start = 44_000, 80, np.datetime64("2026-03-01T00:00:00")
+    path, small, out = tmp_path / "large.csv", tmp_path / "small.csv", tmp_path / "out.npz"
     with path.open("w") as file:
         file.write(",".join(["time", *(f"flux_{200 + k}" for k in range(512))]) + "\n")
         for row in range(n):
             light = ",".join(map(str, (PATTERN[row] + np.arange(512)).tolist()))
             file.write(f"{start + np.timedelta64(5 * row, 's')},{light}\n")
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
-def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
-    n, margin = 44_000, 80
-    path, small, out = tmp_path / "large.csv", tmp_path / "small.csv", tmp_path / "out.npz"
-    _csv(path, n)
     small.write_text("time,flux_200\n" + "\n".join(f"{k},1" for k in range(30)) + "\n")
     assert path.stat().st_size > margin * 2**20
     code = CSV_CHILD.format(margin=margin, path=str(path), small=str(small), out=str(out))
