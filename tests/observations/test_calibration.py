@@ -141,21 +141,6 @@ def test_fit_recovers_another_width_and_wavelength_scale() -> None:
     assert abs(f.shift_nm.value - 0.1) < FAR * f.shift_nm.error
 
 
-def test_written_instrument_is_the_fitted_one(answer: Any, tmp_path: Path) -> None:
-    answer.write(tmp_path)
-    read = Instrument.load(tmp_path / "instrument.toml")
-    assert read == answer.instrument
-    assert read.notice.startswith("The throughput is fitted to")
-    nm = answer.throughput.wavelength_nm[5:-5]
-    ratio = np.interp(nm, answer.throughput.wavelength_nm, np.exp(answer.throughput.log_factor))
-    np.testing.assert_allclose(read.throughput(nm) / NOMINAL.throughput(nm), ratio, rtol=3e-3)
-    np.testing.assert_allclose(
-        read.throughput_errors.sd(nm),
-        np.interp(nm, answer.throughput.wavelength_nm, answer.throughput.error),
-        rtol=0.01,
-    )
-
-
 def test_one_star_determines_throughput_alone() -> None:
     one = answer_of((("A0V", 5.0),), truth(), 2, dark=False)
     undetermined = {value.name for value in one.values if not value.determined}
@@ -308,20 +293,22 @@ def test_steps_of_the_throughput_are_followed() -> None:
     assert any("structure finer than" in text for text in found.messages)
 
 
-def test_fitted_values_and_throughput_vary_together(tmp_path: Path) -> None:
+def test_written_instrument_is_the_fitted_one_whose_values_vary_together(tmp_path: Path) -> None:
     """Modes, which lose 1e-4 of the variances: counts per photon have their own error, without that of the gain."""
     found = answer_of(STARS[:2], truth(), 9)
     found.write(tmp_path)
-    middle = Instrument.load(tmp_path / "instrument.toml")
-    assert middle.throughput_errors is not None
-    errors = middle.throughput_errors
+    middle, fitted = Instrument.load(tmp_path / "instrument.toml"), found.throughput
+    assert middle == found.instrument
+    assert middle.notice.startswith("The throughput is fitted to")
+    errors, nm = middle.throughput_errors, fitted.wavelength_nm[5:-5]
+    assert errors is not None
+    ratio, error = (np.interp(nm, fitted.wavelength_nm, each) for each in (np.exp(fitted.log_factor), fitted.error))
+    np.testing.assert_allclose(middle.throughput(nm) / NOMINAL.throughput(nm), ratio, rtol=3e-3)
+    np.testing.assert_allclose(errors.sd(nm), error, rtol=0.01)
     values = {one.name: one.error / one.value for one in found.values}
-    for name, of in (
-        ("gain", "conversion_uv_per_electron"),
-        ("read noise", "read_noise_dn"),
-        ("dark slope", "dark_slope_per_c"),
-    ):
-        assert np.linalg.norm(errors.values[of]) == pytest.approx(values[name], rel=1e-3)
+    of = {"gain": "conversion_uv_per_electron", "read noise": "read_noise_dn", "dark slope": "dark_slope_per_c"}
+    for name, key in of.items():
+        assert np.linalg.norm(errors.values[key]) == pytest.approx(values[name], rel=1e-3)
     (modes,) = errors.at(np.array([450.0])).T
     gain = np.zeros(modes.size)
     gain[: len(errors.values["conversion_uv_per_electron"])] = errors.values["conversion_uv_per_electron"]

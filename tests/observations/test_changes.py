@@ -186,23 +186,6 @@ def test_recovered_periods_are_those_of_another_periodogram() -> None:
             assert abs(found.recovered[k][j].value - other) < 0.03 + 4 * error, (period, amplitude)
 
 
-def test_rows_of_periods_are_those_of_their_cells() -> None:
-    """Sinusoids far below the noise are never found, and far above it nearly always."""
-    settings = ["change.periods=true", "change.visits=20", "orbit.targets=['eps Eri']", "orbit.days=30"]
-    asked_for = [*settings, "change.of=['320-700']", "change.trials=20"]
-    answer = asked(*asked_for)
-    table = answer.period_table
-    periods, amplitudes = (list(dict.fromkeys(np.asarray(table[name]))) for name in ("period", "amplitude_errors"))
-    assert len(table) == len(periods) * len(amplitudes)
-    pairs = set(zip(np.asarray(table["period"]), np.asarray(table["amplitude_errors"]), strict=True))
-    assert len(pairs) == len(table)
-    error = answer.table["error"][0]
-    np.testing.assert_allclose(table["amplitude"], error * np.asarray(table["amplitude_errors"]), rtol=1e-6)
-    least, most = (np.asarray(table["amplitude_errors"]) == end for end in (min(amplitudes), max(amplitudes)))
-    assert table["recovered"][least].mean() < 0.2
-    assert table["recovered"][most].mean() > table["recovered"][least].mean() + 0.3
-
-
 @pytest.fixture(scope="module")
 def flat(tmp_path_factory: pytest.TempPathFactory) -> str:
     source = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")
