@@ -139,8 +139,21 @@ def criterion(
     total = min(_criterion_of(survey, fits, every, epsilon) for epsilon in DEPARTURES)
     shapeless = shapeless or not any(process.terms for process in survey.processes)
     if fits and shapeless and survey.sums.shape[1] == 1:
-        alone = sum(_criterion_alone(survey, fit.event, size, fits, further) for fit in fits)
-        total = min(total, _criterion_of(survey, [], ~taken, 0.0) + alone)
+        alone = []
+        for event in (fit.event for fit in fits):
+            rows, added = slice(event.first, event.last + 1), [(1, *_added(survey, [], 0.0))]
+            for others in (fits, further):
+                near = (fit for fit in others if event.first <= fit.event.last and fit.event.first <= event.last)
+                if number := sum(fit.n_flares for fit in near):
+                    added += [(number, *_added(survey, others, epsilon)) for epsilon in DEPARTURES]
+            costs = []
+            for n_flares, light, extra in added:
+                values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
+                data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
+                process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
+                costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
+            alone.append(min(costs))
+        total = min(total, _criterion_of(survey, [], ~taken, 0.0) + sum(alone))
     return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
 
 
@@ -169,26 +182,6 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, 
         data = Binned(start, column, noise, survey.stare.frame_s)
         total += criterion_of_process(replace(process, excess=1.0), data, size)
     return total
-
-
-def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alternatives: Sequence[EventLight]) -> float:
-    """Return the criterion of the frames of an event in a light curve, whose light has a process of its own.
-
-    It is the smallest of those with no flares, and with the flares of each of the alternatives.
-    """
-    rows = slice(event.first, event.last + 1)
-    added = [(1, *_added(survey, [], 0.0))]
-    for fits in alternatives:
-        inside = sum(fit.n_flares for fit in fits if event.first <= fit.event.last and fit.event.first <= event.last)
-        if inside:
-            added += [(inside, *_added(survey, fits, epsilon)) for epsilon in DEPARTURES]
-    costs = []
-    for n_flares, light, extra in added:
-        values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
-        data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
-        process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
-        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
-    return min(costs)
 
 
 def _seen_once(survey: SeriesSurvey) -> bool:

@@ -287,7 +287,11 @@ class ProcessSearch:
         return replace(one, unsolved=one.unsolved | (share > CHANGED * one.irregular))
 
     def _solve(self, one: Filter, chosen: Bool) -> None:
-        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved."""
+        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved.
+
+        Innovations of a template are neglected `MOST_MARGIN` frames after it.
+        """
+        padded = np.pad(one.shape, 1)
         for k, norms in enumerate(one.norms):
             left = np.flatnonzero(chosen & norms.unsolved)
             norms.unsolved[left] = False
@@ -295,23 +299,15 @@ class ProcessSearch:
             while left.size:
                 stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, one.shape.size), side="right"))
                 stop = min(stop, CHUNK_TEMPLATES)
-                norms.norm[left[:stop]] = self._exact(k, one.shape, starts[:stop])
+                begin, end = np.searchsorted(self.at, [starts[0], starts[stop - 1] + one.shape.size])
+                norms.norm[left[:stop]] = 0.0
+                if end > begin:
+                    # Many shapes end before the same frame, so that what follows it is solved once.
+                    end = min(-(-end // CHUNK_FRAMES) * CHUNK_FRAMES, self.at.size)
+                    place = self.at[begin:end, None] - starts[:stop] + 1
+                    columns = padded[np.clip(place, 0, one.shape.size + 1, out=place)]
+                    norms.norm[left[:stop]] = self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
                 left, starts = left[stop:], starts[stop:]
-
-    def _exact(self, k: int, shape: Float, starts: NDArray[np.int64]) -> Float:
-        """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,).
-
-        Innovations of a template are neglected `MOST_MARGIN` frames after it.
-        """
-        begin, end = np.searchsorted(self.at, [starts[0], starts[-1] + shape.size])
-        if end <= begin:
-            return np.zeros(starts.size)
-        # Many shapes end before the same frame, so that what follows it is solved once.
-        end = min(-(-end // CHUNK_FRAMES) * CHUNK_FRAMES, self.at.size)
-        padded = np.pad(shape, 1)
-        place = self.at[begin:end, None] - starts + 1
-        columns = padded[np.clip(place, 0, shape.size + 1, out=place)]
-        return self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
 
 
 def _threads(n_values: int) -> int | None:
