@@ -208,10 +208,7 @@ def test_other_stars_than_stated_are_refused_or_reported() -> None:
 
 
 def test_plans_and_measurements_state_the_error_of_the_throughput(tmp_path: Path) -> None:
-    """A throughput known to 5 %, alike at all wavelengths, moves fluxes by as much, and no temperature.
-
-    E50 follows the S/N, which grows with the light by less than its share and more than its root.
-    """
+    """A throughput known to 5 % moves fluxes by as much, no temperature, and E50 by less, but more than by its root."""
     errors = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: wavelength, unit: nm, datatype: float64}\n"
     errors += "# - {name: mode_1, datatype: float64}\nwavelength mode_1\n200 0.05\n700 0.05\n"
     (tmp_path / "errors.ecsv").write_text(errors)

@@ -168,20 +168,13 @@ def test_coefficients_are_those_of_celerite2() -> None:
             np.testing.assert_array_equal(one, other)
 
 
-#: Frequent false alarms, whose rate takes little time.
-OFTEN = Study.build({"search": {"per": "day"}}, "test")
-
-
-def few_frames() -> Frames:
-    rng = np.random.default_rng(6)
-    time = np.arange(500) * 60.0
-    flux = LEVEL * (1 + 0.05 * flare(time, 60.0, 12_000.0, 300.0)) + rng.normal(0.0, SD, time.size)
-    return Frames.of(time, flux, np.full(time.size, SD))
-
-
-def test_progress_rises_to_the_number_of_frames() -> None:
-    reported: list[tuple[int, int]] = []
-    answer = analyse(OFTEN, progress=lambda done, total: reported.append((done, total)), frames=few_frames())
+def test_progress_rises_to_the_number_of_frames_and_may_stop_the_analysis(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Events that wait are not measured once the analysis is stopped."""
+    # Frequent false alarms, whose rate takes little time.
+    at, often, reported = np.arange(500) * 60.0, Study.build({"search": {"per": "day"}}, "test"), []
+    flux = LEVEL * (1 + 0.05 * flare(at, 60.0, 12_000.0, 300.0)) + np.random.default_rng(6).normal(0.0, SD, at.size)
+    frames = Frames.of(at, flux, np.full(at.size, SD))
+    answer = analyse(often, progress=lambda done, total: reported.append((done, total)), frames=frames)
     assert max(row.event.value for row in answer.rows) > 20
     done, totals = (list(each) for each in zip(*reported, strict=True))
     assert set(totals) == {500}
@@ -189,30 +182,22 @@ def test_progress_rises_to_the_number_of_frames() -> None:
     assert done[-1] == 500
     assert (np.diff(done) > 0).all()
     assert len(done) > 20
-
-
-class StoppedError(Exception):
-    """Raised by a report to stop the work."""
-
-
-def test_a_report_may_stop_the_analysis_and_events_that_wait_are_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[Any] = []
 
     def after_begin(done: int, total: int) -> None:
-        if done:
-            raise StoppedError
+        assert not done, "stopped"
 
     def slow(*given: Any) -> None:
         begun.append(given)
         time.sleep(0.02)
 
     def stop(share: float) -> None:
-        raise StoppedError
+        raise AssertionError("stopped")
 
-    with pytest.raises(StoppedError):
-        analyse(OFTEN, progress=after_begin, frames=few_frames())
+    with pytest.raises(AssertionError, match="stopped"):
+        analyse(often, progress=after_begin, frames=frames)
     monkeypatch.setattr(events, "measure_event", slow)
     survey: Any = SimpleNamespace(flux_level=lambda quiet: None)
-    with pytest.raises(StoppedError):
+    with pytest.raises(AssertionError, match="stopped"):
         events.measure_events(survey, np.zeros(3, np.bool_), [None] * 100, steps=processes.Steps(stop))  # type: ignore[list-item]
     assert 0 < len(begun) < 30

@@ -201,39 +201,6 @@ def test_faint_star_with_a_great_flare_has_its_energy() -> None:
     assert 0.005 < error / event.energy.fitted_s < 0.03
 
 
-@pytest.mark.long
-def test_losses_of_light_are_not_searched_and_flares_between_them_are_found() -> None:
-    """A light curve of 5 h with twelve losses of 0.5 to 5 %, and two flares of S/N 30 between them.
-
-    Losses raise the light when they end, so that the light between them resembles flares. At one false alarm a month
-    0.007 are expected, and none may be found: that fails by chance for 0.7 % of seeds. The threshold of a month is
-    extrapolated from the rates of a day, which take few simulations.
-    """
-    frame_s, noise, rng = 10.0, 1e-3 / np.sqrt(2), np.random.default_rng(421)
-    time = np.arange(1800) * frame_s
-    loss = np.zeros(time.size)
-    for start in rng.uniform(0, 3000, 12) + 1500 * np.arange(12):
-        out, back, length = rng.uniform(20, 200, 3)
-        gone = 1 - np.exp(-np.clip(time - start, 0, length) / out)
-        gone *= np.exp(-np.clip(time - start - length, 0, None) / back)
-        loss = np.maximum(loss, rng.uniform(0.005, 0.05) * gone)
-    whole = time[(loss < 1e-4) & (time > 1000) & (time < 16_000)]
-    peaks = [float(whole[whole.size // 3]), float(whole[2 * whole.size // 3])]
-    flux = 1 - loss + sum(0.02 * flare(time, frame_s, peak, 40.0) for peak in peaks)
-    flux += noise * rng.standard_normal(time.size)
-    answer = analysed(Frames.of(time, flux, np.full(time.size, noise)))
-    analysis = answer.analysis
-    observed = analysis.survey.time_s
-    sure = detected(analysis, PER_MONTH)
-    spans = [(observed[one.first] - 60, observed[one.last] + 60) for one in sure]
-    assert all(any(low < peak < high for low, high in spans) for peak in peaks)
-    assert all(any(low < peak < high for peak in peaks) for low, high in spans)
-    assert analysis.likeness.alike
-    lost = np.array(["loss" in str(one) for one in answer.frames["reason"]])
-    assert lost[loss > 5 * noise].mean() > 0.9
-    assert lost[loss < 0.1 * noise].mean() < 0.05
-
-
 @pytest.mark.parametrize(
     ("seed", "n", "period_s", "sizes", "noise"),
     [(7, 300, 172_800.0, (0.021, 0.0), 2e-4), (8, 600, 40_600.0, (0.022, 0.008), 8e-4)],

@@ -274,11 +274,7 @@ def test_false_alarms_are_as_many_as_promised(threshold: float) -> None:
 
 @pytest.mark.long
 def test_detection_rate_follows_the_signal_to_noise() -> None:
-    """The share of flares of one size above a threshold; the binomial bound fails once in a thousand times.
-
-    The statistic of the template of the flare's own shape is normal about its S/N; others of the bank only add. Noise
-    hardly reaches the threshold.
-    """
+    """Flares of one size: the statistic is normal about its S/N; the binomial bound fails once in a thousand times."""
     rng, above = np.random.default_rng(309), 5.0
     _, survey, _ = prepared(drawn(rng))
     unit = survey.templates.directions[np.argmin(np.abs(np.array(survey.templates.temperatures_k) - 10_000))]

@@ -78,12 +78,14 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
     for first in (150, 400, 700):
         lost[first : first + 40] = True
     flux = 1 - 0.03 * lost + 0.02 * flare(time, 20.0, 11_000.0, 60.0) + noise * rng.standard_normal(time.size)
-    frames = Frames.of(time, flux, np.full(time.size, noise))
-    reasons = analysed(frames).frames["reason"]
-    found = np.array(["loss" in str(one) for one in reasons])
+    answer = analysed(Frames.of(time, flux, np.full(time.size, noise)))
+    found = np.array(["loss" in str(one) for one in answer.frames["reason"]])
     assert found[lost].mean() > 0.9
     assert found[~lost].mean() < 0.05
     assert not found[550:560].any()
+    (one,) = detected(answer.analysis, PER_MONTH)
+    assert abs(answer.analysis.survey.time_s[one.brightest] - 11_000.0) < 60
+    assert answer.analysis.likeness.alike
 
 
 @pytest.mark.long
