@@ -79,21 +79,6 @@ def _exponential(rate: float) -> Half:
     return Half(lambda tau: np.asarray(np.exp(-rate * tau) / rate), decays=True)
 
 
-def _exponentials() -> tuple[list[Half], Float]:
-    """Return exponentials of few rates, and their weights in those of `SLOW_RATES`, shape (n_rate, n_few).
-
-    An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
-    """
-    middle, half = np.log(SLOW_RATES[[0, -1]].prod()) / 2, np.log(SLOW_RATES[-1] / SLOW_RATES[0]) / 2
-    points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
-    # The barycentric weights of Chebyshev points are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715,
-    # equation 5.4); scipy would compute them with the points in a random order, which changes the last bits.
-    barycentric = (-1.0) ** np.arange(EXPONENTIALS)
-    barycentric[[0, -1]] /= 2
-    interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
-    return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(interpolate(np.log(SLOW_RATES)))
-
-
 def _gaussian(tau: Float, width: float) -> Float:
     """Return the integral of a Gaussian beyond tau; its half-width at half maximum is negative before the peak."""
     root = float(np.sqrt(np.log(2)))
@@ -144,7 +129,15 @@ class Family:
         rises = [Half(SHAPES["davenport2014"].before), *(Half(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES)]
         gaussian = Half(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
-        slow, interpolated = _exponentials()
+        # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points,
+        # whose barycentric weights are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715, equation 5.4);
+        # scipy would compute them with the points in a random order, which changes the last bits.
+        middle, half = np.log(SLOW_RATES[[0, -1]].prod()) / 2, np.log(SLOW_RATES[-1] / SLOW_RATES[0]) / 2
+        points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
+        barycentric = (-1.0) ** np.arange(EXPONENTIALS)
+        barycentric[[0, -1]] /= 2
+        interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
+        slow, interpolated = [_exponential(float(rate)) for rate in np.exp(points)], interpolate(np.log(SLOW_RATES))
         choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
         # Each share has the same weight: without a slow decay, its rate does not matter.
         rates = np.array([1.0 if share == 0 else 1 / SLOW_RATES.size for share, _ in choices])

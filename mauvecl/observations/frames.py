@@ -61,7 +61,18 @@ class QualityBits:
         mission = "Kepler" if said & {"KEPLER", "K2"} else "TESS" if "TESS" in said else ""
         if chosen is None or str(chosen).strip().lower() == "default":
             return cls(DEFAULTS.get(mission, ALL_BITS), mission, NOTED.get(mission, 0))
-        return cls(_mask(chosen, NAMES.get(mission, {}), what), mission)
+        names, mask = NAMES.get(mission, {}), 0
+        by_name = {name.lower(): bit for bit, name in names.items()} | {"all": ALL_BITS, "none": 0}
+        words = [word for word in re.split(r"[\s,;|+]+", str(chosen).strip()) if word]
+        for word in words or [str(chosen)]:
+            if word.isascii() and word.isdigit() and len(word) < 19:
+                mask |= int(word)
+            elif word.lower() in by_name and (len(words) == 1 or word.lower() not in ("all", "none")):
+                mask |= by_name[word.lower()]
+            else:
+                known = f"names among {', '.join(names.values())}" if names else "for Kepler, K2 and TESS names"
+                raise InputError.of("quality_bits", word, f"all, none, default, or numbers, and {known}", where=what)
+        return cls(mask, mission)
 
     def excluded(self, quality: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which frames a chosen bit excludes."""
@@ -92,22 +103,6 @@ def decimal_flags(flags: NDArray[np.float64]) -> NDArray[np.float64]:
     if max(texts, default=0.0) < 2**32 or set("".join(texts.values())) - {"0", "1"}:
         return flags
     return np.array([float(int(texts[one], 2)) if one in texts else one for one in values.tolist()])[place]
-
-
-def _mask(chosen: str | int, names: Mapping[int, str], what: str) -> int:
-    """Return the sum of the bits that a text or number chooses."""
-    by_name = {name.lower(): bit for bit, name in names.items()} | {"all": ALL_BITS, "none": 0}
-    words = [word for word in re.split(r"[\s,;|+]+", str(chosen).strip()) if word]
-    mask = 0
-    for word in words or [str(chosen)]:
-        if word.isascii() and word.isdigit() and len(word) < 19:
-            mask |= int(word)
-        elif word.lower() in by_name and (len(words) == 1 or word.lower() not in ("all", "none")):
-            mask |= by_name[word.lower()]
-        else:
-            known = f"names among {', '.join(names.values())}" if names else "for Kepler, K2 and TESS names"
-            raise InputError.of("quality_bits", word, f"all, none, default, or numbers, and {known}", where=what)
-    return mask
 
 
 Float = NDArray[np.float64]
