@@ -21,15 +21,12 @@ FLUX = 1000 + RNG.normal(0, 5, 100)
 ERROR = np.full(100, 5.0)
 
 
-def test_unsorted_frames_are_sorted_with_a_remark() -> None:
+def test_frames_are_sorted_and_numbered_over_gaps_and_slow_changes_of_the_times() -> None:
     order = RNG.permutation(100)
     frames = Frames.of(TIME[order], FLUX[order], ERROR[order])
     np.testing.assert_array_equal(frames.flux, FLUX)
     assert len(frames.remarks) == 1
     assert Frames.of(TIME, FLUX).remarks == ()
-
-
-def test_numbers_follow_the_cadence_over_gaps_and_slow_changes_of_the_times() -> None:
     kept = np.r_[0:30, 50:100]
     assert Frames.of(TIME[kept], FLUX[kept]).numbers.tolist() == kept.tolist()
     # Barycentric times: 100 s of drift over a year, as of the Earth's motion along the line of sight.
