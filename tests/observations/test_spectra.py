@@ -297,7 +297,7 @@ def test_detection_rate_follows_the_signal_to_noise() -> None:
 @pytest.mark.long
 def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
     """Flares of S/N 20-100 on a star that drifts by 5 % an hour; each bound fails once in a thousand times."""
-    # Intervals allow for drifts that noise may hide, so that those of 68 % may cover 90 %; without, 53 % held the truth.
+    # Intervals allow for drifts that noise may hide: those of 68 % may cover 90 %; without, 53 % held the truth.
     rng = np.random.default_rng(310)
     number, pulls = 24, {"temperature": list[float](), "energy bolometric": list[float]()}
     inside = {name: np.zeros(2) for name in pulls}
