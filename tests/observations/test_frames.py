@@ -79,9 +79,7 @@ def test_time_series_of_astropy_are_frames() -> None:
     np.testing.assert_allclose(frames.error, 1.0)
     np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0, atol=2e-5)
     assert (frames.unit, frames.scale, frames.reference_mjd) == ("Jy", "tdb", pytest.approx(61_000.0))
-
-
-def test_binned_time_series_are_frames_through_a_mapping() -> None:
+    # Binned ones need a mapping.
     series = BinnedTimeSeries(time_bin_start=WHEN, time_bin_size=18.0 * u.s, data={"flux": LIGHT[:, 0]})
     how = frame_files.FrameMapping(time="time_bin_start", time_at="start", exposure="time_bin_size", flux="flux")
     frames = frame_files.frames_of(series, how)
