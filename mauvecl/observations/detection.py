@@ -67,8 +67,8 @@ def _fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None
     columns = [*survey.sums.T, survey.flux] if survey.weighted else survey.sums.T
     befores = [None] * len(columns) if start is None else [*start.processes, start.flux_process]
     for column, before in zip(columns, befores, strict=False):
-        parts = (each[quiet] for each in (survey.stare.start_s, column, survey.variance))
-        fitted.append(fit_process(Binned.of(*parts, survey.stare.frame_s), before, steps))
+        time, values, variance = (each[quiet] for each in (survey.stare.start_s, column, survey.variance))
+        fitted.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), before, steps))
     return replace(survey, processes=tuple(fitted[: survey.sums.shape[1]]), flux_process=fitted[-1])
 
 

@@ -280,11 +280,10 @@ class Quantities:
                 raise InputError(f"{what}: {values.name!r} must not change within a frame", key=values.name)
             return Values.of(values.name, rows[:, 0], values.unit, what)
 
-        return Quantities(
-            tuple(map(single, self.time)), *map(spectra, (self.flux, self.error, self.quality)),
-            *map(single, (self.exposure, self.temperature)),
-            Values.of(wavelength.name, pixels, wavelength.unit, what),
-        )  # fmt: skip
+        flux, error, quality = map(spectra, (self.flux, self.error, self.quality))
+        exposure, temperature = map(single, (self.exposure, self.temperature))
+        nm = Values.of(wavelength.name, pixels, wavelength.unit, what)
+        return Quantities(tuple(map(single, self.time)), flux, error, quality, exposure, temperature, nm)
 
 
 def _keys(values: Values) -> NDArray[Any]:

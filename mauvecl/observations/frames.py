@@ -232,7 +232,7 @@ class Frames:
         exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-        each: dict[str, NDArray[Any] | None] = {"error": None, "temperature_c": None}
+        each: dict[str, Any] = {"error": None, "temperature_c": None}
         for key, given, shape in (
             ("error", error, light.shape),
             ("temperature_c", how.pop("temperature_c", None), (n,)),

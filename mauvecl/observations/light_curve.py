@@ -359,8 +359,8 @@ def quiescent_light(
     used, process = reasons == 0, survey.flux_process
     quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
     error = level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
-    for_all = [
+    level, sd, noise = (
         np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
         for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
-    ]
-    return QuiescentLevel(*for_all, excess, used & outside, reasons, process)
+    )
+    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process)

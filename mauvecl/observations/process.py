@@ -483,7 +483,8 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
     """Return the process of some terms that fits best, and its BIC."""
     expected = data.log_excess
     start = np.array([log_excess, *(value for term in terms for value in term.parameters)])
-    bounds, shortest = [(log_excess - 3.0, log_excess + 3.0)], np.log(SHORTEST * data.step_s)
+    bounds: list[Any] = [(log_excess - 3.0, log_excess + 3.0)]
+    shortest = np.log(SHORTEST * data.step_s)
     for term in terms:
         scale, period = (SCALES[0] * data.step_s, SCALES[1] * data.span_s), term.parameters[1]
         around = (max(period - NEAR_PERIOD, shortest), period + NEAR_PERIOD) if term.rotates else np.log(scale)

@@ -318,7 +318,7 @@ def weighted_sums(
         if error is not None and errors is not None:
             errors[part] = np.sqrt(error.rows(part.start, part.stop)[:, live] ** 2 @ given[:, live].T ** 2)
     flags, remarks = _flags(quality), dead_pixel_remarks(int((~live).sum()), flux.what)
-    each = errors.T if errors is not None else [None] * len(given)
+    each: Any = errors.T if errors is not None else [None] * len(given)
     return [(light, sd, flags, remarks) for light, sd in zip(sums.T, each, strict=True)], statistics
 
 
