@@ -320,8 +320,8 @@ def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
     return file.find(mapping.wavelength)
 
 
-def _number_of_rows(file: TableFile, found: Quantities) -> int:
-    """Return the number of frames before any is read; raise InputError unless all columns have as many."""
+def _check_rows(file: TableFile, found: Quantities) -> None:
+    """Raise InputError unless all columns have one row, or spectrum, for each frame, before any is read."""
     what, n = file.what, found.time[0].n_rows
     if not 0 < n <= MAX_FRAMES:
         expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
@@ -343,21 +343,31 @@ def _number_of_rows(file: TableFile, found: Quantities) -> int:
             "give a light curve, such as lightkurve's `to_lightcurve` makes",
             key="flux",
         )
-    return n
 
 
-def _exposure_s(file: TableFile, found: Quantities, mapping: FrameMapping, between_edges: Float | None) -> Float | None:
-    """Return the exposure time of each frame by a column, the mapping, the header or the edges of frames, or None."""
-    n = found.time[0].n_rows
-    if found.exposure is not None:
-        return converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+def _conditions(
+    file: TableFile, found: Quantities, mapping: FrameMapping, exposure: Float | None
+) -> dict[str, Float | None]:
+    """Return exposure times and temperatures of frames, by columns, the mapping or the header; None if unknown.
+
+    The `exposure` is that between the edges of frames, if the times have these.
+    """
+    n, temperature, nominal = found.time[0].n_rows, None, file.header.get("CCD-TEMP")
     try:
         # The header of BRITE's light curves has milliseconds for each image of a stack.
         stated = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
     except (KeyError, ValueError):
         stated = 0.0
-    one = mapping.exposure_s or stated
-    return np.full(n, one) if 0.0 < one < np.inf else between_edges
+    if found.exposure is not None:
+        exposure = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+    elif 0.0 < (one := mapping.exposure_s or stated) < np.inf:
+        exposure = np.full(n, one)
+    if found.temperature is not None:
+        celsius = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit")
+        temperature = celsius.numbers().reshape(n)
+    elif isinstance(nominal, int | float):
+        temperature = np.full(n, float(nominal))
+    return {"exposure_s": exposure, "temperature_c": temperature}
 
 
 def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float | None, str, list[str]]:
@@ -384,14 +394,9 @@ def _frames_in(
     """Build frames from a file and the names of its quantities; `read` returns their light."""
     what, header = file.what, file.header
     found = Quantities.of(file, mapping)
-    n = _number_of_rows(file, found)
+    _check_rows(file, found)
     time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
-    each: dict[str, Any] = {"exposure_s": _exposure_s(file, found, mapping, between_edges_s), "temperature_c": None}
-    if found.temperature is not None:
-        celsius = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit")
-        each["temperature_c"] = celsius.numbers().reshape(n)
-    elif isinstance(nominal := header.get("CCD-TEMP"), int | float):
-        each["temperature_c"] = np.full(n, float(nominal))
+    each: dict[str, Any] = {**_conditions(file, found, mapping, between_edges_s)}
     bits = QualityBits.of(header, mapping.quality_bits, what)
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
     light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)
