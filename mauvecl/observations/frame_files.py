@@ -352,7 +352,8 @@ def _conditions(
 
     The `exposure` is that between the edges of frames, if the times have these.
     """
-    n, temperature, nominal = found.time[0].n_rows, None, file.header.get("CCD-TEMP")
+    n, nominal = found.time[0].n_rows, file.header.get("CCD-TEMP")
+    temperature: Float | None = None
     try:
         # The header of BRITE's light curves has milliseconds for each image of a stack.
         stated = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
