@@ -31,8 +31,7 @@ from mauvecl import Study, calibrate
 from mauvecl.host.instrument.curves import Curve
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.throughput import ERROR_KNOTS, ONE_STAR_ERROR
-from tests.observations.test_calibrated_coverage import deviations
-from tests.observations.test_calibration import NOMINAL, STARS, frames_of, relative, truth
+from tests.observations.test_calibration import NOMINAL, STARS, deviations, frames_of, relative, truth
 
 NM = np.linspace(195.0, 705.0, 2041)
 #: Factors on the nominal throughput by name; that of the tests is smooth.

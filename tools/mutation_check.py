@@ -337,7 +337,10 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "durations without the error of their level": (
         "test_tables_of_default_questions_are_unchanged[analyse-counts]",
-        ("grid.information + left + mean**2 * likelihood.level_variance) / level", "grid.information + left) / level"),
+        (
+            "grid.information + likelihood.left + mean**2 * likelihood.level_variance) / level",
+            "grid.information + likelihood.left) / level",
+        ),
     ),
     "brighter flares on a higher level": (
         "test_tables_of_default_questions_are_unchanged[analyse-counts]",
@@ -353,7 +356,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "published shapes that do not share their weight": (
         "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
-        ("(1 - GENERAL_WEIGHT) / len(published)", "(1 - GENERAL_WEIGHT)"),
+        ("(1 - GENERAL_WEIGHT) / len(shapes)", "(1 - GENERAL_WEIGHT)"),
     ),
     "likelihood without the information on the level": (
         "test_covariance_is_that_of_dense_matrices",
@@ -369,7 +372,7 @@ MUTATIONS: dict[str, Mutation] = {
     # The level of observed light curves, and the search.
     "norms that end with their template": (
         "test_level_norms_and_covariances_are_those_of_the_matrices",
-        ('total = np.einsum("jo,jo->o", state, self._norms_after(last, after) @ state)', "total = 0.0"),
+        ('total = np.einsum("jo,jo->o", state, self._forms[last, after] @ state)', "total = 0.0"),
     ),
     "statistics of a known level": (
         "test_statistics_have_unit_variance_over_gaps_and_changing_noise[process0-300-0.05-0.02-0-at-once]",
@@ -536,7 +539,7 @@ MUTATIONS: dict[str, Mutation] = {
         ('Column("smallest", "smallest.one"', 'Column("smallest", "smallest.scatter"'),
     ),
     "amplitudes of other cells": (
-        "test_rows_of_periods_are_those_of_their_cells",
+        "test_tables_of_default_questions_are_unchanged[change-periods]",
         (
             'Column("amplitude_errors", lambda row: row.recovery.amplitudes[:, None]',
             'Column("amplitude_errors", lambda row: np.resize(row.recovery.amplitudes, row.shares("value").shape)',

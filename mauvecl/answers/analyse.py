@@ -300,7 +300,7 @@ FRAMES = (
     Column("level", "level.level", "", "quiescent level"),
     Column("level_error", "level.level_error", "", "standard error of the level"),
     Column("error", "level.error", "", "standard deviation of a quiescent frame"),
-    Column("reason", lambda row: Reason.all_words(row.level.reasons), "",
+    Column("reason", lambda row: Reason.words(row.level.reasons), "",
            "why the frame is not searched; empty if it is"),
     Column("quality", lambda row: np.zeros(row.frames.n_frames, np.int64) if row.frames.quality is None
            else row.frames.quality, "", "quality flag of the file"),

@@ -289,9 +289,11 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
 
 
 def _indices(case: Case) -> list[IndexRow]:
-    quiet, unknown = case.quiet, case.unknowns()
-    rows = []
-    for index in visits.covered_indices(quiet):
+    quiet, unknown, rows = case.quiet, case.unknowns(), []
+    first, last = quiet.wavelength_nm[[0, -1]]
+    for index in visits.INDICES.values():
+        if not first <= index.continuum_nm[0][0] < index.continuum_nm[-1][1] <= last:
+            continue
         value = visits.IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
         error, known_error = (visits.error_of_index(value.weights, quiet, nuisances) for nuisances in (unknown, None))
         lost = visits.pixels_of(value.weights, quiet)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -19,7 +19,7 @@ from mauvecl.observations.frame_model import CleanedSpectra, FrameModel, clean_s
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import (
     CHANCE_DIP,
     NO_COLOUR_K,
@@ -195,11 +195,6 @@ class Analysis:
         """Star-days of the searched frames."""
         return self.survey.stare.observed_s / DAY_S
 
-    @property
-    def unit(self) -> float:
-        """Level of the star in standard deviations of a frame, to which changes are relative."""
-        return self.survey.level / self.survey.scale
-
     @cached_property
     def light_misleads(self) -> bool:
         """True if the light that all pixels share changes suddenly and the search does not leave it out."""
@@ -264,86 +259,83 @@ class Analysis:
             *self._verdict_messages(),
         ]
 
-    def _frame_messages(self) -> list[str]:
-        """Return messages on what is searched and on the noise of frames."""
-        lines = []
+    def _frame_messages(self) -> Iterator[str]:
+        """Yield messages on what is searched and on the noise of frames."""
         if self.crowded:
-            lines.append(
+            yield (
                 f"Events take {100 * self.in_events:.2g} % of the searched frames, so that what the star does without "
                 "them is not known, and there are no verdicts: the light probably has eclipses, transits or pulsation, "
                 "or is another column than the flux; mark the frames to leave out in a column of quality, or name the "
                 "columns in a mapping."
             )
         if len(self.events) >= most_events(self.survey.stare.n_frames):
-            lines.append(
+            yield (
                 f"The search ended at {len(self.events)} events: there may be smaller ones, which are taken for "
                 "quiescent light; a light curve of fewer frames may show them."
             )
         reasons = self.level.reasons
         if (reasons != 0).any():
-            lines.append(f"{np.count_nonzero(reasons)} of {reasons.size} frames are not searched; the table of frames "
-                         "states the reason of each.")  # fmt: skip
+            lost = np.count_nonzero(reasons)
+            yield f"{lost} of {reasons.size} frames are not searched; the table of frames states the reason of each."
         if lost := np.count_nonzero(reasons & Reason.LOSS):
-            lines.append(f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses; flares "
-                         "in them are not searched.")  # fmt: skip
+            yield (
+                f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses; flares "
+                "in them are not searched."
+            )
         if self.level.excess > 1.2:
-            lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
-                         "measured scatter is used.")  # fmt: skip
-        return lines
+            excess = f"{self.level.excess:.2f} times the stated errors"
+            yield f"The scatter of quiescent frames is {excess}; the measured scatter is used."
 
-    def _level_messages(self) -> list[str]:
-        """Return messages on changes of the light that are no flares."""
-        lines = []
+    def _level_messages(self) -> Iterator[str]:
+        """Yield messages on changes of the light that are no flares."""
         if self.light_misleads:
-            lines.append(
+            yield (
                 "The throughput changes, as by pointing losses; short changes may resemble flares: "
                 'search.frame.light = "free", the default, searches without the light that all pixels share.'
             )
         if changes := self.level.changes:
             largest = max(changes, key=lambda change: abs(change[1]))[1]
             often = "once" if len(changes) == 1 else f"{len(changes)} times"
-            lines.append(
+            yield (
                 f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the most: light "
                 "is relative to the level after each change, and the table of frames has that level."
             )
         if self.level.process.terms and not self.dark_misleads:
             # A light curve that shows few periods of a process has another standard deviation than the process.
             spread = self.level.level[self.level.used].std() / self.survey.level
-            lines.append(
+            terms = self.level.process.describe(self.survey.level / self.survey.scale)
+            yield (
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
-                f"{100 * spread:.2g} %, by {self.level.process.describe(self.unit)}."
+                f"{100 * spread:.2g} %, by {terms}."
             )
         if self.spectra is not None and self.dark_misleads:
             series = self.spectra.series
-            lines.append(
+            yield (
                 f"The dark current changes the sum over wavelength by {series.dark_drift:.2g} times its level, as in a "
                 "detector whose temperature changes: peaks are not stated, and equivalent durations "
                 + ("are relative to the light of the star by the shape of its spectrum." if series.model.star_is_known
                    else "only where the star is named, whose spectrum distinguishes its light from the dark current.")
             )  # fmt: skip
-        return lines
 
-    def _verdict_messages(self) -> list[str]:
-        """Return messages on why events have no verdict or another threshold than the wanted one."""
-        lines = []
+    def _verdict_messages(self) -> Iterator[str]:
+        """Yield messages on why events have no verdict or another threshold than the wanted one."""
         if not self.likeness.alike:
-            lines.append(
+            yield (
                 f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "
                 f"{self.likeness.lag} frames), which the fitted process does not describe: there are no verdicts. "
                 f"Sudden dips, which are no flares, have an S/N of up to {max(self.dip, self.candidates):.3g}: rises "
                 "of that size are no evidence of flares."
             )
         elif self.dip == self.threshold:
-            lines.append(
+            yield (
                 f"The light falls suddenly, as by losses of light, with an S/N of {self.dip:.3g}: rises of that size "
                 "may be returns from a loss, and only larger ones are called detected."
             )
         if self.wanted < self.measured.smallest:
-            lines.append(
+            yield (
                 f"Simulated light curves show rates down to {self.measured.smallest:.2g} false alarms per star-day; "
                 "the threshold for fewer is extrapolated with the tail of their noise."
             )
-        return lines
 
 
 def analyse_frames(
@@ -408,39 +400,38 @@ def _thresholds(
     return rates, threshold, candidates, dip
 
 
-def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
-    """Return statements about the pixels of spectra that a reader must know."""
-    cleaned, noise, lines = spectra.cleaned, spectra.series.noise, []
+def _spectral_messages(spectra: SpectralAnalysis) -> Iterator[str]:
+    """Yield statements about the pixels of spectra that a reader must know."""
+    cleaned, noise = spectra.cleaned, spectra.series.noise
     if count := int(cleaned.rays.sum()):
-        lines.append(
+        yield (
             f"{count} single values in {np.count_nonzero(cleaned.rays)} frames stand out from their spectrum, as "
             "cosmic rays do; a fit to the other pixels replaces them, and the table of frames counts them."
         )
     if cleaned.stated_by == "instrument":
-        lines.append("The frames state no errors: the noise of each pixel is that of the instrument's model.")
+        yield "The frames state no errors: the noise of each pixel is that of the instrument's model."
     if many := int(noise.departs.sum()):
         ratio = noise.measured / noise.stated
-        lines.append(
+        yield (
             f"The noise of {many} of {ratio.size} pixels departs from what is stated: their measured noise is used, "
             f"{ratio.min():.2f} to {ratio.max():.2f} times it."
         )
     if changes := spectra.series.changes:
         largest = max(changes, key=lambda one: abs(one.change))
         times = "once" if len(changes) == 1 else f"{len(changes)} times"
-        lines.append(
+        yield (
             f"The light that all pixels share changes suddenly {times}, by up to {100 * abs(largest.change):.2g} %, as "
             "by pointing losses and re-acquisitions; the table of throughput states when."
         )
     for name, sd in spectra.series.jitters.items():
         if np.isfinite(sd):
             size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
-            lines.append(f"The {CAUSES[name]} of single frames changes: {size}, which the search marginalises over.")
+            yield f"The {CAUSES[name]} of single frames changes: {size}, which the search marginalises over."
         elif name == "light":
             left = f"{100 * spectra.series.kept:.2g} %"
-            lines.append(
+            yield (
                 "The level of each frame is free in the search, because pointing losses change it: flares keep "
                 f"{left} of their S/N; search.frame.light states its standard deviation instead (1e-6: steady)."
             )
         else:
-            lines.append(f"The search leaves out all changes of the {CAUSES[name]} of single frames.")
-    return lines
+            yield f"The search leaves out all changes of the {CAUSES[name]} of single frames."

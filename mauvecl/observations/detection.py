@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.observations.event_fits import flares_of
-from mauvecl.observations.process import Binned, Process, criterion_of_process, fit_process
+from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import REACH
@@ -58,26 +57,19 @@ NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
 STILL_BRIGHT, END_FRAMES = 1.0, 4
 
 
-def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
+def _fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
     """Return a survey with the processes that fit its sums and its flux outside the frames of events, `taken`.
 
-    The terms of `start`, a survey of nearly the same frames, are kept. `steps` reports each fit.
+    The terms of `start`, a survey of nearly the same frames, are kept.
     """
-    quiet = ~taken
-    time, step = survey.stare.start_s[quiet], survey.stare.frame_s
-
-    def fitted(values: Float, variance: Float, before: Process | None) -> Process:
-        return fit_process(Binned.of(time, values[quiet], variance[quiet], step), before, steps)
-
-    processes = tuple(
-        fitted(column, survey.variance, None if start is None else start.processes[k])
-        for k, column in enumerate(survey.sums.T)
-    )
-    flux = processes[0]
+    quiet, fitted = ~taken, []
     # The flux of a light curve is its only sum.
-    if survey.weighted:
-        flux = fitted(survey.flux, survey.variance, None if start is None else start.flux_process)
-    return replace(survey, processes=processes, flux_process=flux)
+    columns = [*survey.sums.T, survey.flux] if survey.weighted else survey.sums.T
+    befores = [None] * len(columns) if start is None else [*start.processes, start.flux_process]
+    for column, before in zip(columns, befores, strict=False):
+        time, values, variance = (each[quiet] for each in (survey.stare.start_s, column, survey.variance))
+        fitted.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), before, steps))
+    return replace(survey, processes=tuple(fitted[: survey.sums.shape[1]]), flux_process=fitted[-1])
 
 
 def fit_quiet_light(
@@ -119,12 +111,12 @@ def light_of_events(survey: SeriesSurvey, taken: Bool) -> list[EventLight]:
     fits = []
     for event in detect_events(survey, PROVISIONAL)[0]:
         flares, scale, photon = flares_of(survey, taken, event)
-        lights = [_light_of(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
-        first, stop = min(rows.start for rows, _ in lights), max(rows.stop for rows, _ in lights)
-        total = np.zeros(stop - first)
-        for rows, flux in lights:
-            total[rows.start - first : rows.stop - first] += flux
-        fits.append(EventLight(event, slice(first, stop), scale * total, photon * total, len(flares)))
+        total = np.zeros(survey.stare.n_frames)
+        every = [_light_of(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
+        for rows, flux in every:
+            total[rows] += flux
+        rows = slice(min(rows.start for rows, _ in every), max(rows.stop for rows, _ in every))
+        fits.append(EventLight(event, rows, scale * total[rows], photon * total[rows], len(flares)))
     return fits
 
 
@@ -147,8 +139,21 @@ def criterion(
     total = min(_criterion_of(survey, fits, every, epsilon) for epsilon in DEPARTURES)
     shapeless = shapeless or not any(process.terms for process in survey.processes)
     if fits and shapeless and survey.sums.shape[1] == 1:
-        alone = sum(_criterion_alone(survey, fit.event, size, fits, further) for fit in fits)
-        total = min(total, _criterion_of(survey, [], ~taken, 0.0) + alone)
+        alone = []
+        for event in (fit.event for fit in fits):
+            rows, added = slice(event.first, event.last + 1), [(1, *_added(survey, [], 0.0))]
+            for others in (fits, further):
+                near = (fit for fit in others if event.first <= fit.event.last and fit.event.first <= event.last)
+                if number := sum(fit.n_flares for fit in near):
+                    added += [(number, *_added(survey, others, epsilon)) for epsilon in DEPARTURES]
+            costs = []
+            for n_flares, light, extra in added:
+                values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
+                data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
+                process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
+                costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
+            alone.append(min(costs))
+        total = min(total, _criterion_of(survey, [], ~taken, 0.0) + sum(alone))
     return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
 
 
@@ -179,26 +184,6 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, 
     return total
 
 
-def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alternatives: Sequence[EventLight]) -> float:
-    """Return the criterion of the frames of an event in a light curve, whose light has a process of its own.
-
-    It is the smallest of those with no flares, and with the flares of each of the alternatives.
-    """
-    rows = slice(event.first, event.last + 1)
-    added = [(1, *_added(survey, [], 0.0))]
-    for fits in alternatives:
-        inside = sum(fit.n_flares for fit in fits if event.first <= fit.event.last and fit.event.first <= event.last)
-        if inside:
-            added += [(inside, *_added(survey, fits, epsilon)) for epsilon in DEPARTURES]
-    costs = []
-    for n_flares, light, extra in added:
-        values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
-        data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
-        process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
-        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
-    return min(costs)
-
-
 def _seen_once(survey: SeriesSurvey) -> bool:
     """Return whether a process is faster than rotation, but too slow to be seen to repeat."""
     span = survey.stare.duration_s
@@ -219,7 +204,7 @@ def alternate(
         # Rounds may come back to the same frames.
         key = taken.tobytes(), before
         if key not in rounds:
-            fitted = fit_processes(survey, taken, before, steps)
+            fitted = _fit_processes(survey, taken, before, steps)
             rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
         fitted, now = rounds[key]
         changed = float((now ^ taken).mean())
@@ -381,10 +366,8 @@ def _extended(
         stop = min(stop, sigma.size - 1, last + int(quiet.sum()) - MIN_QUIET)
         while last < stop and not taken[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > STILL_BRIGHT:
             last += 1
-        start = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0)
-        while (
-            first > start and not taken[first - 1] and sigma[max(0, first - END_FRAMES) : first].mean() > STILL_BRIGHT
-        ):
+        start, ends = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0), END_FRAMES
+        while first > start and not taken[first - 1] and sigma[max(0, first - ends) : first].mean() > STILL_BRIGHT:
             first -= 1
         longer.append((first, last))
     return longer

@@ -1,7 +1,7 @@
 """Fits of flares to an event: posteriors of the equivalent duration for shapes, and departures from them.
 
 Peak and half-width of a single flare are integrated on a grid, amplitudes, level and departures in closed form; the
-shapes of `families` and departures are averaged with the weights of their marginal likelihoods. Several flares of a
+families of shapes and departures are averaged with the weights of their marginal likelihoods. Several flares of a
 published shape are fitted by least squares, and their errors are those of the linearised model. Priors are flat in the
 peak and in the logarithms of half-width and amplitude.
 """
@@ -17,8 +17,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.flares.shapes import Shape
-from mauvecl.observations.event_windows import Family, FittedFlare, Likelihood, Profile, Window, families
+from mauvecl.flares.shapes import SHAPES, Shape
+from mauvecl.observations.event_windows import GENERAL_WEIGHT, Family, FittedFlare, Likelihood, Profile, Window
 
 if TYPE_CHECKING:
     from mauvecl.observations.search import Detection, SeriesSurvey
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+#: Published shapes that are averaged, besides that of the search.
+AVERAGED = ("davenport2014", "tovarmendoza2022")
 #: Logarithm of the weight of a part of a mixture that is neglected.
 LEAST_LOG_WEIGHT = -18.5
 #: Size of the cells in which parts of a mixture are joined, in standard deviations and in the logarithm of these.
@@ -116,22 +118,22 @@ class Fit:
 
 def fit_event(window: Window, searched: Shape) -> list[Fit]:
     """Fit an event by a single flare of each family, and by several flares of each published shape that needs them."""
-    *published, general = families(searched)
-    first = {family.name: _first_fit(window, family) for family in published}
+    shapes = {shape.name: shape for shape in (searched, *(SHAPES[name] for name in AVERAGED))}
+    published = [Family.of(shape, (1 - GENERAL_WEIGHT) / len(shapes)) for shape in shapes.values()]
+    first = [_first_fit(window, family) for family in published]
     fits = []
-    for family in published:
-        grid = first[family.name]
+    for family, grid in zip(published, first, strict=True):
         shape, flare = grid.best
         fits += _single(window, family, shape, flare, grid.box, grid)
         several = _further(window, shape, [flare])
         if len(several) > 1:
             fits += _several(window, family, several)
-    best = max(first.values(), key=lambda grid: float(scipy.special.logsumexp(grid.log)))
-    boxes = np.array([grid.box for grid in first.values()])
+    best = max(first, key=lambda grid: float(scipy.special.logsumexp(grid.log)))
+    boxes = np.array([grid.box for grid in first])
     low, high = boxes[..., 0].min(axis=0), boxes[..., 1].max(axis=0)
     # The range contains all of these, and half as much on each side.
     wide = np.column_stack([low - (high - low) / 2, high + (high - low) / 2])
-    return fits + _single(window, general, *best.best, wide)
+    return fits + _single(window, Family.general(), *best.best, wide)
 
 
 def flares_of(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[list[FittedFlare], float, float]:
@@ -378,16 +380,14 @@ def _single(
                 break
         box = grid.box
         shape, flare = grid.best
-        toward = likelihood.inverse @ likelihood.departure
-        per_amplitude = grid.half_widths_s * family.durations[grid.shape] - grid.along(toward)
+        per_amplitude = grid.half_widths_s * family.durations[grid.shape] - grid.along(likelihood.toward)
         in_level = grid.along(likelihood.level)
         level = float(window.values @ likelihood.level) - grid.amplitude * in_level
         level = np.where(level > 0, level, window.quiet_level)
-        mean = (grid.amplitude * per_amplitude + float(toward @ window.values)) / level
-        left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
+        mean = (grid.amplitude * per_amplitude + float(likelihood.toward @ window.values)) / level
         # Durations are relative to the level, which is lower where the flare is brighter.
         along = per_amplitude + mean * in_level
-        sd = np.sqrt(along**2 / grid.information + left + mean**2 * likelihood.level_variance) / level
+        sd = np.sqrt(along**2 / grid.information + likelihood.left + mean**2 * likelihood.level_variance) / level
         constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
         prior = float(np.log(family.prior / len(family.epsilon)))
         fits.append(Fit(Mixture(grid.log + constant + prior, mean, sd), shape, [flare], epsilon))
@@ -418,16 +418,13 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
         wide[1::3] = [2 * f.half_width_s for f in flares]
         covariance = np.linalg.inv(slopes @ likelihood.inverse @ slopes.T + np.diag(wide**-2.0))
         total = np.array([f.equivalent_duration_s for f in flares])
-        gradient = np.zeros(parameters.size)
-        gradient[0::3] = gradient[2::3] = total
-        toward = likelihood.inverse @ likelihood.departure
-        along = gradient - slopes @ toward
         level = float(likelihood.level_without(light))
-        mean = float(total.sum() + toward @ (window.values - light)) / level
+        mean = float(total.sum() + likelihood.toward @ (window.values - light)) / level
         # Durations are relative to the level, which is lower where the flares are brighter.
-        along += mean * (slopes @ likelihood.level)
-        left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
-        variance = float(along @ covariance @ along) + left + mean**2 * likelihood.level_variance
+        along = slopes @ (mean * likelihood.level - likelihood.toward)
+        along[0::3] += total
+        along[2::3] += total
+        variance = float(along @ covariance @ along) + likelihood.left + mean**2 * likelihood.level_variance
         # As the grid of a single flare, without the factor of one amplitude.
         log = likelihood.log_factor - 0.5 * float(likelihood.chi2(light)) + prior
         log += 0.5 * float(np.linalg.slogdet(covariance)[1]) + (3 * n - 1) / 2 * np.log(2 * np.pi)

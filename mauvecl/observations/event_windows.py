@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-#: Published shapes that are averaged, besides that of the search.
-AVERAGED = ("davenport2014", "tovarmendoza2022")
 #: Departures from a shape that are averaged (assumed); a flare of the general family is never exactly of its shapes.
 EPSILON, GENERAL_EPSILON = (0.0, 0.02, 0.06, 0.2), (0.04, 0.1, 0.2)
 #: Widths of the Gaussian rises and decays of the general family from half maximum to maximum, in half-widths (assumed).
@@ -62,41 +60,23 @@ class Half:
 
     def before(self, tau: ArrayLike) -> Float:
         """Return the integral up to tau."""
-        return self._rest(tau) if self.decays else self._own(tau)
+        return self._integral(tau, whole=not self.decays)
 
     def after(self, tau: ArrayLike) -> Float:
         """Return the integral from tau on."""
-        return self._own(tau) if self.decays else self._rest(tau)
+        return self._integral(tau, whole=self.decays)
 
-    def _own(self, tau: ArrayLike) -> Float:
-        return self.integral(np.maximum(tau, 0.0) if self.decays else np.minimum(tau, 0.0))
-
-    def _rest(self, tau: ArrayLike) -> Float:
-        """Return the integral between the peak and tau."""
-        t = np.asarray(tau, np.float64)
-        shines = t > 0 if self.decays else t < 0
-        return self._own(0.0) - self._own(t) if shines.any() else np.zeros(t.shape)
+    def _integral(self, tau: ArrayLike, whole: bool) -> Float:
+        """Return the `whole` integral on the far side of tau from the peak, or that between the peak and tau."""
+        t = np.asarray(np.maximum(tau, 0.0) if self.decays else np.minimum(tau, 0.0))
+        if whole:
+            return self.integral(t)
+        return self.integral(np.zeros(())) - self.integral(t) if t.any() else np.zeros(t.shape)
 
 
 def _exponential(rate: float) -> Half:
     """Return an exponential decay with a rate per half-width."""
     return Half(lambda tau: np.asarray(np.exp(-rate * tau) / rate), decays=True)
-
-
-def _exponentials(rates: Float) -> tuple[list[Half], Float]:
-    """Return exponentials of few rates, and their weights in those of many, shape (n_rate, n_few).
-
-    An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
-    """
-    middle, half = np.log(rates[[0, -1]].prod()) / 2, np.log(rates[-1] / rates[0]) / 2
-    points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
-    # The barycentric weights of Chebyshev points are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715,
-    # equation 5.4); scipy would compute them with the points in a random order, which changes the last bits.
-    barycentric = (-1.0) ** np.arange(EXPONENTIALS)
-    barycentric[[0, -1]] /= 2
-    interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
-    weights = interpolate(np.log(rates))
-    return [_exponential(float(rate)) for rate in np.exp(points)], np.asarray(weights)
 
 
 def _gaussian(tau: Float, width: float) -> Float:
@@ -149,7 +129,15 @@ class Family:
         rises = [Half(SHAPES["davenport2014"].before), *(Half(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES)]
         gaussian = Half(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
-        slow, interpolated = _exponentials(SLOW_RATES)
+        # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points,
+        # whose barycentric weights are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715, equation 5.4);
+        # scipy would compute them with the points in a random order, which changes the last bits.
+        middle, half = np.log(SLOW_RATES[[0, -1]].prod()) / 2, np.log(SLOW_RATES[-1] / SLOW_RATES[0]) / 2
+        points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
+        barycentric = (-1.0) ** np.arange(EXPONENTIALS)
+        barycentric[[0, -1]] /= 2
+        interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
+        slow, interpolated = [_exponential(float(rate)) for rate in np.exp(points)], interpolate(np.log(SLOW_RATES))
         choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
         # Each share has the same weight: without a slow decay, its rate does not matter.
         rates = np.array([1.0 if share == 0 else 1 / SLOW_RATES.size for share, _ in choices])
@@ -171,13 +159,6 @@ class Family:
         """Return one of the shapes."""
         return WeightedSum(self.name, tuple((float(w), part) for w, part in zip(self.weights[k], self.parts,
                                                                                  strict=True) if w))  # fmt: skip
-
-
-def families(searched: Shape) -> Sequence[Family]:
-    """Return the families that are averaged for a search with some shape, that of many shapes last."""
-    published = {shape.name: shape for shape in (searched, *(SHAPES[name] for name in AVERAGED))}
-    prior = (1 - GENERAL_WEIGHT) / len(published)
-    return [*(Family.of(shape, prior) for shape in published.values()), Family.general()]
 
 
 Profile = Shape | WeightedSum
@@ -335,8 +316,8 @@ class Likelihood:
     inverse: Float  # shape (n, n)
     log_factor: float  # of the likelihood, without the constant
     # Of the integral of the departures of the flares from their shape, in amplitude x s.
-    departure: Float  # shape (n,); covariance with the values
-    variance: float
+    toward: Float  # shape (n,); weights of the values in it
+    left: float  # its variance given the values
     # Weights of the values in the level of the star at the peak, and its variance with a known flare, relative to the
     # level; zero where the values are not its light.
     level: Float  # shape (n,)
@@ -372,14 +353,16 @@ class Likelihood:
         level, level_variance = np.zeros(n), 0.0
         if len(window.survey.bank.directions) == 1:
             at = int(np.argmin(np.abs(window.middle - window.one.peak_s)))
-            toward = inverse @ window.process[at]
+            by_values = inverse @ window.process[at]
             rest = 1.0 - float(window.process[at] @ ones)
-            level = (toward + rest * ones / total) / window.scale
-            known = float(window.process[at, at] - window.process[at] @ toward) + rest**2 / total
+            level = (by_values + rest * ones / total) / window.scale
+            known = float(window.process[at, at] - window.process[at] @ by_values) + rest**2 / total
             level_variance = max(known, 0.0) / window.scale**2
         inverse = inverse - ones[:, None] * ones / total
         log_factor = -float(np.log(np.diag(factor)).sum()) - 0.5 * float(np.log(total))
-        return cls(window, inverse, log_factor, shared, variance, level, level_variance)
+        toward = inverse @ shared
+        left = max(variance - float(toward @ shared), 0.0)
+        return cls(window, inverse, log_factor, toward, left, level, level_variance)
 
     def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
         """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).

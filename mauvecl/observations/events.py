@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -15,11 +15,8 @@ from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.process import UNREPORTED, Process, Steps
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
-
-if TYPE_CHECKING:
-    from mauvecl.observations.process import Process
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -70,7 +67,7 @@ class Energy:
     @property
     def p_value(self) -> float:
         """Probability of a chi-squared at least as large."""
-        return _p_value(self.chi2, self.dof)
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
 
     @property
     def poor(self) -> bool:
@@ -78,31 +75,29 @@ class Energy:
         return self.p_value < POOR
 
 
-def _p_value(chi2: float, dof: int) -> float:
-    return float(scipy.stats.chi2.sf(chi2, dof)) if dof > 0 else float("nan")
-
-
 def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: Detection) -> Energy:
     """Measure the equivalent duration of an event; the arguments are those of `measure_event`."""
     peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
     level = float(flux_level[peak]) * survey.scale / survey.level
     window = replace(Window.of(survey, taken, one), quiet_level=level if level > 0 else 1.0)
-    directions = _directions(survey, taken, one)
     fits = fit_event(window, survey.bank.shape)
     totals = np.array([fit.mixture.log_total for fit in fits])
     best = fits[int(np.argmax(totals))]
     plain, model = _without_departures(window, best)
     chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
     mixtures = [fit.mixture for fit in fits]
-    if _p_value(chi2, dof) < POOR:
-        mixtures = _tempered(window, best, mixtures)
+    if scipy.stats.chi2.sf(chi2, dof) < POOR:
+        # What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the
+        # event (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
+        place = log_time(window.middle[window.inside], best.flares[0])
+        power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
+        mixtures = [replace(m, log_weight=m.log_weight + (power - 1) * (m.log_total - totals.max())) for m in mixtures]
     mixture = joined(mixtures)
     share = np.exp(np.array([one.log_total for one in mixtures]) - mixture.log_total)
     published = [fit for fit in fits if fit.shape.name != GENERAL]
-    if len(directions) > 1:
-        # Flares of other temperatures have another light for the same sum.
-        mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
-                           for weight, factor in directions])  # fmt: skip
+    # Flares of other temperatures have another light for the same sum.
+    mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
+                      for weight, factor in _directions(survey, taken, one)])  # fmt: skip
     level = float(plain.level_without(model))
     summed, error = _summed(survey, taken, flux_level, one)
     ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
@@ -120,18 +115,6 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
 def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
     """Return the likelihood of flares without departures from their shape, and their light in the bins, shape (n,)."""
     return Likelihood.of(window, fit.flares, fit.shape, 0.0), light_of(window, fit.shape, fit.flares)
-
-
-def _tempered(window: Window, best: Fit, mixtures: Sequence[Mixture]) -> list[Mixture]:
-    """Weaken the preference among fits of an event that no shape fits without departures.
-
-    What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the event
-    (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
-    """
-    place = log_time(window.middle[window.inside], best.flares[0])
-    power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
-    top = max(one.log_total for one in mixtures)
-    return [replace(one, log_weight=one.log_weight + (power - 1) * (one.log_total - top)) for one in mixtures]
 
 
 def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:

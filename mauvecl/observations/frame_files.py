@@ -91,7 +91,7 @@ def read_frames(
     """
     with _frame_file(path, mapping, check=not ignore_checksum) as (file, how, stem):
         if raw and mapping is None and isinstance(file, StoredFile):
-            how = file.raw_mapping
+            how = file.mapping(raw=True)
         if quality_bits is not None:
             how = how.model_copy(update={"quality_bits": quality_bits})
         return _frames_in(file, how, stem)
@@ -119,36 +119,25 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         if not all(hasattr(container, name) for name in names) or time is None or len(container.flux.shape) != 2:
             raise InputError.of("container", type(container).__name__, "a table with times, or spectra of shape "
                                 "(n_frame, n_pixel) with flux, spectral_axis and `time`")  # fmt: skip
-        masked = getattr(container, "mask", None)
-        mask = np.zeros(container.flux.shape, np.bool_) if masked is None else np.asarray(masked, np.bool_)
-        columns: dict[str, Any] = {"time": time, "flux": np.ma.MaskedArray(container.flux.value, mask)}
-        if getattr(container, "uncertainty", None) is not None:
-            columns["flux_err"] = np.asarray(container.uncertainty.represent_as(StdDevUncertainty).array, np.float64)
+        masked, uncertainty = (getattr(container, name, None) for name in ("mask", "uncertainty"))
+        flux = np.ma.MaskedArray(container.flux.value, False if masked is None else masked)
         nm = container.spectral_axis.to_value("nm", equivalencies=u.spectral())
-        columns["wavelength"] = np.tile(nm, (len(columns["flux"]), 1))
-        container = Table(
-            columns, meta=dict(container.meta or {}), units={"flux": container.flux.unit, "wavelength": "nm"}
-        )
-        mapping = FrameMapping(time="time", flux="flux", wavelength="wavelength",
-                               error="flux_err" if "flux_err" in columns else None)  # fmt: skip
+        columns: dict[str, Any] = {"time": time, "flux": flux, "wavelength": np.tile(nm, (len(flux), 1))}
+        if uncertainty is not None:
+            columns["error"] = np.asarray(uncertainty.represent_as(StdDevUncertainty).array, np.float64)
+        units = {"flux": container.flux.unit, "wavelength": "nm"}
+        container = Table(columns, meta=dict(container.meta or {}), units=units)
+        mapping = FrameMapping(**dict(zip(columns, columns, strict=True)))
     file = MemoryTable(container, type(container).__name__)
     return _frames_in(file, mapping or recognised(file), str(container.meta.get("LABEL", "frames")))
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedFrames:
-    """Spectra reduced to weighted sums.
+    """Spectra reduced to weighted sums."""
 
-    Attributes
-    ----------
-    light_curves : tuple of Frames
-        One for each row of the weights.
-    pixels : PixelStatistics
-        Light and noise of each pixel of the file.
-    """
-
-    light_curves: tuple[Frames, ...]
-    pixels: PixelStatistics
+    light_curves: tuple[Frames, ...]  #: one for each row of the weights
+    pixels: PixelStatistics  #: light and noise of each pixel of the file
 
 
 @validated
@@ -171,12 +160,8 @@ def reduce_frames(
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
         given = None if weights is None else np.asarray(weights, np.float64)
         quality = _masked(found.quality, QualityBits.of(file.header, how.quality_bits, file.what))
-        sums = weighted_sums(flux, error, quality, given)
-        curves = tuple(
-            _frames_in(file, how, stem, lambda *_, k=k: sums.light(k, flux.what, quality))
-            for k in range(sums.sums.shape[1])
-        )
-        return ReducedFrames(curves, sums.pixels)
+        lights, pixels = weighted_sums(flux, error, quality, given)
+        return ReducedFrames(tuple(_frames_in(file, how, stem, lambda *_, one=one: one) for one in lights), pixels)
 
 
 @dataclass(frozen=True)
@@ -220,7 +205,7 @@ def _frame_file(
             open_one = partial(_opened, name=name, check=check)
             opened = nullcontext(FolderFile(place, how, what, lambda one: open_one(one, f"file {one.name!r}")))
         with opened as file:
-            yield file, how or (file.mapping if isinstance(file, StoredFile) else recognised(file)), place.stem
+            yield file, how or (file.mapping() if isinstance(file, StoredFile) else recognised(file)), place.stem
 
 
 def _opened(
@@ -284,23 +269,21 @@ class Quantities:
         place = np.empty(counts.shape, np.int64)
         place[frame, pixel] = np.arange(frame.size)
 
-        def spectra(values: Values) -> Values:
-            return Values.of(values.name, values.numbers()[place], values.unit, what)
+        def spectra(values: Any) -> Any:
+            return values and Values.of(values.name, values.numbers()[place], values.unit, what)
 
-        def single(values: Values) -> Values:
+        def single(values: Any) -> Any:
+            if values is None:
+                return None
             rows = _keys(values)[place]
             if (rows != rows[:, :1]).any():
                 raise InputError(f"{what}: {values.name!r} must not change within a frame", key=values.name)
             return Values.of(values.name, rows[:, 0], values.unit, what)
 
-        parts: dict[str, Any] = {
-            "time": tuple(map(single, self.time)),
-            "wavelength": Values.of(wavelength.name, pixels, wavelength.unit, what),
-        }
-        for name in ("flux", "error", "quality", "exposure", "temperature"):
-            values, change = getattr(self, name), single if name in ("exposure", "temperature") else spectra
-            parts[name] = None if values is None else change(values)
-        return Quantities(**parts)
+        flux, error, quality = map(spectra, (self.flux, self.error, self.quality))
+        exposure, temperature = map(single, (self.exposure, self.temperature))
+        nm = Values.of(wavelength.name, pixels, wavelength.unit, what)
+        return Quantities(tuple(map(single, self.time)), flux, error, quality, exposure, temperature, nm)
 
 
 def _keys(values: Values) -> NDArray[Any]:
@@ -337,8 +320,8 @@ def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
     return file.find(mapping.wavelength)
 
 
-def _number_of_rows(file: TableFile, found: Quantities) -> int:
-    """Return the number of frames before any is read; raise InputError unless all columns have as many."""
+def _check_rows(file: TableFile, found: Quantities) -> None:
+    """Raise InputError unless all columns have one row, or spectrum, for each frame, before any is read."""
     what, n = file.what, found.time[0].n_rows
     if not 0 < n <= MAX_FRAMES:
         expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
@@ -360,33 +343,32 @@ def _number_of_rows(file: TableFile, found: Quantities) -> int:
             "give a light curve, such as lightkurve's `to_lightcurve` makes",
             key="flux",
         )
-    return n
 
 
-def _temperature_c(file: TableFile, found: Quantities, mapping: FrameMapping, n: int) -> Float | None:
-    """Return the detector temperature of each frame, from a column or the header, or None."""
-    if found.temperature is not None:
-        return converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit").numbers().reshape(n)
-    nominal = file.header.get("CCD-TEMP")
-    return np.full(n, float(nominal)) if isinstance(nominal, int | float) else None
+def _conditions(
+    file: TableFile, found: Quantities, mapping: FrameMapping, exposure: Float | None
+) -> dict[str, Float | None]:
+    """Return exposure times and temperatures of frames, by columns, the mapping or the header; None if unknown.
 
-
-def _exposure_s(file: TableFile, found: Quantities, mapping: FrameMapping, between_edges: Float | None) -> Float | None:
-    """Return the exposure time of each frame by a column, the mapping, the header or the edges of frames, or None."""
-    n = found.time[0].n_rows
-    if found.exposure is not None:
-        return converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
-    one = mapping.exposure_s or _brite_exposure_s(file)
-    return between_edges if one is None else np.full(n, one)
-
-
-def _brite_exposure_s(file: TableFile) -> float | None:
-    """Return the exposure time in the header of BRITE's light curves, in milliseconds for each image of a stack."""
+    The `exposure` is that between the edges of frames, if the times have these.
+    """
+    n, nominal = found.time[0].n_rows, file.header.get("CCD-TEMP")
+    temperature: Float | None = None
     try:
-        found = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
+        # The header of BRITE's light curves has milliseconds for each image of a stack.
+        stated = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
     except (KeyError, ValueError):
-        return None
-    return found if 0.0 < found < np.inf else None
+        stated = 0.0
+    if found.exposure is not None:
+        exposure = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+    elif 0.0 < (one := mapping.exposure_s or stated) < np.inf:
+        exposure = np.full(n, one)
+    if found.temperature is not None:
+        celsius = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit")
+        temperature = celsius.numbers().reshape(n)
+    elif isinstance(nominal, int | float):
+        temperature = np.full(n, float(nominal))
+    return {"exposure_s": exposure, "temperature_c": temperature}
 
 
 def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float | None, str, list[str]]:
@@ -413,9 +395,9 @@ def _frames_in(
     """Build frames from a file and the names of its quantities; `read` returns their light."""
     what, header = file.what, file.header
     found = Quantities.of(file, mapping)
-    n = _number_of_rows(file, found)
+    _check_rows(file, found)
     time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
-    each: dict[str, Any] = {"exposure_s": _exposure_s(file, found, mapping, between_edges_s)}
+    each: dict[str, Any] = {**_conditions(file, found, mapping, between_edges_s)}
     bits = QualityBits.of(header, mapping.quality_bits, what)
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
     light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)
@@ -426,7 +408,7 @@ def _frames_in(
     if n_left := int(np.count_nonzero(~kept)):
         words = "1 row has no time and was" if n_left == 1 else f"{n_left} rows have no time and were"
         remarks += (f"{what}: {words} left out",)
-    each |= {"error": sd, "temperature_c": _temperature_c(file, found, mapping, n)}
+    each["error"] = sd
     each["quality"] = None if flags is None else np.where(np.isfinite(flags), flags, bits.mask & -bits.mask)
     made = Frames.of(
         time[kept],
@@ -480,11 +462,10 @@ def _read_light(
 
 def _check_one_source(file: TableFile) -> None:
     """Raise InputError if a column says that the rows are of several bands or stars."""
-    for name in file.columns:
-        if key_of(name) not in GROUPS or len((values := file.find(name)).shape) != 1:
-            continue
-        texts = values.texts()
-        cells = [str(one) for one in np.unique(values.numbers())] if texts is None else texts
+    groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS]
+    for values in (one for one in groups if len(one.shape) == 1):
+        name, texts = values.name, values.texts()
+        cells = map(str, np.unique(values.numbers())) if texts is None else texts
         held = sorted({cell for cell in cells if not is_missing(cell)})
         # The filter of ATLAS is called F, as is the light of others.
         if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):

@@ -156,15 +156,6 @@ class FrameModel:
             messages=(),
         )
 
-    def flares_of(self, n_frames: int) -> FlareModel:
-        """Return the model of flares in the sum of some frames, with one pixel for each value, in DN."""
-        binned = replace(self.flare, hot=self.flare.hot @ self.bins.T, fixed=self.flare.fixed @ self.bins.T)
-        return binned.stacked(n_frames)
-
-    def part(self, kept: NDArray[np.bool_]) -> FrameModel:
-        """Return the model of some of the values."""
-        return replace(self, bins=self.bins[kept], per_dn=self.per_dn[kept])
-
 
 def _per_flam(unit: str, wavelength_nm: Float) -> Float | None:
     """Return a flux density of 1 erg s-1 cm-2 nm-1 in a unit, shape (n_value,); None if it is not one."""
@@ -287,7 +278,7 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
     if not fine.any() or not usable.any():
         raise InputError(f"{frames.name}: at least one pixel must be finite in every frame, but none is", key="flux")
-    model = model.part(fine)
+    model = replace(model, bins=model.bins[fine], per_dn=model.per_dn[fine])
     assert frames.wavelength_nm is not None
     flux = frames.flux[:, fine]
     saturated = usable & (flux >= model.ceiling).any(axis=1)

@@ -61,7 +61,18 @@ class QualityBits:
         mission = "Kepler" if said & {"KEPLER", "K2"} else "TESS" if "TESS" in said else ""
         if chosen is None or str(chosen).strip().lower() == "default":
             return cls(DEFAULTS.get(mission, ALL_BITS), mission, NOTED.get(mission, 0))
-        return cls(_mask(chosen, NAMES.get(mission, {}), what), mission)
+        names, mask = NAMES.get(mission, {}), 0
+        by_name = {name.lower(): bit for bit, name in names.items()} | {"all": ALL_BITS, "none": 0}
+        words = [word for word in re.split(r"[\s,;|+]+", str(chosen).strip()) if word]
+        for word in words or [str(chosen)]:
+            if word.isascii() and word.isdigit() and len(word) < 19:
+                mask |= int(word)
+            elif word.lower() in by_name and (len(words) == 1 or word.lower() not in ("all", "none")):
+                mask |= by_name[word.lower()]
+            else:
+                known = f"names among {', '.join(names.values())}" if names else "for Kepler, K2 and TESS names"
+                raise InputError.of("quality_bits", word, f"all, none, default, or numbers, and {known}", where=what)
+        return cls(mask, mission)
 
     def excluded(self, quality: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which frames a chosen bit excludes."""
@@ -87,29 +98,11 @@ class QualityBits:
 
 def decimal_flags(flags: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return flags as numbers; those that lightkurve 2 writes into CSV are the digits of binary numbers."""
-    finite = flags[np.isfinite(flags)]
-    if not (finite.size and finite.max() >= 2**32):
+    values, place = np.unique(flags, return_inverse=True)
+    texts = {value: f"{value:.0f}" for value in values[np.isfinite(values)].tolist()}
+    if max(texts, default=0.0) < 2**32 or set("".join(texts.values())) - {"0", "1"}:
         return flags
-    texts = {value: f"{value:.0f}" for value in np.unique(finite).tolist()}
-    if any(set(text) - {"0", "1"} for text in texts.values()):
-        return flags
-    return np.array([float(int(texts[value], 2)) if value in texts else value for value in flags.tolist()])
-
-
-def _mask(chosen: str | int, names: Mapping[int, str], what: str) -> int:
-    """Return the sum of the bits that a text or number chooses."""
-    by_name = {name.lower(): bit for bit, name in names.items()} | {"all": ALL_BITS, "none": 0}
-    words = [word for word in re.split(r"[\s,;|+]+", str(chosen).strip()) if word]
-    mask = 0
-    for word in words or [str(chosen)]:
-        if word.isascii() and word.isdigit() and len(word) < 19:
-            mask |= int(word)
-        elif word.lower() in by_name and (len(words) == 1 or word.lower() not in ("all", "none")):
-            mask |= by_name[word.lower()]
-        else:
-            known = f"names among {', '.join(names.values())}" if names else "for Kepler, K2 and TESS names"
-            raise InputError.of("quality_bits", word, f"all, none, default, or numbers, and {known}", where=what)
-    return mask
+    return np.array([float(int(texts[one], 2)) if one in texts else one for one in values.tolist()])[place]
 
 
 Float = NDArray[np.float64]
@@ -139,14 +132,14 @@ class Reason(IntFlag):
     LOSS = 32  #: light is suddenly lost for some frames, as by pointing losses and eclipses
 
     @classmethod
-    def words(cls, value: int) -> str:
-        """Return the reasons in words."""
-        return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
+    def words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
+        """Return the reasons of frames in words."""
 
-    @classmethod
-    def all_words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
-        """Return the reasons of many frames in words."""
-        return np.array([*map(cache(cls.words), values.tolist())], np.str_)
+        @cache
+        def words(value: int) -> str:
+            return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
+
+        return np.array([*map(words, values.tolist())], np.str_)
 
 
 def _check_light(name: str, time: Float, light: Float) -> None:
@@ -161,16 +154,6 @@ def _check_light(name: str, time: Float, light: Float) -> None:
     if not np.isfinite(time).all():
         raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
                    "finite times")  # fmt: skip
-
-
-def _whole_flags(name: str, quality: ArrayLike | None, n: int) -> NDArray[np.int64]:
-    """Return the quality flags of frames, zero without any; raise InputError if they are no whole numbers."""
-    if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
-        raise _bad(name, "quality", "a value that is not finite", "whole numbers")
-    flags = np.zeros(n, np.int64) if quality is None else np.asarray(quality, np.int64)
-    if flags.shape != (n,):
-        raise _bad(name, "quality", flags.shape, f"({n},)")
-    return flags
 
 
 def _cadence_of(name: str, time: Float) -> float:
@@ -188,78 +171,29 @@ def _cadence_of(name: str, time: Float) -> float:
     return cadence
 
 
-def _exposures(name: str, given: ArrayLike | None, n: int, cadence: float) -> Float:
-    """Return the exposure time of each frame, by default the cadence; raise InputError for an impossible one."""
-    if given is not None and np.shape(given) not in ((), (1,), (n,)):
-        raise _bad(name, "exposure", np.shape(given), f"one exposure time, or one for each of {n} frames")
-    exposure = np.array(np.broadcast_to(np.asarray(cadence if given is None else given, np.float64), (n,)))
-    if not (np.isfinite(exposure) & (exposure > 0)).all():
-        raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-    return exposure
-
-
 @validated
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Observed frames of one star.
+    """Observed frames of one star."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (n_frame,)
-        Middle of each frame, in seconds from `reference_mjd`; ascending.
-    exposure_s : ndarray, shape (n_frame,)
-        Exposure time of each frame.
-    flux : ndarray, shape (n_frame,) or (n_frame, n_pixel)
-        Light in `unit`.
-    error : ndarray of the same shape, or None
-        Standard deviation of each value.
-    quality : ndarray, shape (n_frame,)
-        Zero for frames without a known fault.
-    quality_mask : int
-        Bits of `quality` that exclude a frame; by default all.
-    mission : str
-        Mission whose names the bits have, "Kepler" (and K2) or "TESS"; empty for other files.
-    wavelength_nm : ndarray, shape (n_pixel,), or None
-    temperature_c : ndarray, shape (n_frame,), or None
-        Temperature of the detector.
-    unit : str
-        Unit of the flux, in astropy's notation; empty if it is relative or unknown.
-    reference_mjd : float or None
-        Modified Julian date of time zero; None if the times have no date.
-    scale : str
-        Time scale of the dates, such as "utc" or "tdb"; empty if unknown.
-    position : str
-        Where the times are measured, in words of FITS TREFPOS, as "TOPOCENTER" or "BARYCENTER"; empty if unknown.
-    direction_deg : (float, float) or None
-        Right ascension and declination (ICRS) that barycentric times refer to.
-    name : str
-        Name of the star or the file.
-    instrument : str
-        Name of the instrument; empty if unknown.
-    net : bool
-        Whether dark current and bias are known to be subtracted, as from raw spectra that `mauvecl realise` wrote.
-    remarks : tuple of str
-        What was done while reading, such as sorting.
-    """
-
-    time_s: Annotated[Float, Unit("s")]
-    exposure_s: Annotated[Float, Unit("s")]
-    flux: Float
-    error: Float | None = None
-    quality: NDArray[np.int64] | None = None
-    quality_mask: int = ALL_BITS
-    mission: str = ""
-    wavelength_nm: Annotated[Float, Unit("nm")] | None = None
-    temperature_c: Annotated[Float, Unit("deg_C")] | None = None
-    unit: str = ""
-    reference_mjd: float | None = None
-    scale: str = ""
-    position: str = ""
-    direction_deg: tuple[float, float] | None = None
-    name: str = "frames"
-    instrument: str = ""
-    net: bool = False
-    remarks: tuple[str, ...] = ()
+    time_s: Annotated[Float, Unit("s")]  #: middle of each frame from `reference_mjd`, shape (n_frame,); ascending
+    exposure_s: Annotated[Float, Unit("s")]  #: of each frame, shape (n_frame,)
+    flux: Float  #: light in `unit`, shape (n_frame,) or (n_frame, n_pixel)
+    error: Float | None = None  #: standard deviation of each value, if known
+    quality: NDArray[np.int64] | None = None  #: shape (n_frame,); zero for frames without a known fault
+    quality_mask: int = ALL_BITS  #: bits of `quality` that exclude a frame; by default all
+    mission: str = ""  #: whose names the bits have, "Kepler" (and K2) or "TESS"; empty for other files
+    wavelength_nm: Annotated[Float, Unit("nm")] | None = None  #: shape (n_pixel,), of spectra
+    temperature_c: Annotated[Float, Unit("deg_C")] | None = None  #: of the detector, shape (n_frame,)
+    unit: str = ""  #: of the flux, in astropy's notation; empty if it is relative or unknown
+    reference_mjd: float | None = None  #: Modified Julian date of time zero; None if the times have no date
+    scale: str = ""  #: of the dates, such as "utc" or "tdb"; empty if unknown
+    position: str = ""  #: where the times hold, in words of FITS TREFPOS, as "TOPOCENTER"; empty if unknown
+    direction_deg: tuple[float, float] | None = None  #: right ascension and declination (ICRS) of barycentric times
+    name: str = "frames"  #: of the star or the file
+    instrument: str = ""  #: empty if unknown
+    net: bool = False  #: whether bias and dark current are known to be subtracted, as by `mauvecl realise`
+    remarks: tuple[str, ...] = ()  #: what was done while reading, such as sorting
 
     @classmethod
     def of(
@@ -287,28 +221,31 @@ class Frames:
         **how
             Other attributes.
         """
-        time = np.asarray(time_s, np.float64)
-        light = np.asarray(flux, np.float64)
-        n = time.size
+        time, light = np.asarray(time_s, np.float64), np.asarray(flux, np.float64)
         _check_light(name, time, light)
-        sd = None if error is None else np.asarray(error, np.float64)
-        if sd is not None and sd.shape != light.shape:
-            raise _bad(name, "error", sd.shape, f"the shape of the flux, {light.shape}")
-        flags = _whole_flags(name, quality, n)
-        order = np.argsort(time, kind="stable")
-        remarks: tuple[str, ...] = ()
+        n, order = time.size, np.argsort(time, kind="stable")
+        cadence = _cadence_of(name, time[order])
+        if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
+            raise _bad(name, "quality", "a value that is not finite", "whole numbers")
+        if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
+            raise _bad(name, "exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
+        exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
+        if not (np.isfinite(exposure) & (exposure > 0)).all():
+            raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+        each: dict[str, Any] = {"error": None, "temperature_c": None}
+        for key, given, shape in (
+            ("error", error, light.shape),
+            ("temperature_c", how.pop("temperature_c", None), (n,)),
+            ("quality", np.zeros(n) if quality is None else quality, (n,)),
+        ):
+            if given is not None:
+                values = np.asarray(given, np.int64 if key == "quality" else np.float64)
+                if values.shape != shape:
+                    raise _bad(name, key.removesuffix("_c"), values.shape, f"the shape {shape}")
+                each[key] = values[order]
+        made = cls(time[order], exposure[order], light[order], name=name, **each, **how)
         if (np.diff(time) < 0).any():
-            remarks = (f"the times of {name} are not ascending; its frames were sorted by time",)
-        exposure = _exposures(name, exposure_s, n, _cadence_of(name, time[order]))
-        if how.get("temperature_c") is not None:
-            temperature = np.asarray(how["temperature_c"], np.float64)
-            if temperature.shape != (n,):
-                raise _bad(name, "temperature", temperature.shape, f"({n},)")
-            how["temperature_c"] = temperature[order]
-        made = cls(
-            time[order], exposure[order], light[order], None if sd is None else sd[order], flags[order],
-            name=name, remarks=remarks, **how,
-        )  # fmt: skip
+            made = made.with_remarks((f"the times of {name} are not ascending; its frames were sorted by time",))
         wavelength = made.wavelength_nm
         if (wavelength is None) != (light.ndim == 1) or (wavelength is not None and wavelength.size != light.shape[1]):
             raise _bad(name, "wavelength", None if wavelength is None else wavelength.shape,
@@ -367,9 +304,7 @@ class Frames:
             errors = self.error.reshape(self.n_frames, -1)
             # An error below the rounding of the number is none.
             finite &= (np.isfinite(errors) & (errors > 1e-16 * np.abs(values))).all(axis=1)
-        flagged = np.zeros(self.n_frames, np.bool_)
-        if self.quality is not None:
-            flagged = QualityBits(self.quality_mask).excluded(self.quality)
+        flagged = self.quality is not None and QualityBits(self.quality_mask).excluded(self.quality)
         return np.asarray(np.where(flagged, Reason.QUALITY, 0) | np.where(finite, 0, Reason.NOT_FINITE), np.int64)
 
     @property
@@ -470,7 +405,13 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
         seconds = (when.tdb - first).to_value(u.s) + late
     remark = f"times are at the Solar System's barycentre (TDB) for {target.name} ({target.source})"
     if place is not None:
-        remark += f", {_accuracy(place, when)}"
+        days = float(np.abs(when.utc.jd - place.elements.epoch_jd).max())
+        if place.resolved_at(days) == "mean":
+            off_ms = 1e3 * place.elements.axis_km / LIGHT_KM_S
+            remark += f", good to {off_ms:.0f} ms: the place in the orbit is not known"
+        else:
+            off_ms = 1e3 * place.along_track_km(days) / LIGHT_KM_S
+            remark += f", good to {off_ms:.2g} ms along the track of {place.elements.source}"
     made = replace(frames, time_s=seconds, reference_mjd=float(first.mjd), scale="tdb", position="BARYCENTER")
     return replace(made, direction_deg=(target.ra_deg, target.dec_deg)).with_remarks((remark,))
 
@@ -498,12 +439,3 @@ def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:
             observer = EarthLocation(*earth_fixed.cartesian.xyz)
         star = SkyCoord(target.ra_deg, target.dec_deg, unit="deg")
         return np.asarray(utc.light_travel_time(star, "barycentric", location=observer).to_value(u.s))
-
-
-def _accuracy(orbit: Orbit, when: Time) -> str:
-    """Return the accuracy of the satellite's position, as a part of a sentence."""
-    days = float(np.abs(when.utc.jd - orbit.elements.epoch_jd).max())
-    if orbit.resolved_at(days) == "mean":
-        return f"good to {1e3 * orbit.elements.axis_km / LIGHT_KM_S:.0f} ms: the place in the orbit is not known"
-    off = 1e3 * orbit.along_track_km(days) / LIGHT_KM_S
-    return f"good to {off:.2g} ms along the track of {orbit.elements.source}"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.process import MAX_TRIED, Binned, Process, criterion_of_process, fit_process
-from mauvecl.observations.progress import Steps
+from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
@@ -394,22 +394,18 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
             largest = np.abs(change[max(0, k - side) : k + side + 1]).max()
             if np.abs(change[k]) >= largest and not any(abs(k + side - one) <= side for one in found):
                 found[int(k + side)] = (float(np.abs(change[k])) / usual, float(change[k]))
-    lasting = [one for one in found if _lasts(time_s, flux, one, found[one][1])]
-    places = np.array(sorted(sorted(lasting, key=lambda one: found[one], reverse=True)[:MOST_STEPS]), np.intp)
-    return places, np.array([found[int(one)][1] for one in places])
-
-
-def _lasts(time_s: Float, flux: Float, place: int, size: float) -> bool:
-    """Return whether the median of the light differs days later too, as not after flares, losses and rotation."""
-    start = time_s[place]
-    for length_s in LENGTHS_S:
-        first, later, last = np.searchsorted(time_s, [start - length_s, start + FLARE_S, start + FLARE_S + length_s])
+    lasting = set()
+    for (place, (_, size)), length_s in product(found.items(), LENGTHS_S):
+        # The median of the light differs days later too, as not after flares, losses and rotation.
+        ends = time_s[place] + np.array([-length_s, FLARE_S, FLARE_S + length_s])
+        first, later, last = np.searchsorted(time_s, ends)
         before, after = flux[first:place], flux[later:last]
         if min(before.size, after.size) >= SIDES[0]:
             share = float(np.median(after) - np.median(before)) / size
             if 1 / LASTS < share < LASTS:
-                return True
-    return False
+                lasting.add(place)
+    places = np.array(sorted(sorted(lasting, key=lambda one: found[one], reverse=True)[:MOST_STEPS]), np.intp)
+    return places, np.array([found[int(one)][1] for one in places])
 
 
 def _light_of_steps(n_frames: int, places: Places, sizes: Float) -> Float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,8 +37,7 @@ from mauvecl.observations.level import (
     single_frames,
     spikes,
 )
-from mauvecl.observations.process import Binned, criterion_of_process, fit_process
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.process import UNREPORTED, Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 
@@ -265,7 +264,7 @@ def survey_light_curve(
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
             continue
-        level = interpolate_to_all(frames, used, survey, survey.flux_level(~taken))
+        level = np.interp(frames.time_s, frames.time_s[used], survey.flux_level(~taken) * survey.scale)
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)
         guessed[used] = taken
@@ -277,7 +276,7 @@ def survey_light_curve(
     finite = np.isfinite(flux)
     below = finite & (reasons != 0) & (np.where(finite, flux, 0.0) - level < -FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
-    survey = survey.frames((reasons == 0)[searched_among(survey, frames)])
+    survey = survey.frames((reasons == 0)[np.searchsorted(frames.time_s, survey.time_s)])
     light = quiescent_light(frames, survey, reasons, ~guessed, seed, steps.part(0.9, 1.0))
     return survey, light.times(steps_of_level), frames
 
@@ -301,11 +300,6 @@ def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], 
             # Frames that are not searched have the level of the next one that is.
             level = relative[np.clip(np.searchsorted(at, np.arange(flux.size)), 0, at.size - 1)]
     return frames, counts, reasons, level
-
-
-def searched_among(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:
-    """Return the numbers of a survey's frames among all frames, shape (n_searched,)."""
-    return np.searchsorted(frames.time_s, survey.time_s)
 
 
 def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
@@ -344,11 +338,6 @@ def _noise(
     return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
 
 
-def interpolate_to_all(frames: Frames, used: Bool, survey: SeriesSurvey, values: Float) -> Float:
-    """Return values of the searched frames, `used`, for all frames in the unit of the flux, interpolated between."""
-    return np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
-
-
 def _single(
     frames: Frames, flux: Float, level: Float, sd: Float, used: Bool, events: Bool, counts: float | None
 ) -> NDArray[np.int64]:
@@ -367,14 +356,11 @@ def quiescent_light(
     frames: Frames, survey: SeriesSurvey, reasons: NDArray[np.int64], outside: Bool, seed: int, steps: Steps
 ) -> QuiescentLevel:
     """Return level, its error, and noise of all frames, from those that are searched and `outside` of events."""
-    used, process, time = reasons == 0, survey.flux_process, survey.stare.start_s
-    quiet, for_all = outside[used], partial(interpolate_to_all, frames, used, survey)
-    return QuiescentLevel(
-        for_all(survey.flux_level(quiet)),
-        for_all(level_error(process, time, survey.variance, quiet, seed, steps)),
-        for_all(np.sqrt(survey.variance) * process.excess),
-        process.excess if frames.error is not None else float("nan"),
-        used & outside,
-        reasons,
-        process,
+    used, process = reasons == 0, survey.flux_process
+    quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
+    error = level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
+    level, sd, noise = (
+        np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
+        for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
     )
+    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process)

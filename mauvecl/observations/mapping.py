@@ -42,74 +42,44 @@ class FrameMapping(Record):
 
     A quantity is the name of a column; in FITS files also of an image, or ``EXTENSION/COLUMN``; in a folder of spectra
     also a keyword of each file's header. A pattern such as ``flux_*`` names several columns, one for each pixel.
-
-    Attributes
-    ----------
-    hdu : str or int, optional
-        Extension of a FITS file whose columns are meant; by default the first table.
-    time : str or (str, str)
-        Times, as numbers or ISO 8601 dates; or start and end of each frame; ``wcs`` for the second axis of an image.
-    time_unit : str, optional
-        Unit of the times, if the file does not state it.
-    time_at : {"middle", "start", "end"}, optional
-        Part of the frame that the times refer to; by default the file's TIMEPIXR, or the middle.
-    epoch : str, optional
-        Date of time zero: a name of `EPOCHS_MJD`, or an ISO 8601 date.
-    scale : str, optional
-        Time scale, such as utc or tdb.
-    position : str, optional
-        Place at which the times hold, as in FITS: TOPOCENTER, GEOCENTER or BARYCENTER.
-    flux : str
-        The light: rate, counts or flux density, with any linear unit, one value or one spectrum for each frame. If a
-        column of wavelengths has as many rows, each row is one pixel of one frame.
-    flux_unit : str, optional
-        Unit of the light, if the file does not state it.
-    error, quality, exposure, temperature : str, optional
-        Frames with a bit of `quality_bits` in their quality are not searched; neither are pixels with one, where there
-        is one for each pixel.
-    quality_bits : str or int, optional
-        Bits of the quality that exclude a frame: their sum, "all", "none", or names and numbers such as "Desat, 128".
-        By default lightkurve's default for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all bits for
-        other files.
-    exposure_s : float, optional
-        Exposure time of every frame.
-    exposure_unit, temperature_unit, wavelength_unit : str, optional
-        Units, if the file does not state them. A unit of wavelength may end in " air".
-    wavelength : str, optional
-        Wavelengths of spectra; ``wcs`` for those in the header of an image, ``names`` for numbers in names of columns.
-    wavelength_file : str, optional
-        File of the wavelengths, relative to the mapping; `wavelength` names its column if it has several.
-    table : str, optional
-        Table of the spectra in a folder, relative to it, with times and other quantities of each.
-    files : str
-        In a folder: names of the spectra, with ``*`` for any text; with `table`, its column of the files' names.
-    name : str, optional
-        Name of the star.
     """
 
+    #: Extension of a FITS file whose columns are meant; by default the first table.
     hdu: Annotated[str | int | None, Accepted("a name or number")] = None
+    #: Times, as numbers or ISO 8601 dates; or start and end of each frame; ``wcs`` for the second axis of an image.
     time: Annotated[str | tuple[str, str], Accepted("the name of a column, or of two")]
-    time_unit: str | None = None
+    time_unit: str | None = None  #: unit of the times, if the file does not state it
+    #: Part of the frame that the times refer to; by default the file's TIMEPIXR, or the middle.
     time_at: Literal["middle", "start", "end"] | None = None
-    epoch: str | None = None
-    scale: str = ""
-    position: str = ""
+    epoch: str | None = None  #: date of time zero: a name of `EPOCHS_MJD`, or an ISO 8601 date
+    scale: str = ""  #: time scale, such as utc or tdb
+    position: str = ""  #: place at which the times hold, as in FITS: TOPOCENTER, GEOCENTER or BARYCENTER
+    #: The light: rate, counts or flux density, in any linear unit, one value or one spectrum per frame. If a column
+    #: of wavelengths has as many rows, each row is one pixel of one frame.
     flux: str
-    flux_unit: str | None = None
-    error: str | None = None
+    flux_unit: str | None = None  #: unit of the light, if the file does not state it
+    error: str | None = None  #: standard errors of the light
+    #: Flags; not searched are frames, or pixels if each has a flag, with a bit of `quality_bits`.
     quality: str | None = None
+    #: Bits of the quality that exclude a frame: their sum, "all", "none", or names and numbers such as "Desat, 128". By
+    #: default lightkurve's default for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all for others.
     quality_bits: Annotated[str | int | None, Accepted("text or a whole number")] = None
-    exposure: str | None = None
-    exposure_s: Exposure | None = None
-    exposure_unit: str | None = None
-    temperature: str | None = None
-    temperature_unit: str | None = None
+    exposure: str | None = None  #: exposure times of the frames
+    exposure_s: Exposure | None = None  #: exposure time of every frame
+    exposure_unit: str | None = None  #: unit of the exposure times, if the file does not state it
+    temperature: str | None = None  #: temperatures of the detector
+    temperature_unit: str | None = None  #: unit of the temperatures, if the file does not state it
+    #: Wavelengths of spectra; ``wcs`` for those of an image's header, ``names`` for numbers in names of columns.
     wavelength: str | None = None
+    #: Unit of the wavelengths, which may end in " air", if the file does not state it.
     wavelength_unit: str | None = None
+    #: File of the wavelengths, relative to the mapping; `wavelength` names its column if it has several.
     wavelength_file: str | None = None
+    #: Table of the spectra in a folder, relative to it, with times and other quantities of each.
     table: str | None = None
+    #: In a folder: names of the spectra, with ``*`` for any text; with `table`, its column of the files' names.
     files: str | None = None
-    name: str | None = None
+    name: str | None = None  #: of the star
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -1,4 +1,4 @@
-"""Gaussian process of the quiescent light: rotation, granulation and red noise.
+"""Gaussian process of the quiescent light: rotation, granulation and red noise; and the progress of its fits.
 
 The light without flares is a constant plus a Gaussian process whose covariance is a sum of celerite terms, so that all
 computations take a time proportional to the number of frames (Foreman-Mackey et al. 2017, doi
@@ -9,20 +9,20 @@ information criterion (Schwarz 1978, doi 10.1214/aos/1176344136).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
+Item = TypeVar("Item")
 Kind = Literal["correlated", "smooth", "rotation", "sharp rotation"]
 
 #: Largest number of values to which the parameters of a process are fitted; longer light curves are binned.
@@ -53,8 +53,12 @@ ITERATIONS, CONVERGED = 80, 1e-3
 DIFFERENCE = 1e-8
 #: Largest number of fits one after the other, and the change of log likelihood below which the last one is the best.
 STARTS, SAME = 4, 0.5
-#: Number of parameters of each kind of term.
-SIZES: dict[Kind, int] = {"correlated": 2, "smooth": 2, "rotation": 5, "sharp rotation": 4}
+#: Largest change of the logarithm of a period in a fit, and bounds of the parameters beyond the first two.
+NEAR_PERIOD = 0.4
+BOUNDS: dict[Kind, tuple[tuple[float, float], ...]] = {
+    "correlated": (), "smooth": (), "rotation": ((0.6, 1e4), (1e-2, 1e3), (1e-3, 2.0)),
+    "sharp rotation": ((0.6, 1e4), (0.05, 0.99)),
+}  # fmt: skip
 #: Number of harmonics of sharp rotation, and their first standard deviation over that of the harmonic before.
 HARMONICS, EACH_HARMONIC = 6, 0.5
 #: What these harmonics cost beyond their parameters, so that only very strong evidence prefers them to two (Kass &
@@ -62,6 +66,40 @@ HARMONICS, EACH_HARMONIC = 6, 0.5
 STRONG = 10.0
 #: Largest number of values to which these harmonics are fitted before they replace two in a longer light curve.
 MAX_TRIED = 5000
+#: Share of the rest of an analysis that a step counts as, where the number of steps is not known.
+EACH = 0.07
+
+
+class Steps:
+    """Part of an analysis, which reports the share of the whole that is done.
+
+    `report` is called with shares of the whole, which rise from `first` to `last`; it may raise to stop the work.
+    """
+
+    def __init__(self, report: Callable[[float], None] | None = None, first: float = 0.0, last: float = 1.0) -> None:
+        self._report, self._first, self._last, self._done = report, first, last, 0.0
+
+    def part(self, first: float, last: float) -> Steps:
+        """Return the part between two shares of this one."""
+        length = self._last - self._first
+        return Steps(self._report, self._first + first * length, self._first + last * length)
+
+    def step(self, share: float | None = None) -> None:
+        """Report that a share of this part is done, or another step of an unknown number."""
+        self._done = max(self._done, self._done + EACH * (1.0 - self._done) if share is None else share)
+        if self._report is not None:
+            self._report(self._first + self._done * (self._last - self._first))
+
+    def each(self, items: Iterable[Item], total: int) -> Iterator[Item]:
+        """Yield items, and report after the work on each."""
+        for done, item in enumerate(items, 1):
+            yield item
+            self.step(min(done / total, 1.0))
+        self.step(1.0)
+
+
+#: Steps of work whose progress nobody follows.
+UNREPORTED = Steps()
 
 
 @dataclass(frozen=True)
@@ -172,7 +210,7 @@ class Process:
     @property
     def n_parameters(self) -> int:
         """Number of fitted parameters, with that of the noise."""
-        return 1 + sum(SIZES[term.kind] for term in self.terms)
+        return 1 + sum(len(term.parameters) for term in self.terms)
 
     @property
     def sd(self) -> float:
@@ -228,12 +266,8 @@ class Covariance:
         self._d, self._w = driver.factor(self._time, self._rates, diagonal, self._u, v, diagonal, v)
         if not (self._d > 0).all():
             raise np.linalg.LinAlgError("the covariance is not positive definite")
+        self.log_determinant = float(np.log(self._d).sum())
         self._forms: dict[tuple[int, int], Float] = {}
-
-    @property
-    def log_determinant(self) -> float:
-        """Logarithm of the determinant."""
-        return float(np.log(self._d).sum())
 
     def _solved_lower(self, values: Float) -> Float:
         out = np.array(values.reshape(len(values), -1), np.float64, order="C")
@@ -264,26 +298,20 @@ class Covariance:
         process has. Those more than `after` times later are neglected.
         """
         last = first + len(columns)
-        rows = slice(first, last)
+        rows, rest = slice(first, last), slice(last, last + after)
         time, rates, solve = self._time, self._rates, self._driver.solve_lower
         innovations = solve(time[rows], rates, self._u[rows], self._w[rows], columns, columns)
         total = 0.0
         if last < time.size:
+            if (last, after) not in self._forms:
+                # Innovations of each unit state.
+                units = -self._u[rest] * np.exp((time[last] - time[rest, None]) * rates)
+                units = solve(time[rest], rates, self._u[rest], self._w[rest], units, units)
+                self._forms[last, after] = (units / self._d[rest, None]).T @ units
             decay = np.exp((time[rows, None] - time[last]) * rates)
             state = (decay * self._w[rows]).T @ innovations
-            total = np.einsum("jo,jo->o", state, self._norms_after(last, after) @ state)
+            total = np.einsum("jo,jo->o", state, self._forms[last, after] @ state)
         return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations) + total)
-
-    def _norms_after(self, first: int, number: int) -> Float:
-        """Return the quadratic form of the state before a time that gives the sum of squared innovations from it on."""
-        if (first, number) not in self._forms:
-            rest = slice(first, first + number)
-            time, rates = self._time[rest], self._rates
-            # Innovations of each unit state.
-            units = -self._u[rest] * np.exp((time[0] - time[:, None]) * rates)
-            units = self._driver.solve_lower(time, rates, self._u[rest], self._w[rest], units, units)
-            self._forms[first, number] = (units / self._d[rest, None]).T @ units
-        return self._forms[first, number]
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""
@@ -293,25 +321,18 @@ class Covariance:
         return np.asarray(made).reshape(np.shape(white))
 
 
-@dataclass(frozen=True, eq=False)
-class LevelFit:
-    """Constant level of values under a covariance."""
+def level_fit(covariance: Covariance, values: Float) -> tuple[float, float, Float]:
+    """Return the mean of values by generalised least squares, their log likelihood, and the innovations without it.
 
-    mean: float  # generalised least squares
-    log_likelihood: float
-    left: Float  # shape (n,); innovations of the values less their mean
-
-
-def level_fit(covariance: Covariance, values: Float) -> LevelFit:
-    """Return the mean of values, and their likelihood with the mean integrated over a flat prior."""
+    The likelihood is integrated over a flat prior of the mean.
+    """
     both = np.ones((values.size, 2))
     both[:, 0] = values
     both = covariance.whitened(both)
     information = float(both[:, 1] @ both[:, 1])
     mean = float(both[:, 0] @ both[:, 1]) / information
     left = both[:, 0] - mean * both[:, 1]
-    log_likelihood = -0.5 * (float(left @ left) + covariance.log_determinant + np.log(information))
-    return LevelFit(mean, log_likelihood, left)
+    return mean, -0.5 * (float(left @ left) + covariance.log_determinant + np.log(information)), left
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,11 +362,6 @@ class Binned:
         """Logarithm of this noise over the typical stated one."""
         return float(np.log(max(self.noise / float(np.sqrt(np.median(self.variance))), 1e-6)))
 
-    @cached_property
-    def period_s(self) -> float | None:
-        """Period of the highest peak of the periodogram, or None if it is noise."""
-        return _period(self, self.values, LONGEST)
-
     @classmethod
     def of(cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED) -> Binned:
         """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
@@ -366,7 +382,7 @@ class Binned:
 def criterion_of_process(process: Process, data: Binned, size: float) -> float:
     """Return the Bayesian information criterion of a process, of which a parameter costs `size`."""
     covariance = process.covariance(data.time_s, data.variance * process.excess**2)
-    return process.n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood
+    return process.n_parameters * size - 2 * level_fit(covariance, data.values)[1]
 
 
 def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREPORTED) -> Process:
@@ -379,15 +395,14 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREP
     best, value = _fitted(data, (), data.log_excess)
     tried = {best.name: value}
     while len(best.terms) < MAX_TERMS:
-        size = best.n_parameters
-        options = []
+        size, options = best.n_parameters, []
         for terms in _starts(data, best):
-            if (size + sum(SIZES[term.kind] for term in terms)) * VALUES_PER_PARAMETER <= data.values.size:
-                options.append(_fitted(data, (*best.terms, *terms), data.log_excess))
+            if (size + sum(len(term.parameters) for term in terms)) * VALUES_PER_PARAMETER <= data.values.size:
+                one, bic = _fitted(data, (*best.terms, *terms), data.log_excess)
+                options.append((one, bic))
+                # A combination has several starting points.
+                tried[one.name] = min(bic, tried.get(one.name, np.inf))
                 steps.step()
-        # A combination has several starting points.
-        for one, bic in options:
-            tried[one.name] = min(bic, tried.get(one.name, np.inf))
         other, lowest = min(options, key=lambda pair: pair[1], default=(best, np.inf))
         if not lowest < value:
             break
@@ -415,8 +430,7 @@ def _sharper(data: Binned, process: Process) -> tuple[Process, float] | None:
 def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
     """Yield starting points of a further term, or of rotation with a slower change of the light."""
     covariance = best.covariance(data.time_s, data.variance * best.excess**2)
-    fit = level_fit(covariance, data.values)
-    spread = max(float(np.std(data.values - fit.mean)), data.noise)
+    spread = max(float(np.std(data.values - level_fit(covariance, data.values)[0])), data.noise)
     rotates = any(term.rotates for term in best.terms)
     low, high = SCALES[0] * data.step_s, SCALES[1] * data.span_s
     for scale in (6 * data.step_s, float(np.sqrt(low * high))):
@@ -426,7 +440,7 @@ def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
         return
     smooth = ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
     yield (smooth,)
-    if (period := data.period_s) is None:
+    if (period := _period(data, data.values, LONGEST)) is None:
         return
     for factor in (1.0, 2.0):
         yield (_rotation(spread, factor * period),)
@@ -465,26 +479,16 @@ def _period(data: Binned, values: Float, share: float) -> float | None:
     return float(1.0 / frequency[best]) if chance < PERIODIC else None
 
 
-def _bounds(data: Binned, kind: Kind, start: tuple[float, ...]) -> list[tuple[float, float]]:
-    """Return the bounds of the logarithms of a term's parameters."""
-    sizes = tuple(np.log(data.noise) + np.log(AMPLITUDES))
-    if kind in ("correlated", "smooth"):
-        return [sizes, (np.log(SCALES[0] * data.step_s), np.log(SCALES[1] * data.span_s))]
-    period = start[1]
-    around = (max(period - 0.4, np.log(SHORTEST * data.step_s)), period + 0.4)
-    qualities = (np.log(0.6), np.log(1e4))
-    if kind == "sharp rotation":
-        return [sizes, around, qualities, (np.log(0.05), np.log(0.99))]
-    return [sizes, around, qualities, (np.log(1e-2), np.log(1e3)), (np.log(1e-3), np.log(2.0))]
-
-
 def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
     """Return the process of some terms that fits best, and its BIC."""
     expected = data.log_excess
     start = np.array([log_excess, *(value for term in terms for value in term.parameters)])
-    bounds = [(log_excess - 3.0, log_excess + 3.0)]
+    bounds: list[Any] = [(log_excess - 3.0, log_excess + 3.0)]
+    shortest = np.log(SHORTEST * data.step_s)
     for term in terms:
-        bounds += _bounds(data, term.kind, term.parameters)
+        scale, period = (SCALES[0] * data.step_s, SCALES[1] * data.span_s), term.parameters[1]
+        around = (max(period - NEAR_PERIOD, shortest), period + NEAR_PERIOD) if term.rotates else np.log(scale)
+        bounds += [np.log(data.noise) + np.log(AMPLITUDES), around, *np.log(BOUNDS[term.kind])]
     low, high = np.array(bounds).T
     places = [*pairwise(accumulate([1, *(len(term.parameters) for term in terms)]))]
 
@@ -499,7 +503,7 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
             covariance = process.covariance(data.time_s, data.variance * process.excess**2)
         except (np.linalg.LinAlgError, RuntimeError, ValueError):
             return 1e25
-        value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values).log_likelihood
+        value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values)[1]
         return value if np.isfinite(value) else 1e25
 
     known: dict[bytes, tuple[float, Float]] = {}

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -179,41 +179,35 @@ class ProcessSearch:
             self._solve(one, one.unsolved)
         return self.filters
 
-    def scores(self, sums: NDArray[Any]) -> Float:
-        """Return C^-1 (sums - level) on the grid of frames with gaps, shape (n_stare, n_sum, n_grid).
+    def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[Filter, Float]]:
+        """Yield each template with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched.
 
-        The shape of sums is (n_stare, n_frame, n_sum), here and below.
+        The shape of sums is (n_stare, n_frame, n_sum). Onsets next to gaps are not searched where rho of the first
+        light curve cannot exceed a positive threshold `above`.
         """
+        filters = self.rows if above is None else self.filters
+        # C^-1 (sums - level) on the grid of frames with gaps.
         scores = np.zeros((len(sums), sums.shape[2], self.n_grid))
         for k, (covariance, level) in enumerate(zip(self.covariances, self._levels, strict=True)):
             values = np.asarray(sums[:, :, k], np.float64)
             mean = (values @ level) / level.sum()
             scores[:, k, self.at] = covariance.solve(values.T).T - mean[:, None] * level
-        return scores
+        correlations = Correlations(scores, max(max(one.shape.size, abs(one.first)) for one in filters))
 
-    def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[Filter, Float]]:
-        """Yield each template with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched.
+        def searched(one: Filter) -> tuple[Filter, Float]:
+            correlated = correlations.of(one.shape, one.first)[..., one.peaks]
+            rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
+            if above is not None:
+                # A template of which a smaller share lies in frames is not searched.
+                least = np.sqrt(LEAST_SHARE * one.without_gaps)
+                self._solve(one, one.unsolved & (rho[0] > above * least).any(axis=0))
+            per_amplitude = one.per_amplitude
+            tried = per_amplitude > 0
+            np.divide(rho, per_amplitude, out=rho, where=tried)
+            rho[:, ~tried] = -np.inf
+            return one, rho
 
-        Onsets next to gaps are not searched where rho of the first light curve cannot exceed a positive threshold
-        `above`.
-        """
-        filters = self.rows if above is None else self.filters
-        scores = Correlations(self.scores(sums), max(max(one.shape.size, abs(one.first)) for one in filters))
-        yield from map_in_threads(partial(self._values, scores, above), filters, _threads(scores.values.size))
-
-    def _values(self, scores: Correlations, above: float | None, one: Filter) -> tuple[Filter, Float]:
-        """Return a template with rho; see `values`."""
-        correlated = scores.of(one.shape, one.first)[..., one.peaks]
-        rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
-        if above is not None:
-            # A template of which a smaller share lies in frames is not searched.
-            least = np.sqrt(LEAST_SHARE * one.without_gaps)
-            self._solve(one, one.unsolved & (rho[0] > above * least).any(axis=0))
-        per_amplitude = one.per_amplitude
-        tried = per_amplitude > 0
-        np.divide(rho, per_amplitude, out=rho, where=tried)
-        rho[:, ~tried] = -np.inf
-        return one, rho
+        yield from map_in_threads(searched, filters, _threads(scores.size))
 
     def largest(self, sums: NDArray[Any]) -> Float:
         """Return the largest value of each light curve, shape (n_stare,)."""
@@ -232,26 +226,22 @@ class ProcessSearch:
         first = template.first + int(bright[0])
         peaks = np.arange(-int(self.frames[0]) % template.stride, self.n_grid, template.stride)
         norms, lost = list[SolvedNorms](), np.zeros((len(self.processes), peaks.size))
+        held = np.zeros(self.n_grid)
         for k, level in enumerate(self._levels):
             if not self.processes[k].terms:
-                norms.append(self._independent(k, shape, first, peaks))
+                # Independent noise.
+                variance = self.variance * self.processes[k].excess ** 2
+                held[self.at] = 1.0 / variance
+                norm, typical = _correlated(held, shape**2, first)[peaks], float(np.median(variance))
+                unit, solved = float((shape**2).sum() / typical), np.zeros(peaks.size, np.bool_)
+                norms.append(SolvedNorms(norm, unit, 1.0 / typical, (shape / typical) ** 2, 0, solved))
             elif self._before is None or earlier is None:
                 norms.append(self._norms(k, shape, first, peaks))
             else:
                 norms.append(self._updated(self._before, earlier, k, peaks))
-            held = np.zeros(self.n_grid)
             held[self.at] = level
             lost[k] = _correlated(held, shape, first)[peaks] ** 2 / level.sum()
         return Filter(template, phase, shape, first, peaks, tuple(norms), lost, self.bank.directions**2)
-
-    def _independent(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
-        """Compute s^T C^-1 s of a sum with independent noise."""
-        variance = self.variance * self.processes[k].excess ** 2
-        held = np.zeros(self.n_grid)
-        held[self.at] = 1.0 / variance
-        norm, typical = _correlated(held, shape**2, first)[peaks], float(np.median(variance))
-        unit, solved = float((shape**2).sum() / typical), np.zeros(peaks.size, np.bool_)
-        return SolvedNorms(norm, unit, 1.0 / typical, (shape / typical) ** 2, 0, solved)
 
     def _norms(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
         """Compute s^T C^-1 s of a sum at peaks that are not next to gaps or ends."""
@@ -297,7 +287,11 @@ class ProcessSearch:
         return replace(one, unsolved=one.unsolved | (share > CHANGED * one.irregular))
 
     def _solve(self, one: Filter, chosen: Bool) -> None:
-        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved."""
+        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved.
+
+        Innovations of a template are neglected `MOST_MARGIN` frames after it.
+        """
+        padded = np.pad(one.shape, 1)
         for k, norms in enumerate(one.norms):
             left = np.flatnonzero(chosen & norms.unsolved)
             norms.unsolved[left] = False
@@ -305,23 +299,15 @@ class ProcessSearch:
             while left.size:
                 stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, one.shape.size), side="right"))
                 stop = min(stop, CHUNK_TEMPLATES)
-                norms.norm[left[:stop]] = self._exact(k, one.shape, starts[:stop])
+                begin, end = np.searchsorted(self.at, [starts[0], starts[stop - 1] + one.shape.size])
+                norms.norm[left[:stop]] = 0.0
+                if end > begin:
+                    # Many shapes end before the same frame, so that what follows it is solved once.
+                    end = min(-(-end // CHUNK_FRAMES) * CHUNK_FRAMES, self.at.size)
+                    place = self.at[begin:end, None] - starts[:stop] + 1
+                    columns = padded[np.clip(place, 0, one.shape.size + 1, out=place)]
+                    norms.norm[left[:stop]] = self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
                 left, starts = left[stop:], starts[stop:]
-
-    def _exact(self, k: int, shape: Float, starts: NDArray[np.int64]) -> Float:
-        """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,).
-
-        Innovations of a template are neglected `MOST_MARGIN` frames after it.
-        """
-        begin, end = np.searchsorted(self.at, [starts[0], starts[-1] + shape.size])
-        if end <= begin:
-            return np.zeros(starts.size)
-        # Many shapes end before the same frame, so that what follows it is solved once.
-        end = min(-(-end // CHUNK_FRAMES) * CHUNK_FRAMES, self.at.size)
-        padded = np.pad(shape, 1)
-        place = self.at[begin:end, None] - starts + 1
-        columns = padded[np.clip(place, 0, shape.size + 1, out=place)]
-        return self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
 
 
 def _threads(n_values: int) -> int | None:

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.observations.level import LevelGiven
-from mauvecl.observations.process import Process, level_fit
+from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.progress import UNREPORTED, Steps
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import Bank, Baseline, Templates
 
@@ -121,19 +120,10 @@ class SeriesSurvey:
         """Return the survey upside down: losses of light become flares."""
         return replace(self, sums=-self.sums, flux=-self.flux)
 
-    def backwards(self) -> SeriesSurvey:
-        """Return the survey in the other direction of time."""
-        start = self.stare.start_s
-        stare = replace(self.stare, start_s=start[-1] + start[0] - start[::-1])
-        return self._with_frames(stare, slice(None, None, -1))
-
     def frames(self, kept: Bool) -> SeriesSurvey:
         """Return the survey of some of the frames."""
-        return self._with_frames(select_frames(self.stare, kept), kept)
-
-    def _with_frames(self, stare: Stare, chosen: Bool | slice) -> SeriesSurvey:
-        names = ("sums", "variance", "flux", "time_s")
-        return replace(self, stare=stare, **{name: getattr(self, name)[chosen] for name in names})
+        parts = {name: getattr(self, name)[kept] for name in ("sums", "variance", "flux", "time_s")}
+        return replace(self, stare=select_frames(self.stare, kept), **parts)
 
 
 def stare_of(frames: Frames, used: Bool) -> Stare:
@@ -210,8 +200,7 @@ class SimulatedRate:
 
     def threshold(self, rate: float) -> float:
         """Return the threshold above which the rate of events per star-day is at most `rate`."""
-        low = float(self.largest[0])
-        goal = float(np.log(rate))
+        low, goal = float(self.largest[0]), float(np.log(rate))
         if self._log_rate(low) <= goal:
             return low
         high = float(self.largest[-1]) + 1.0
@@ -263,11 +252,11 @@ def largest_dip(survey: SeriesSurvey, quiet: Bool, least: float) -> float:
     Quiescent frames are searched upside down, in both directions of time. Losses of light have larger dips than noise.
     """
     down = survey.frames(quiet).inverted()
-    return max(
-        float(rho.max(initial=-np.inf))
-        for one in (down, down.backwards())
-        for _, rho in one.search.values(one.sums[None], least)
-    )
+    start = down.stare.start_s
+    stare = replace(down.stare, start_s=start[-1] + start[0] - start[::-1])
+    back = replace(down, stare=stare, sums=down.sums[::-1], variance=down.variance[::-1])
+    values = (one.search.values(one.sums[None], least) for one in (down, back))
+    return max(float(rho.max(initial=-np.inf)) for found in values for _, rho in found)
 
 
 def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
@@ -278,7 +267,7 @@ def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
     columns = []
     for process, column in zip(survey.processes, survey.sums.T, strict=True):
         covariance = process.covariance(survey.stare.start_s[quiet], survey.variance[quiet] * process.excess**2)
-        columns.append(level_fit(covariance, column[quiet]).left)
+        columns.append(level_fit(covariance, column[quiet])[2])
     return np.column_stack(columns)
 
 

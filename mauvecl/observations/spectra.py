@@ -28,8 +28,8 @@ from mauvecl.observations.frame_model import (
 )
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
-from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
-from mauvecl.observations.progress import UNREPORTED, Steps
+from mauvecl.observations.light_curve import check_usable, quiescent_light
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, WHITE, Detection, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
@@ -166,11 +166,9 @@ def survey_spectra(
             break
         reasons = np.where(single, reasons | Reason.SPIKE, reasons)
         used = reasons == 0
-    kept = reasons[searched_among(survey, frames)] == 0
-    survey = survey.frames(kept)
+    survey = survey.frames(reasons[np.searchsorted(frames.time_s, survey.time_s)] == 0)
     series = replace(series, excess=series.excess[used])
-    draws = steps.part(0.9, 1.0)
-    return survey, series, quiescent_light(frames, survey, reasons, ~events, seed, draws)
+    return survey, series, quiescent_light(frames, survey, reasons, ~events, seed, steps.part(0.9, 1.0))
 
 
 def _survey(
@@ -493,7 +491,9 @@ def measure_flare(
     # What changes the light of the star changes that of the flare alike.
     of_flare = np.array([np.full(summed.size, float(name == "light")) for name in unknown])
     nuisances = Nuisances(tuple(unknown), spectra, errors, of_flare)
+    # In the sum of the frames, with one pixel for each value.
+    flares = replace(model.flare, hot=model.flare.hot @ model.bins.T, fixed=model.flare.fixed @ model.bins.T)
     try:
-        return fit((summed / model.per_dn + exposure.recorded_dn)[None], exposure, model.flares_of(n), nuisances)
+        return fit((summed / model.per_dn + exposure.recorded_dn)[None], exposure, flares.stacked(n), nuisances)
     except InputError as error:
         return str(error)

@@ -62,8 +62,7 @@ class FolderFile(TableFile):
         """Return a column of the table, a keyword of each header, or a column of each file."""
         if self.table is not None and (column := self.table.named(name)) is not None:
             return column
-        keyword = matched(name, self.header)
-        if keyword is not None:
+        if (keyword := matched(name, self.header)) is not None:
             found = [header.get(keyword) for header in self._headers]
             if None in found:
                 fault = f"{self.what}: {self.paths[found.index(None)].name} needs the keyword {keyword}"
@@ -71,25 +70,8 @@ class FolderFile(TableFile):
             return Values.of(name, np.array(found), None, self.what)
         with self.open_file(self.paths[0]) as first:
             one = first.named(name) or (first.find(name) if "*" in name else None)
-        return None if one is None else self._of_files(name, one)
-
-    def axis(self, name: str, dimension: int) -> Values:
-        """Return the wavelengths of the first file's image; raise InputError if another file has others."""
-        if dimension != 1:
-            return super().axis(name, dimension)
-        first: Values | None = None
-        for path in self.paths:
-            with self.open_file(path) as file:
-                axis = file.axis(name, 1)
-            first = first or axis
-            if axis.shape != first.shape or not np.allclose(axis.numbers(), first.numbers(), rtol=1e-9, atol=0.0):
-                fault = f"{self.what}: {path.name} must have the wavelengths of {self.paths[0].name}"
-                raise InputError(fault, key="wavelength")
-        assert first is not None
-        return first
-
-    def _of_files(self, name: str, one: Values) -> Values:
-        """Return a column of every file, with one row per file."""
+        if one is None:
+            return None
         n = int(np.prod(one.shape))
 
         @lru_cache(maxsize=64)
@@ -105,7 +87,22 @@ class FolderFile(TableFile):
         def read(start: int, stop: int) -> Any:
             return np.stack([values(k) for k in range(start, stop)])
 
+        # A column of every file, with one row per file.
         return Values(name, (len(self.paths), n), read, one.unit, self.what)
+
+    def axis(self, name: str, dimension: int) -> Values:
+        """Return the wavelengths of the first file's image; raise InputError if another file has others."""
+        if dimension != 1:
+            return super().axis(name, dimension)
+        with self.open_file(self.paths[0]) as file:
+            first = file.axis(name, 1)
+        for path in self.paths[1:]:
+            with self.open_file(path) as file:
+                axis = file.axis(name, 1)
+            if axis.shape != first.shape or not np.allclose(axis.numbers(), first.numbers(), rtol=1e-9, atol=0.0):
+                fault = f"{self.what}: {path.name} must have the wavelengths of {self.paths[0].name}"
+                raise InputError(fault, key="wavelength")
+        return first
 
     @cached_property
     def _headers(self) -> list[dict[str, Any]]:
@@ -118,9 +115,6 @@ class FolderFile(TableFile):
 
 Float = NDArray[np.float64]
 
-#: Paths of the quantities of a stored scene.
-MAPPING = {"time": "time", "flux": "flux", "error": "error", "quality": "quality", "exposure": "exposure",
-           "wavelength": "wavelength", "flux_unit": "adu"}  # fmt: skip
 #: Attributes that every scene has.
 REQUIRED = ("exposure_s", "frames", "instrument", "dark_unit", "saturation_dn")
 #: Largest number of pixels of a spectrum.
@@ -148,19 +142,22 @@ class StoredFile(TableFile):
         self.stacked = int(of["frames"]) if numbers is None else 1
         self.per_row = 1 if numbers is None else numbers.size
         exposure, frame = float(of["exposure_s"]), float(of["exposure_s"]) / int(of["frames"])
-        n = int(raw.shape[0]) * self.per_row
+        n, ceiling = int(raw.shape[0]) * self.per_row, self.stacked * float(of["saturation_dn"])
         if n > MAX_FRAMES:
             raise InputError(f"{what} must hold at most {MAX_FRAMES} frames of {path}, not {n}", key="frames")
         within = np.array([exposure / 2]) if numbers is None else (numbers + 0.5) * frame
-        at = np.arange(n)
-        shape = (n, calibration["wavelength_nm"].size)
+        at, shape = np.arange(n), (n, calibration["wavelength_nm"].size)
+
+        def saturated(start: int, stop: int) -> NDArray[np.int64]:
+            return np.asarray((self._raw(start, stop) >= ceiling).any(axis=1), np.int64)
+
         parts = [
             Values.of("time", at // self.per_row * exposure + within[at % self.per_row], "s", what),
             Values.of("exposure", np.full(n, exposure if numbers is None else frame), "s", what),
             Values.of("wavelength", calibration["wavelength_nm"], "nm", what),
             Values("flux", shape, self._flux, "adu", what),
             Values("error", shape, self._error, "adu", what),
-            Values("quality", (n,), self._saturated, "", what, 8 * shape[1]),
+            Values("quality", (n,), saturated, "", what, 8 * shape[1]),
         ]
         if self.stacked == 1:
             parts.append(Values("raw", shape, self._raw, "adu", what))
@@ -177,19 +174,13 @@ class StoredFile(TableFile):
         """Return a quantity."""
         return self.parts.get(name)
 
-    @property
-    def mapping(self) -> FrameMapping:
-        """Paths of the quantities in the store."""
-        more = {"temperature": "temperature"} if "temperature" in self.parts else {}
-        return FrameMapping(**MAPPING, **more)
-
-    @property
-    def raw_mapping(self) -> FrameMapping:
-        """Paths of the quantities, with counts that have bias and dark current; only those of single frames."""
-        if self.stacked > 1:
+    def mapping(self, raw: bool = False) -> FrameMapping:
+        """Return the names of the quantities; of `raw` ones, with bias and dark current, only in single frames."""
+        if raw and self.stacked > 1:
             remedy = "give single frames: `mauvecl realise --frames all`"
             raise InputError(f"{self.what} holds sums of {self.stacked} frames; {remedy}", key="frames")
-        return self.mapping.model_copy(update={"flux": "raw", "error": None})
+        names = {name: name for name in self.parts if name != "raw"}
+        return FrameMapping(**names | {"flux_unit": "adu"} | ({"flux": "raw", "error": None} if raw else {}))
 
     def _raw(self, start: int, stop: int) -> Float:
         first, last = start // self.per_row, -(-stop // self.per_row)
@@ -208,10 +199,6 @@ class StoredFile(TableFile):
         light = np.maximum(self._flux(start, stop), 0.0)
         dark = of["dark_dn"] * (1.0 if self.attributes["dark_unit"] == "DN" else gain)
         return np.asarray(np.sqrt(self.stacked * (of["read_noise_dn"] ** 2 + dark + 1 / 12) + gain * light))
-
-    def _saturated(self, start: int, stop: int) -> NDArray[np.int64]:
-        limit = self.stacked * float(self.attributes["saturation_dn"])
-        return np.asarray((self._raw(start, stop) >= limit).any(axis=1), np.int64)
 
 
 @contextmanager
@@ -302,46 +289,21 @@ Light = tuple[Float, Float | None, Float | None, tuple[str, ...]]
 
 @dataclass(frozen=True, eq=False)
 class PixelStatistics:
-    """Light and noise of each pixel over the frames without a fault, arrays of shape (n_pixel,).
+    """Light and noise of each pixel over the frames without a fault, arrays of shape (n_pixel,)."""
 
-    Attributes
-    ----------
-    count : ndarray of int
-        Frames in which the pixel is finite.
-    mean : ndarray
-    scatter : ndarray
-        Standard deviation of a frame, from differences of neighbouring frames: slow changes have no part in it.
-    stated : ndarray or None
-        Root of the mean of the squared errors that the file states.
-    """
-
-    count: NDArray[np.int64]
-    mean: Float
-    scatter: Float
-    stated: Float | None
-
-
-@dataclass(frozen=True, eq=False)
-class WeightedSums:
-    """Weighted sums of the pixels of each frame."""
-
-    sums: Float  # shape (n_frame, n_weight); NaN for frames with a pixel that is not finite
-    errors: Float | None  # from the stated errors of the pixels, which are taken to be independent
-    pixels: PixelStatistics
-    dead: int  # number of pixels that are left out, because they are not finite in most frames
-
-    def light(self, number: int, what: str, quality: Values | None) -> Light:
-        """Return the sums of one weight with their errors, the quality of the frames and remarks."""
-        error = None if self.errors is None else self.errors[:, number]
-        return self.sums[:, number], error, _flags(quality), dead_pixel_remarks(self.dead, what)
+    count: NDArray[np.int64]  #: frames in which the pixel is finite
+    mean: Float  #: light of a frame
+    scatter: Float  #: standard deviation of a frame, from differences of neighbours: slow changes have no part in it
+    stated: Float | None  #: root of the mean of the squared errors that the file states
 
 
 def weighted_sums(
     flux: Values, error: Values | None, quality: Values | None, weights: Float | None = None
-) -> WeightedSums:
+) -> tuple[list[Light], PixelStatistics]:
     """Reduce spectra to weighted sums, by default the sum over all pixels, reading them twice in pieces.
 
-    Quality has the shape of the flux or of its frames, and is zero where nothing is wrong.
+    Quality has the shape of the flux or of its frames, and is zero where nothing is wrong. Pixels that are not finite
+    in most frames are left out, other frames with one have no sum, and errors of pixels are taken to be independent.
     """
     n, n_pixel = flux.shape
     given = np.ones((1, n_pixel)) if weights is None else np.atleast_2d(np.asarray(weights, np.float64))
@@ -355,7 +317,9 @@ def weighted_sums(
         sums[part] = _piece(flux, quality, part)[:, live] @ given[:, live].T
         if error is not None and errors is not None:
             errors[part] = np.sqrt(error.rows(part.start, part.stop)[:, live] ** 2 @ given[:, live].T ** 2)
-    return WeightedSums(sums, errors, statistics, int((~live).sum()))
+    flags, remarks = _flags(quality), dead_pixel_remarks(int((~live).sum()), flux.what)
+    each: Any = errors.T if errors is not None else [None] * len(given)
+    return [(light, sd, flags, remarks) for light, sd in zip(sums.T, each, strict=True)], statistics
 
 
 def _piece(flux: Values, quality: Values | None, part: slice) -> Float:
@@ -416,10 +380,9 @@ def whole_or_reduced(flux: Values, error: Values | None, quality: Values | None)
         for part in flux.pieces:
             light[part] = _piece(flux, quality, part)
         return light, None if error is None else error.numbers(), _flags(quality), ()
-    found = weighted_sums(flux, error, quality)
-    remarks = (
+    remark = (
         f"{flux.what} has {n_bytes / 2**20:.0f} MiB of spectra, more than {limit >> 20} MiB: they were summed over "
-        "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+        "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit"
     )
-    light, sd, flags, more = found.light(0, flux.what, quality)
-    return light, sd, flags, (*remarks, *more)
+    ((light, sd, flags, more),) = weighted_sums(flux, error, quality)[0]
+    return light, sd, flags, (remark, *more)

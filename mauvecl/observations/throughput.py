@@ -152,10 +152,6 @@ class _Linearised:
         """Parameters."""
         return np.asarray(self.covariance @ self.projected)
 
-    def error_of(self, which: NDArray[np.bool_]) -> float:
-        """Return the prior standard deviation of some parameters that has the largest restricted likelihood."""
-        return _best(lambda sd: self.likelihood(self.smoothing, np.where(which, sd, self.prior)), LOG_ERROR)
-
     @cached_property
     def normal(self) -> Float:
         """Information of the values, shape (n_parameter, n_parameter)."""
@@ -358,19 +354,15 @@ class ThroughputModel:
             if value > 0:
                 columns.append(np.sqrt(value) * (jacobian @ vector)[:, None] * np.ones_like(model))
                 prior.append(1.0)
-        white = self._whitener(self.variance_dn2(model))
-        design = np.column_stack([white(column) for column in columns])
-        values = white(self.observed_dn - model) + design[:, : around.size] @ around
-        return _Linearised(values, design, np.array(prior), self.penalty)
-
-    def _whitener(self, variance: Float) -> Callable[[Float], Float]:
-        """Return a function that makes values of shape (n_star, n_pixel) independent and of variance one."""
-        used = self.usable.T
+        # Usable values become independent and of variance one.
+        used, index = self.usable.T, np.arange(n_star)
         covariance = np.where(used[:, :, None] & used[:, None, :], self.dark_covariance, 0.0)
-        index = np.arange(len(self.stars))
-        covariance[:, index, index] += np.where(used, variance.T, 1.0)
+        covariance[:, index, index] += np.where(used, self.variance_dn2(model).T, 1.0)
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-        return lambda values: np.einsum("pij,jp->ip", inverse, np.where(used.T, values, 0.0)).ravel()
+        every = [np.where(used.T, each, 0.0) for each in (*columns, self.observed_dn - model)]
+        *columns, observed = (np.einsum("pij,jp->ip", inverse, each).ravel() for each in every)
+        design = np.column_stack(columns)
+        return _Linearised(observed + design[:, : around.size] @ around, design, np.array(prior), self.penalty)
 
 
 def fit_throughput(
@@ -399,7 +391,8 @@ def fit_throughput(
     m, n = model.n_shape, model.basis.shape[1]
     if several and spectrum_error is None and best.pixels(model).disagree:
         trial = _iterated(model, ONE_STAR_ERROR)
-        error = trial.error_of(trial.prior == ONE_STAR_ERROR)
+        of_spectra = trial.prior == ONE_STAR_ERROR
+        error = _best(lambda sd: trial.likelihood(trial.smoothing, np.where(of_spectra, sd, trial.prior)), LOG_ERROR)
         best = _iterated(model, error)
     pixels, shape = best.pixels(model), best.found[n : n + m]
     if (np.abs(shape) > LIMITS[:m]).any():

@@ -246,23 +246,12 @@ MIN_CONTINUUM = 3
 
 @dataclass(frozen=True, eq=False)
 class LineIndex:
-    """Lines of one or more spectra.
+    """Lines of one or more spectra."""
 
-    Attributes
-    ----------
-    flux, error : ndarray, shape (...)
-        Integral over the band above the continuum, in the unit of the flux times nm, and its standard error; the
-        error is NaN if the spectrum has none.
-    continuum : ndarray, shape (...)
-        Mean of the continuum over the band.
-    equivalent_width_nm : ndarray, shape (...)
-        Width of the continuum with the light of the line: positive in emission.
-    """
-
-    flux: Float
-    error: Float
-    continuum: Float
-    equivalent_width_nm: Float
+    flux: Float  #: integral over the band above the continuum, in the unit of the flux times nm, shape (...)
+    error: Float  #: standard error of it; NaN if the spectrum has none
+    continuum: Float  #: mean of the continuum over the band
+    equivalent_width_nm: Float  #: width of the continuum with the light of the line: positive in emission
 
 
 def _integral_of_line(x: Float, weight: Float, share: Float) -> Float:
@@ -370,11 +359,6 @@ class Index:
     continuum_nm: tuple[tuple[float, float], ...]
     published: str  # the usual definition for spectra of higher resolution, with its source
 
-    @property
-    def lines(self) -> EmissionLine:
-        """The lines in the band."""
-        return EmissionLine.named(self.name)
-
 
 #: Indices by name. The bands are an assumption of this project: published ones, of 0.1 to 3 nm, lie within Mauve's line
 #: function of 13.3 nm, so that the band is 16 nm about the lines and each continuum 12 nm beyond.
@@ -414,15 +398,9 @@ class Change:
 
     @classmethod
     def named(
-        cls,
-        name: str,
-        star: Source,
-        quiet: Expectation,
-        instrument: Instrument,
-        order: Order,
-        file: Source | None,
+        cls, name: str, star: Source, quiet: Expectation, instrument: Instrument, order: Order, file: Source | None,
         band: str,
-    ) -> Self:
+    ) -> Self:  # fmt: skip
         """Return a change by name: lines, ``balmer jump``, ``colour``, a band as in ``200-320``, or ``spectrum``.
 
         The star is at its brightness, and the expectation that of one exposure. ``spectrum`` adds the light of `file`,
@@ -446,7 +424,11 @@ class Change:
             flux = own * (_below(limits[1]) - _below(limits[0]))
             meaning = f"relative change of the light in {limits[0]:g}-{limits[1]:g} nm"
         else:
-            line = _line(name)
+            try:
+                line = EmissionLine.named(name)
+            except InputError:
+                known = f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum"
+                raise InputError.of("change.of", shortened(name), known) from None
             nm = np.unique(np.concatenate([nm, line.nodes_nm]))
             flux, unit, meaning = line.profile(nm), "erg / (s cm2)", f"flux of {line.name}"
         rate = electrons_per_second(instrument, nm, flux, order)
@@ -470,20 +452,6 @@ def _band(name: str) -> tuple[float, float] | None:
     if not 0 < low < high:
         raise InputError.of("change.of", name, "a band of ascending wavelengths, such as 200-320", unit="nm")
     return low, high
-
-
-def _line(name: str) -> EmissionLine:
-    try:
-        return EmissionLine.named(name)
-    except InputError:
-        expected = f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum"
-        raise InputError.of("change.of", shortened(name), expected) from None
-
-
-def covered_indices(quiet: Expectation) -> list[Index]:
-    """Return the indices whose band and continua lie within the pixels."""
-    first, last = quiet.wavelength_nm[0], quiet.wavelength_nm[-1]
-    return [one for one in INDICES.values() if first <= one.continuum_nm[0][0] and one.continuum_nm[-1][1] <= last]
 
 
 def exposure_dn_per_electron(quiet: Expectation, instrument: Instrument) -> Float:
@@ -527,7 +495,7 @@ class IndexValue:
         weights = np.zeros(nm.size)
         weights[near] = part.flux * calibration[near]
         mean = find((calibration * quiet.signal_dn)[near])
-        lines = index.lines
+        lines = EmissionLine.named(index.name)
         rate = electrons_per_second(instrument, lines.nodes_nm, lines.profile(lines.nodes_nm), order)
         captured = float(weights @ (rate * exposure_dn_per_electron(quiet, instrument)))
         return cls(index, weights, float(mean.flux), float(mean.equivalent_width_nm), captured)

@@ -56,31 +56,15 @@ def survey_of(n: int, model: processes.Process) -> searches.SeriesSurvey:
     return replace(survey, processes=(model,), flux_process=model)
 
 
-def event_of(survey: searches.SeriesSurvey) -> searches.Detection:
-    middle = survey.stare.n_frames // 2
-    return searches.Detection(100.0, 120.0, float(survey.stare.start_s[middle]), 0, 20.0, middle - 8, middle + 120)
+def watch(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, place: int, found: list[tuple[str, int]]) -> None:
+    """Record the size of an argument of a function, whenever it is called."""
+    original = getattr(owner, name)
 
+    def recorded(*given, **others):  # type: ignore[no-untyped-def]
+        found.append((name, np.size(given[place])))
+        return original(*given, **others)
 
-class Sizes:
-    """Numbers of values that functions are called with."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.monkeypatch, self.found = monkeypatch, list[tuple[str, int]]()
-
-    def watch(self, owner: object, name: str, place: int) -> None:
-        """Record the size of an argument of a function."""
-        original = getattr(owner, name)
-
-        def recorded(*given, **others):  # type: ignore[no-untyped-def]
-            self.found.append((name, np.size(given[place])))
-            return original(*given, **others)
-
-        self.monkeypatch.setattr(owner, name, recorded)
-
-    def taken(self) -> list[tuple[str, int]]:
-        """Return the sizes and forget them."""
-        found, self.found = self.found, []
-        return found
+    monkeypatch.setattr(owner, name, recorded)
 
 
 def test_general_family_has_the_same_bits_in_each_process() -> None:
@@ -96,19 +80,19 @@ def test_general_family_has_the_same_bits_in_each_process() -> None:
 def test_work_of_an_event_does_not_grow_with_the_light_curve(
     model: processes.Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sizes = Sizes(monkeypatch)
-    sizes.watch(event_windows, "_bins", 0)
-    sizes.watch(processes.Process, "covariance", 1)
-    sizes.watch(processes.Process, "times", 1)
-    sizes.watch(processes.Process, "at", 1)
-    measured, work = [], []
+    sizes, measured, work = list[tuple[str, int]](), [], []
+    watch(monkeypatch, event_windows, "_bins", 0, sizes)
+    for name in ("covariance", "times", "at"):
+        watch(monkeypatch, processes.Process, name, 1, sizes)
     for n in (SHORT, LONG):
         survey = survey_of(n, model)
-        one = event_of(survey)
+        start = float(survey.stare.start_s[n // 2])
+        one = searches.Detection(100.0, 120.0, start, 0, 20.0, n // 2 - 8, n // 2 + 120)
         taken = np.zeros(n, np.bool_)
         taken[one.first : one.last + 1] = True
         measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy)
-        work.append(sizes.taken())
+        work.append(sizes[:])
+        sizes.clear()
     assert work[0]
     assert work[0] == work[1]
     assert max(size for name, size in work[0] if name != "at") <= 2 * event_windows.WINDOW_FRAMES + 200
@@ -119,13 +103,13 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(
 def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sizes = Sizes(monkeypatch)
-    sizes.watch(processes.Covariance, "squared_norms", 1)
-    work = []
+    sizes, work = list[tuple[str, int]](), []
+    watch(monkeypatch, processes.Covariance, "squared_norms", 1, sizes)
     for n in (SHORT, LONG):
         found, _ = detect_events(survey_of(n, SMOOTH), 7.0)
         assert len(found) == 1
-        work.append(sum(size for _, size in sizes.taken()))
+        work.append(sum(size for _, size in sizes))
+        sizes.clear()
     assert work[1] == pytest.approx(work[0], rel=0.02)
 
 
@@ -184,20 +168,13 @@ def test_coefficients_are_those_of_celerite2() -> None:
             np.testing.assert_array_equal(one, other)
 
 
-#: Frequent false alarms, whose rate takes little time.
-OFTEN = Study.build({"search": {"per": "day"}}, "test")
-
-
-def few_frames() -> Frames:
-    rng = np.random.default_rng(6)
-    time = np.arange(500) * 60.0
-    flux = LEVEL * (1 + 0.05 * flare(time, 60.0, 12_000.0, 300.0)) + rng.normal(0.0, SD, time.size)
-    return Frames.of(time, flux, np.full(time.size, SD))
-
-
-def test_progress_rises_to_the_number_of_frames() -> None:
-    reported: list[tuple[int, int]] = []
-    answer = analyse(OFTEN, progress=lambda done, total: reported.append((done, total)), frames=few_frames())
+def test_progress_rises_to_the_number_of_frames_and_may_stop_the_analysis(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Events that wait are not measured once the analysis is stopped."""
+    # Frequent false alarms, whose rate takes little time.
+    at, often, reported = np.arange(500) * 60.0, Study.build({"search": {"per": "day"}}, "test"), []
+    flux = LEVEL * (1 + 0.05 * flare(at, 60.0, 12_000.0, 300.0)) + np.random.default_rng(6).normal(0.0, SD, at.size)
+    frames = Frames.of(at, flux, np.full(at.size, SD))
+    answer = analyse(often, progress=lambda done, total: reported.append((done, total)), frames=frames)
     assert max(row.event.value for row in answer.rows) > 20
     done, totals = (list(each) for each in zip(*reported, strict=True))
     assert set(totals) == {500}
@@ -205,33 +182,22 @@ def test_progress_rises_to_the_number_of_frames() -> None:
     assert done[-1] == 500
     assert (np.diff(done) > 0).all()
     assert len(done) > 20
-
-
-class StoppedError(Exception):
-    """Raised by a report to stop the work."""
-
-
-def test_a_report_may_stop_the_analysis() -> None:
-    def stop(done: int, total: int) -> None:
-        if done:
-            raise StoppedError
-
-    with pytest.raises(StoppedError):
-        analyse(OFTEN, progress=stop, frames=few_frames())
-
-
-def test_events_that_wait_are_not_measured_once_the_analysis_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[Any] = []
+
+    def after_begin(done: int, total: int) -> None:
+        assert not done, "stopped"
 
     def slow(*given: Any) -> None:
         begun.append(given)
         time.sleep(0.02)
 
     def stop(share: float) -> None:
-        raise StoppedError
+        raise AssertionError("stopped")
 
+    with pytest.raises(AssertionError, match="stopped"):
+        analyse(often, progress=after_begin, frames=frames)
     monkeypatch.setattr(events, "measure_event", slow)
     survey: Any = SimpleNamespace(flux_level=lambda quiet: None)
-    with pytest.raises(StoppedError):
+    with pytest.raises(AssertionError, match="stopped"):
         events.measure_events(survey, np.zeros(3, np.bool_), [None] * 100, steps=processes.Steps(stop))  # type: ignore[list-item]
     assert 0 < len(begun) < 30

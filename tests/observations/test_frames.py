@@ -21,15 +21,12 @@ FLUX = 1000 + RNG.normal(0, 5, 100)
 ERROR = np.full(100, 5.0)
 
 
-def test_unsorted_frames_are_sorted_with_a_remark() -> None:
+def test_frames_are_sorted_and_numbered_over_gaps_and_slow_changes_of_the_times() -> None:
     order = RNG.permutation(100)
     frames = Frames.of(TIME[order], FLUX[order], ERROR[order])
     np.testing.assert_array_equal(frames.flux, FLUX)
     assert len(frames.remarks) == 1
     assert Frames.of(TIME, FLUX).remarks == ()
-
-
-def test_numbers_follow_the_cadence_over_gaps_and_slow_changes_of_the_times() -> None:
     kept = np.r_[0:30, 50:100]
     assert Frames.of(TIME[kept], FLUX[kept]).numbers.tolist() == kept.tolist()
     # Barycentric times: 100 s of drift over a year, as of the Earth's motion along the line of sight.
@@ -82,9 +79,7 @@ def test_time_series_of_astropy_are_frames() -> None:
     np.testing.assert_allclose(frames.error, 1.0)
     np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0, atol=2e-5)
     assert (frames.unit, frames.scale, frames.reference_mjd) == ("Jy", "tdb", pytest.approx(61_000.0))
-
-
-def test_binned_time_series_are_frames_through_a_mapping() -> None:
+    # Binned ones need a mapping.
     series = BinnedTimeSeries(time_bin_start=WHEN, time_bin_size=18.0 * u.s, data={"flux": LIGHT[:, 0]})
     how = frame_files.FrameMapping(time="time_bin_start", time_at="start", exposure="time_bin_size", flux="flux")
     frames = frame_files.frames_of(series, how)

@@ -32,19 +32,15 @@ pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + {margin} * 2**20
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 """
-CHILD = (
-    PREPARED
-    + LIMITED
-    + """
+CHILD = f"""{PREPARED}{LIMITED}
 mapping = FrameMapping(time="TIME", time_unit="s", flux="FLUX", wavelength="WAVES", wavelength_unit="nm", exposure_s=5)
-frames = read_frames({path!r}, mapping)
-weights = np.zeros((2, {pixels})); weights[0, 3] = 1.0; weights[1, :2] = 1.0
-reduced = reduce_frames({path!r}, weights, mapping)
+frames = read_frames({{path!r}}, mapping)
+weights = np.zeros((2, {PIXELS})); weights[0, 3] = 1.0; weights[1, :2] = 1.0
+reduced = reduce_frames({{path!r}}, weights, mapping)
 print(*frames.remarks, sep=chr(10), file=sys.stderr)
-np.savez({out!r}, white=frames.flux, one=reduced.light_curves[0].flux, two=reduced.light_curves[1].flux,
+np.savez({{out!r}}, white=frames.flux, one=reduced.light_curves[0].flux, two=reduced.light_curves[1].flux,
          mean=reduced.pixels.mean, scatter=reduced.pixels.scatter)
 """
-)
 
 
 def _light() -> np.ndarray:
@@ -71,7 +67,7 @@ def test_a_file_larger_than_memory_is_reduced_in_pieces(write, tmp_path: Path) -
     path, out = tmp_path / "large.fits", tmp_path / "out.npz"
     write(path)
     assert path.stat().st_size > 2.5 * MARGIN_MIB * 2**20
-    code = CHILD.format(margin=MARGIN_MIB, path=str(path), out=str(out), pixels=PIXELS)
+    code = CHILD.format(margin=MARGIN_MIB, path=str(path), out=str(out))
     limits = {"MAUVECL_LARGEST_CONTENT_MIB": "32", "OPENBLAS_NUM_THREADS": "1"}
     done = python(code, **limits)
     path.unlink()
@@ -122,22 +118,17 @@ np.savez({{out!r}}, white=frames.flux, time=frames.time_s)
 """
 
 
-def _csv(path: Path, n: int) -> None:
-    """Write a table with a date and 512 columns of light in each row."""
-    start = np.datetime64("2026-03-01T00:00:00")
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
+def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
+    """A table with a date and 512 columns of light in each row."""
+    n, margin, start = 44_000, 80, np.datetime64("2026-03-01T00:00:00")
+    path, small, out = tmp_path / "large.csv", tmp_path / "small.csv", tmp_path / "out.npz"
     with path.open("w") as file:
         file.write(",".join(["time", *(f"flux_{200 + k}" for k in range(512))]) + "\n")
         for row in range(n):
             light = ",".join(map(str, (PATTERN[row] + np.arange(512)).tolist()))
             file.write(f"{start + np.timedelta64(5 * row, 's')},{light}\n")
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
-def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
-    n, margin = 44_000, 80
-    path, small, out = tmp_path / "large.csv", tmp_path / "small.csv", tmp_path / "out.npz"
-    _csv(path, n)
     small.write_text("time,flux_200\n" + "\n".join(f"{k},1" for k in range(30)) + "\n")
     assert path.stat().st_size > margin * 2**20
     code = CSV_CHILD.format(margin=margin, path=str(path), small=str(small), out=str(out))

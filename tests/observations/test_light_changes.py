@@ -60,7 +60,5 @@ def test_gaps_are_not_bridged_and_frames_left_out_are_not_compared() -> None:
     assert found(np.random.default_rng(403), lost(400, N, 0.3), numbers=later) == []
     kept = np.delete(np.arange(N), slice(398, 402))
     assert len(found(np.random.default_rng(403), lost(398, 402, 0.9), frames=kept)) == 0
-
-
-def test_few_frames_have_no_changes() -> None:
+    # Neither have few frames.
     assert module.light_changes(np.zeros((5, PIXELS)), np.arange(5), np.arange(5), STAR, OTHERS, SD) == []

@@ -51,21 +51,15 @@ def test_mg_ii_of_au_mic_lies_in_the_published_range() -> None:
     assert error.max() < 5e-13
 
 
-PIXELS, FRAMES = 40, 300
-STAR = np.linspace(100.0, 900.0, PIXELS)
-BLUE = np.linspace(300.0, 50.0, PIXELS)
-
-
 def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
     rng = np.random.default_rng(299)
-    shape = np.zeros(FRAMES)
+    star, blue, shape, loss = np.linspace(100.0, 900.0, 40), np.linspace(300.0, 50.0, 40), np.zeros(300), np.ones(300)
     shape[80:100] = np.exp(-np.arange(20) / 6.0)
-    loss = np.ones(FRAMES)
     loss[200:215] = 1.15
-    mean = (STAR + shape[:, None] * BLUE) * loss[:, None]
+    mean = (star + shape[:, None] * blue) * loss[:, None]
     error = np.full(mean.shape, 15.0)
-    wavelength = np.linspace(200.0, 700.0, PIXELS)
-    frames = Frames.of(np.arange(FRAMES) * 60.0, rng.normal(mean, error), error, wavelength_nm=wavelength)
+    wavelength = np.linspace(200.0, 700.0, 40)
+    frames = Frames.of(np.arange(300) * 60.0, rng.normal(mean, error), error, wavelength_nm=wavelength)
     events = analysed(frames).events
     flare, change = (next(row for row in events if row["istart"] <= at <= row["istop"]) for at in (82, 205))
     assert flare["blue_over_red"] > 2
@@ -74,22 +68,15 @@ def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
     assert change["p_no_colour"] > 1e-4
 
 
-SHARE = 0.8
-
-
-@pytest.fixture
-def study(tmp_path: Path) -> Study:
-    (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
-    star = {"library": "M3V", "magnitude": 9.0, "neighbours": tmp_path / "near.csv", "neighbour_share": SHARE}
-    return Study.model_validate({"star": [star], "search": {"per": "day"}})
-
-
 def electrons(source: Source) -> float:
     return float(expect(source, Instrument.load("mauvesim"), exposure=50.0).source_electrons.sum())
 
 
-def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(study: Study) -> None:
+def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(tmp_path: Path) -> None:
     """The light of a flare of unit amplitude on each star, made by hand, says how large it must be."""
+    (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
+    star = {"library": "M3V", "magnitude": 9.0, "neighbours": tmp_path / "near.csv", "neighbour_share": 0.8}
+    study = Study.model_validate({"star": [star], "search": {"per": "day"}})
     rng = np.random.default_rng(3)
     time = np.arange(400) * 60.0
     flux = rng.normal(1000.0, 5.0, 400)
@@ -100,7 +87,7 @@ def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(st
     assert table["star"].tolist() == ["M3V V = 9", "B", "C"] * n
     stars = [Source.from_library(x).at_magnitude(m) for x, m in (("M3V", 9.0), ("M4V", 10.0), ("G2V", 12.0))]
     light = np.array([electrons(one) for one in stars])
-    shares = np.array([1.0, SHARE, SHARE])
+    shares = np.array([1.0, 0.8, 0.8])
     rise = shares * (np.array([electrons(one.flaring(1.0)) for one in stars]) - light) / (shares @ light)
     np.testing.assert_allclose(table["amplitude"], table["ampl_rec"] / np.tile(rise, n), rtol=1e-9)
     duration = [one.equivalent_duration_s for one in answer.analysis.events for _ in stars]

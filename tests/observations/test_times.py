@@ -68,12 +68,15 @@ def test_the_satellites_place_counts_with_its_light_travel_time(start: str, kind
     assert words in found.remarks[0]
 
 
-def test_other_scales_give_the_same_instants() -> None:
+def test_other_scales_give_the_same_instants_and_barycentric_times_stay() -> None:
     utc = observed.barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
     tt = Frames.of(TIME, FLUX, reference_mjd=float(Time(NEAR, scale="utc").tt.mjd), scale="tt", position="GEOCENTER")
     found = observed.barycentric(tt, AU_MIC)
     assert (found.reference_mjd - utc.reference_mjd) * 86_400 == pytest.approx(0.0, abs=2e-6)
     np.testing.assert_allclose(found.time_s, utc.time_s, atol=1e-6)
+    again = observed.barycentric(utc, AU_MIC)
+    np.testing.assert_array_equal(again.time_s, utc.time_s)
+    assert "barycentric already" in again.remarks[-1]
 
 
 def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,13 +87,6 @@ def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(place, download)
     later = Frames.of(TIME, FLUX, reference_mjd=70_000.0, scale="utc", position="TOPOCENTER")
     assert observed.barycentric(later, AU_MIC, ORBIT).position == "BARYCENTER"
-
-
-def test_barycentric_times_stay_as_they_are() -> None:
-    once = observed.barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
-    again = observed.barycentric(once, AU_MIC)
-    np.testing.assert_array_equal(again.time_s, once.time_s)
-    assert "barycentric already" in again.remarks[-1]
 
 
 @pytest.mark.long
