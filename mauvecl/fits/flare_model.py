@@ -183,14 +183,7 @@ class FlareModel:
         return cls(log_k, counts[:NODES], counts[NODES:], names, tuple(derived))
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
-        """Return the model of exposures that are n times as long, with a known factor on all light.
-
-        Parameters
-        ----------
-        n : int
-        light : float
-            Mean share of the flare's light that reaches the detector.
-        """
+        """Return the model of exposures that are n times as long, of which a share `light` of all light arrives."""
         derived = list(self.derived)
         for k, each in enumerate(derived):
             if each.name.startswith("energy") and each.factors is not None:
@@ -635,12 +628,9 @@ def variance_of(
 
 
 def usable_variance(
-    quiet: Expectation,
-    added_dn: Float | None = None,
-    skipped_nm: Ranges = (),
-    nuisances: Nuisances | None = None,
+    quiet: Expectation, added_dn: Float | None = None, skipped_nm: Ranges = (), nuisances: Nuisances | None = None,
     highest_dn: Float | None = None,
-) -> tuple[Float, NDArray[np.bool_]]:
+) -> tuple[Float, NDArray[np.bool_]]:  # fmt: skip
     """Return `variance_of` without skipped pixels, at the unknowns' means; raises InputError without a pixel."""
     if nuisances and nuisances.mean_dn.any():
         added_dn = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn

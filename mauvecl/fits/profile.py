@@ -219,10 +219,10 @@ def intervals(
     give no limit within the model's temperatures.
     """
     low, high = profile.ends(best, at_nodes, allowed)
-    first, last = np.where(np.isnan(low), profile.nodes[0], low), np.where(np.isnan(high), profile.nodes[-1], high)
+    start, stop = np.where(np.isnan(low), profile.nodes[0], low), np.where(np.isnan(high), profile.nodes[-1], high)
     # Samples are even in the angle of a sine, because the remaining rise goes to zero at the ends like a root.
     angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
-    x = (first + last)[:, None] / 2 + (last - first)[:, None] / 2 * np.sin(angle)
+    x = (start + stop)[:, None] / 2 + (stop - start)[:, None] / 2 * np.sin(angle)
     products, factor_at = profile.products(x), profile.factor_at(x)
     faces, light = list(profile.faces(products)), profile.reduction.light
     least, factor = best.gain[:, None] - allowed, profile.factor(best.log_k, best.linear)

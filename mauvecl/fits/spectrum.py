@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -225,7 +226,7 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
+    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
     log_k, linear, cut = problem.pilot()
     near, every = bool(cut.any()), np.arange(len(cut))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
@@ -248,24 +249,14 @@ def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         yield rows[start : start + BATCH]
 
 
-@dataclass(frozen=True, eq=False)
 class _Problem:
     """Exposures, and the model of the flares that are fitted to them."""
 
-    raw: NDArray[Any]  # frames, shape (n, n_pixel)
-    mean_dn: Float  # of frames without a flare
-    quiet: Expectation
-    model: FlareModel
-    nuisances: Nuisances | None
-    levels: tuple[float, ...]
-    skipped_nm: Ranges
-
-    @classmethod
-    def of(
-        cls, frames: ArrayLike, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None,
+    def __init__(
+        self, frames: ArrayLike, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None,
         levels: Sequence[float], skipped_nm: Ranges,
-    ) -> Self:  # fmt: skip
-        """Subtract the mean without a flare from exposures; raises InputError as `fit` does."""
+    ) -> None:  # fmt: skip
+        """Raise InputError as `fit` does."""
         raw = np.atleast_2d(np.asarray(frames))
         if raw.ndim != 2 or not len(raw) or raw.shape[1] != quiet.wavelength_nm.size:
             raise InputError(
@@ -275,20 +266,12 @@ class _Problem:
             raise InputError("frames must hold finite numbers, but some are undefined", key="frames")
         if not levels:
             raise InputError.of("levels", levels, "at least one probability")
-        mean = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
-        return cls(raw, mean, quiet, model, nuisances, tuple(levels), skipped_nm)
-
-    @property
-    def rises(self) -> list[float]:
-        """Rises of chi-squared at the ends of intervals of each level."""
-        return [float(scipy.stats.chi2.isf(1 - level, 1)) for level in self.levels]
-
-    def reduction(
-        self, added_dn: Float | None, highest_dn: Float | None = None, clipped: NDArray[np.bool_] | None = None
-    ) -> Reduction:
-        """Return the reduction of exposures with a flare; see `Reduction.of`."""
-        return Reduction.of(self.model, self.quiet, added_dn, self.nuisances, self.skipped_nm, highest_dn=highest_dn,
-                            clipped=clipped)  # fmt: skip
+        self.raw, self.quiet, self.model, self.nuisances, self.levels = raw, quiet, model, nuisances, tuple(levels)
+        #: Mean of the frames without a flare, and rises of chi-squared at the ends of intervals of each level.
+        self.mean_dn = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
+        self.rises = [float(scipy.stats.chi2.isf(1 - level, 1)) for level in levels]
+        #: Reduction of exposures with a flare, for its mean and further options of `Reduction.of`.
+        self.reduction = partial(Reduction.of, model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
 
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
         """Yield frames less their mean without a flare, in blocks that fit into a processor's cache."""
@@ -370,7 +353,7 @@ class _Problem:
             own, clipped = rows[some], None
             if near and (raw[own].max(axis=0) > ceiling).any():
                 clipped = clipped_pixels(raw[own], quiet)
-            reduction = self.reduction(mean, highest, clipped)
+            reduction = self.reduction(mean, highest_dn=highest, clipped=clipped)
             yield from ((batch, reduction) for batch in _batches(own))
 
     def measured(self, rows: NDArray[np.intp], reduction: Reduction) -> Measurement:
@@ -394,22 +377,17 @@ class _Problem:
         return self.measurement(model, reduction, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
 
     def measurement(
-        self,
-        model: FlareModel,
-        reduction: Reduction,
-        profile: Profile,
-        best: BestFit,
-        quiescent: Float,
-        ends: tuple[Float, Float],
-        second: tuple[float, Slopes] | None = None,
-    ) -> Measurement:
+        self, model: FlareModel, reduction: Reduction, profile: Profile, best: BestFit, quiescent: Float,
+        ends: tuple[Float, Float], second: tuple[float, Slopes] | None = None,
+    ) -> Measurement:  # fmt: skip
         """Return the measurement of best fits with the ends of their intervals.
 
         `quiescent` is chi-squared without a flare. A second blackbody is given by its log temperature and the
         derivatives with respect to it.
         """
         chi2 = quiescent - best.gain
-        dof = np.count_nonzero(reduction.variance) - reduction.n_free - len(model.linear) - (1 if second is None else 2)
+        n_used = int(np.count_nonzero(reduction.variance))
+        dof = n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
         factor, log_k = profile.factor(best.log_k, best.linear), best.log_k
         spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])
         if second is not None:
@@ -630,7 +608,7 @@ def fit_two_temperatures(
     if any(derived.ratio is not None for derived in model.derived):
         raise InputError("the model must have blackbodies, with or without lines, and no Balmer jump", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
+    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
     parts, order, two = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
     for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):

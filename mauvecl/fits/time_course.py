@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
@@ -101,7 +102,7 @@ def _columns_of(found: Measurement, q: int) -> list[Column]:
         text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
         for side, values in zip(("lower", "higher"), ends, strict=True):
             named = f"{column}_{side.removesuffix('er')}_{100 * level:.0f}"
-            columns.append(Column(named, lambda _, ends=values: ends[:, q], unit, f"{side} {text}"))
+            columns.append(Column(named, partial(lambda ends, _: ends[:, q], values), unit, f"{side} {text}"))
     return columns
 
 
@@ -200,16 +201,9 @@ def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -
 
 
 def fit_bins(
-    raw: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    nuisances: Nuisances | None,
-    stare: Stare,
-    first: NDArray[np.intp],
-    count: NDArray[np.intp],
-    levels: Sequence[float] = LEVELS,
-    skipped_nm: Ranges = (),
-) -> MeasuredBins:
+    raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare,
+    first: NDArray[np.intp], count: NDArray[np.intp], levels: Sequence[float] = LEVELS, skipped_nm: Ranges = (),
+) -> MeasuredBins:  # fmt: skip
     """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
     strengths, end = known_strengths(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
@@ -377,7 +371,7 @@ class _Data:
     def residuals(self, theta: Float, whiten: Whiten) -> Float:
         """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
         rise, log_k = self.strengths(theta)
-        return whiten((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0]
+        return np.asarray(whiten((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0])
 
     def jacobian(self, theta: Float, whiten: Whiten) -> Float:
         """Return the derivatives of `residuals` with respect to the parameters, shape (n, 6)."""
@@ -508,14 +502,9 @@ def fit_cooling(
 
 
 def cooling_course(
-    event: Event,
-    measurement: Measurement,
-    frames: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    stare: Stare,
+    event: Event, measurement: Measurement, frames: Float, quiet: Expectation, model: FlareModel, stare: Stare,
     skipped_nm: Ranges = (),
-) -> CoolingCourse:
+) -> CoolingCourse:  # fmt: skip
     """Return a flare in the quantities of a fit and in each frame; parameters as for `fit_cooling`."""
     data = _data(frames, quiet, model, None, stare, event.form, skipped_nm)
     cooling = event.temperature
@@ -549,14 +538,9 @@ def cooling_event(measurement: Measurement, shape: Shape) -> Event:
 
 
 def _data(
-    raw: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    nuisances: Nuisances | None,
-    stare: Stare,
-    shape: Shape,
+    raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare, shape: Shape,
     skipped_nm: Ranges,
-) -> _Data:
+) -> _Data:  # fmt: skip
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
     clipped = clipped_pixels(raw, quiet)
     reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
