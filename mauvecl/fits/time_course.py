@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
@@ -26,6 +26,7 @@ from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare
+from mauvecl.host.arrays import array_cache
 from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
@@ -251,7 +252,6 @@ def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> 
     return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
 
 
-Pair = tuple[Float, Float]
 #: Whitens sums, (n, n_frame, n_sum), to the shape (n, n_frame n_sum).
 Whiten = Callable[[Float], Float]
 
@@ -274,7 +274,7 @@ class _Level:
     # Sums of a blackbody of amplitude 1 for a curve of 1, over log temperature.
     flare: scipy.interpolate.CubicSpline
 
-    def around(self, flare: Pair | None) -> Float:
+    def around(self, flare: tuple[Float, Float] | None) -> Float:
         """Return the changes for unit amplitude next to a flare of known strengths, shape (n_frame, n_sum)."""
         if flare is None or not self.curve.any():
             return self.sums
@@ -301,34 +301,32 @@ class _Data:
         """Return values of the frames that are proportional to the light, before the known losses of it."""
         return np.asarray(values / np.where(self.light > 0, self.light, 1.0))
 
-    def strengths(self, theta: Float) -> Pair:
-        """Return the amplitude and log temperature of each frame."""
-        rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
-        log_k = theta[3] + np.log(self._cooled(theta)[0])
-        return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
+    @cached_property
+    def flare(self) -> Callable[[Float], tuple[Float, Float, Float, Float]]:
+        """Function of the parameters that returns the amplitude and log temperature of each frame, and their slopes.
 
-    def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
-        """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
-        since = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0)
-        end = min(float(np.exp(theta[4])), 1.0)
-        return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end
+        These are the derivatives by the parameters, each of shape (6, n_frame).
+        """
+        return array_cache(2)(self._flare)
 
-    def slopes(self, theta: Float) -> Pair:
-        """Return the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
-        rise, log_k = self.strengths(theta)
+    def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
         width, amplitude, fold = np.exp(theta[[1, 2, 5]])
+        rise = amplitude * self.light * self.shape.mean_over(self.edges, theta[0], width)
+        # Temperatures over that at the peak, as in `Cooling`.
+        since, end = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0), min(float(np.exp(theta[4])), 1.0)
+        cooled = end + (1.0 - end) * np.exp(-since / fold)
+        log_k, (coolest, hottest) = theta[3] + np.log(cooled), self.model.log_k[[0, -1]]
         tau, span = (self.edges - theta[0]) / width, np.diff(self.edges, axis=1)[:, 0]
         at, factor = self.shape.at(tau), amplitude * self.light / span
         of_rise, of_log_k = np.zeros((2, len(PARAMETERS), rise.size))
         of_rise[0], of_rise[1] = factor * (at[:, 0] - at[:, 1]), rise - factor * width * np.diff(at * tau, axis=1)[:, 0]
         of_rise[2] = rise
-        cooled, since, end = self._cooled(theta)
         falling = (cooled - end) / cooled
         of_log_k[0], of_log_k[3], of_log_k[5] = (since > 0.0) * falling / fold, 1.0, falling * since / fold
         if theta[4] < 0.0:
             of_log_k[4] = end / cooled * (1.0 - (cooled - end) / (1.0 - end))
-        inside = (log_k > self.model.log_k[0]) & (log_k < self.model.log_k[-1])
-        return of_rise, of_log_k * inside
+        of_log_k *= (log_k > coolest) & (log_k < hottest)
+        return rise, np.clip(log_k, coolest, hottest), of_rise, of_log_k
 
     def whitening(self, theta: Float | None, *, none: bool = False) -> Whiten:
         """Return the whitening of residuals for the covariances of a flare, or of frames without one.
@@ -339,7 +337,7 @@ class _Data:
         """
         covariance, flare = self.quiet_covariance, None
         if theta is not None:
-            flare = self.strengths(theta)
+            flare = self.flare(theta)[:2]
             covariance = covariance + flare[0][:, None, None] * self.spread(flare[1])
         for jitter in self.jitters:
             changes = jitter.sd * jitter.around(flare)
@@ -370,12 +368,12 @@ class _Data:
 
     def residuals(self, theta: Float, whiten: Whiten) -> Float:
         """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
-        rise, log_k = self.strengths(theta)
+        rise, log_k, *_ = self.flare(theta)
         return np.asarray(whiten((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0])
 
     def jacobian(self, theta: Float, whiten: Whiten) -> Float:
         """Return the derivatives of `residuals` with respect to the parameters, shape (n, 6)."""
-        (rise, log_k), (of_rise, of_log_k) = self.strengths(theta), self.slopes(theta)
+        rise, log_k, of_rise, of_log_k = self.flare(theta)
         hot, slope = self.reduction.spline(log_k), self.reduction.spline(log_k, 1)
         return np.asarray(-whiten(of_rise[..., None] * hot + (rise * of_log_k)[..., None] * slope).T)
 
@@ -393,7 +391,7 @@ class _Quantity:
     def value(self, theta: Float, data: _Data) -> float:
         """Return the quantity of some parameters."""
         if self.spline is not None:
-            rise, log_k = data.strengths(theta)
+            rise, log_k, *_ = data.flare(theta)
             return self.factor * float(np.sum(data.intrinsic(rise) * self.spline(log_k)[:, 0]))
         if self.place == 0:
             return float(theta[0])
@@ -406,7 +404,7 @@ class _Quantity:
             gradient = np.zeros(len(PARAMETERS))
             gradient[[self.place, 3] if self.place == 4 else self.place] = 1.0
             return gradient
-        (rise, log_k), (of_rise, of_log_k) = data.strengths(theta), data.slopes(theta)
+        rise, log_k, of_rise, of_log_k = data.flare(theta)
         light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
         total = float(np.sum(data.intrinsic(rise) * light))
         return np.asarray(data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total)
@@ -489,9 +487,7 @@ def fit_cooling(
     spread = slopes @ covariance @ slopes.T
     ends = fit.ends(quantities, estimates, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
-    empty = np.full(theta.shape, -np.inf)
-    without = data.whitening(theta, none=True)
-    none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
+    none = float(np.sum(data.whitening(theta, none=True)(data.sums[None]) ** 2))
     return Measurement(
         tuple(quantity.name for quantity in quantities), tuple(quantity.unit for quantity in quantities),
         (-np.inf,) + (0.0,) * (len(quantities) - 1),
@@ -513,7 +509,7 @@ def cooling_course(
     logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
     theta = np.array([event.peak_s, *logs])
     values = {quantity.name: quantity.value(theta, data) for quantity in _quantities(data, stare, cooling=True)}
-    rise, log_k = data.strengths(theta)
+    rise, log_k, *_ = data.flare(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
     strengths = known_strengths(stare, quiet)
     drawn_dn = less_known(frames, quiet, strengths, used[None])[:, 0]
