@@ -462,8 +462,8 @@ class SingleFlareFit:
         edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
         y = _remove_baseline(np.asarray(sums[:, used], np.float64), weight, level)
 
-        def inner_products(peak: Float, log_width: Float) -> tuple[Float, Float]:
-            """Return products of shape and derivatives with each other, (n, 3, 3), and with the sums, (n, 3, K)."""
+        def inner_products(peak: Float, log_width: Float) -> Float:
+            """Return products of shape and derivatives with each other and with the sums, shape (n, 3, 3 + n_sum)."""
             width = np.exp(log_width)
             step = DIFFERENCE * width
             here, later, wider = (
@@ -474,20 +474,19 @@ class SingleFlareFit:
                 np.stack([here, (later - here) / DIFFERENCE, (wider - here) / DIFFERENCE], 2), weight, level
             )
             weighted = three * weight[:, :, None]
-            return np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
+            both = np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
+            return np.concatenate(both, axis=2)
 
         return self._climbed(inner_products, peak, log_width)
 
-    def _climbed(
-        self, inner_products: Callable[[Float, Float], tuple[Float, Float]], peak: Float, log_width: Float
-    ) -> FittedFlares:
+    def _climbed(self, inner_products: Callable[[Float, Float], Float], peak: Float, log_width: Float) -> FittedFlares:
         """Climb to the largest gains from starting points, by damped Newton steps (Marquardt 1963)."""
         n = peak.size
         products = inner_products(peak, log_width)
-        log_kelvin, amplitude, gain = self._brightest(products)
-        damping = np.full(n, DAMPING)
-        going = np.ones(n, np.bool_)
+        state = np.array([peak, log_width, *self._brightest(products)])
+        damping, going = np.full(n, DAMPING), np.ones(n, np.bool_)
         for _ in range(STEPS):
+            peak, log_width, log_kelvin, amplitude, gain = state
             information, pull = self._normal(products, amplitude, log_kelvin)
             diagonal = np.einsum("nii->ni", information)
             damped = information + (damping[:, None] * diagonal + 1e-12)[:, :, None] * np.eye(4)
@@ -495,22 +494,15 @@ class SingleFlareFit:
             move = np.where(going[:, None], np.clip(move, -LARGEST_STEP, LARGEST_STEP), 0.0)
             there = peak + move[:, 1] * np.exp(log_width), log_width + move[:, 2]
             tried = inner_products(*there)
-            kelvin, best, reached = self._brightest(tried)
-            better = going & (reached > gain)
-            small = np.abs(reached - gain) < ENOUGH
-            peak, log_width, log_kelvin, amplitude, gain = (
-                np.where(better, a, b)
-                for a, b in zip(
-                    (*there, kelvin, best, reached), (peak, log_width, log_kelvin, amplitude, gain), strict=True
-                )
-            )
-            products = tuple(  # type: ignore[assignment]
-                np.where(better[:, None, None], a, b) for a, b in zip(tried, products, strict=True)
-            )
+            reached = np.array([*there, *self._brightest(tried)])
+            better, small = going & (reached[4] > gain), np.abs(reached[4] - gain) < ENOUGH
+            state = np.where(better, reached, state)
+            products = np.where(better[:, None, None], tried, products)
             damping = np.where(better, damping / EASIER, damping * HARDER)
             going &= ~(small & better) & (damping < 1e6)
             if not going.any():
                 break
+        peak, log_width, log_kelvin, amplitude, gain = state
         information, _ = self._normal(products, amplitude, log_kelvin)
         covariance, n_free = np.zeros((n, 4, 4)), 4 if self.templates.coloured else 3
         covariance[:, :n_free, :n_free] = np.linalg.pinv(information[:, :n_free, :n_free], hermitian=True)
@@ -521,9 +513,9 @@ class SingleFlareFit:
         area, snr = self.bank.shape.equivalent_duration, np.sqrt(np.maximum(gain, 0.0))
         return FittedFlares.of(theta, covariance, area, snr, coloured=self.templates.coloured)
 
-    def _brightest(self, products: tuple[Float, Float]) -> tuple[Float, Float, Float]:
+    def _brightest(self, products: Float) -> tuple[Float, Float, Float]:
         """Return log temperature, amplitude and fall of chi-squared of the best fits of given shapes."""
-        shapes, data = products
+        shapes, data = np.split(products, [3], axis=2)
         length = np.sqrt(np.maximum(shapes[:, 0, 0], 1e-300))
         sums = data[:, 0] / length[:, None]
         profile = Profile(self.templates.mean_sums, sums)
@@ -571,9 +563,9 @@ class SingleFlareFit:
             terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
         return weight, terms
 
-    def _normal(self, products: tuple[Float, Float], amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
+    def _normal(self, products: Float, amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
         """Return information and gradient for log amplitude, peak in half-widths, log half-width, log temperature."""
-        shapes, data = products
+        shapes, data = np.split(products, [3], axis=2)
         spline = self.templates.mean_sums.spline
         r, dr = spline(log_kelvin), spline(log_kelvin, 1) * self.templates.coloured
         # Each derivative is a product of one in time and one in the sums.
