@@ -487,7 +487,7 @@ MUTATIONS: dict[str, Mutation] = {
             "np.dstack([slope, hot, *fixed, reduction.spline(x, 2)]))[0]",
             "np.dstack([normal, slope, hot, *fixed, reduction.spline(x, 2)]))[0][:, :, 1:]",
         ),
-        ("    changes = _orthogonal_to(normal, changes)\n", ""),
+        ('    changes = changes @ np.linalg.qr(along.transpose(0, 2, 1), mode="complete")[0][:, :, 1:]\n', ""),
     ),
     "one star without errors of its spectrum": (
         "test_one_star_determines_throughput_alone",

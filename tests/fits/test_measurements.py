@@ -115,22 +115,16 @@ def test_forecasts_agree_with_brute_force(
     base = np.interp(grid, s.wavelength_nm, s.flux_flam)
 
     def counts(amplitude: float, temperature: float, ratio: float, flux: float) -> np.ndarray:
-        body = Source.from_arrays(
-            s.wavelength_nm, mauvecl.Blackbody(temperature).flux(s.wavelength_nm), name="blackbody"
-        )
+        body = Source.from_arrays(s.wavelength_nm, mauvecl.Blackbody(temperature).flux(s.wavelength_nm))
         brightness = 10 ** (-0.4 * (s.magnitude("Kepler") - body.magnitude("Kepler")))
-        shape = BalmerFlare(temperature, max(ratio, 1.0)).flux(grid)
-        hot = amplitude * brightness * shape
+        hot = amplitude * brightness * BalmerFlare(temperature, max(ratio, 1.0)).flux(grid)
         tents = np.maximum(0.0, 1 - np.abs(np.subtract.outer(grid, CA_II_NM)) / 0.1).sum(axis=1) / 2.0
         lit = Source(grid, base + hot + flux * tents, "flaring", "test")
         return expect(lit, MAUVE, exposure=50.0).net_source_dn - x.net_source_dn
 
     at = np.array([0.3, kelvin, jump, line])
     steps = np.array([0.003, 10.0, 0.01, 1e-13])
-    derivatives = [
-        (counts(*(at + step)) - counts(*(at - step))) / (2 * size)
-        for size, step in zip(steps, np.diag(steps), strict=True)
-    ]
+    derivatives = [(counts(*(at + step)) - counts(*(at - step))) / (2 * step.sum()) for step in np.diag(steps)]
     variance = x.variance_dn2 + x.gain_dn_per_electron * counts(*at)
     if unknown:
         derivatives += [x.dark_dn, x.net_source_dn, x.sky_dn]
@@ -237,15 +231,12 @@ def test_bounded_intervals_agree_with_brute_force() -> None:
      ("flares/ADLeo_1497s.dat", (10.0, 10.0), (1.2, 3.0), (6500.0, 12_500.0))],
     ids=["912s", "1497s"],
 )  # fmt: skip
-def test_great_flare_of_ad_leo(
-    file: str, misfits: tuple[float, float], jumps: tuple[float, float], optical_k: tuple[float, float]
-) -> None:
+def test_great_flare_of_ad_leo(file: str, misfits: Any, jumps: Any, optical_k: Any) -> None:
     """Fit the mean exposure: no blackbody, a Balmer jump, and an interval that contains the optical 9500 K."""
     data, units = Path(__file__).parents[1] / "data", {"wavelength_unit": "Angstrom"}
-    ad_leo = Source.read(data / "flares" / "adleo_quiescent2.dat", extend="M3V", **units)  # type: ignore[arg-type]
-    flare = mauvecl.ObservedFlare.read(
-        data / file, data / "flares" / "adleo_quiescent2.dat", continue_at_k=9500.0, **units
-    )  # type: ignore[arg-type]
+    quiescent, how = data / "flares" / "adleo_quiescent2.dat", {"continue_at_k": 9500.0, **units}
+    ad_leo = Source.read(quiescent, extend="M3V", **units)  # type: ignore[arg-type]
+    flare = mauvecl.ObservedFlare.read(data / file, quiescent, **how)  # type: ignore[arg-type]
     nm = flare.grid(ad_leo.wavelength_nm)
     light = np.interp(nm, ad_leo.wavelength_nm, ad_leo.flux_flam) + flare.flux(nm)
     x, lit = (expect(one, MAUVE, exposure=50.0) for one in (ad_leo, Source(nm, light, "flaring", "test")))
