@@ -142,7 +142,6 @@ def test_forecasts_agree_with_brute_force(
 
 #: Vacuum wavelengths of lines of Ca II, nm.
 CA_II_NM = np.array([393.478, 396.959])
-COLUMNS = ("temperature", "amplitude", "flux 200-320 nm", "flux bolometric")
 
 
 @pytest.mark.long
@@ -152,7 +151,8 @@ def test_intervals_of_95_percent_cover(jump: bool, unknown: bool) -> None:
     """Fit 24 cells of 600 draws; 4 or 5 quantities of each fail in 2e-6 of seeds, and all cells together in as many."""
     x, m = quiet(), model(jump=jump)
     unknowns = free(x, sky=0.1) if unknown else None
-    columns = [m.names.index(name) for name in (*COLUMNS, *(["jump"] if jump else []))]
+    names = ["temperature", "amplitude", "flux 200-320 nm", "flux bolometric", *(["jump"] if jump else [])]
+    columns = [m.names.index(name) for name in names]
     n, covered = 600, np.zeros(len(columns), np.int64)
     cells = list(itertools.product((6000.0, 12_000.0, 30_000.0), (10.0, 100.0)))
     for cell, (kelvin, snr) in enumerate(cells):

@@ -81,7 +81,6 @@ def test_moments_equal_those_of_the_recipe(stares: Stares, method: Any) -> None:
 
 
 N_STARES, N_FRAMES = 10_000, 1000
-WOBBLING = {"jitters": {"light": 0.03, "temperature": 0.05}}
 
 
 @pytest.mark.long
@@ -90,7 +89,7 @@ WOBBLING = {"jitters": {"light": 0.03, "temperature": 0.05}}
     [
         # Sums as skewed as the expansion is used for: few counts in few pixels.
         ({"temperature_c": -20.0, "output_max_nm": 303.0}, {}, 2),
-        ({"output_max_nm": 309.0, "photon_noise": "poisson"}, WOBBLING, 3),
+        ({"output_max_nm": 309.0, "photon_noise": "poisson"}, {"jitters": {"light": 0.03, "temperature": 0.05}}, 3),
     ],
     ids=["cold", "Poisson photons, jitter"],
 )

@@ -13,15 +13,13 @@ from scipy import stats
 from mauvecl import SHAPES, EnergyScale, Source, Study, plan
 from mauvecl.search import completeness
 
-QUICK = {"completeness": "closed form"}
-
 
 def planned(targets: dict[str, dict[str, Any]], kind: str = "K5V", **changes: Any) -> Any:
     """Return the plan of stars of V = 8 in 10 pc that differ in their rates."""
     star = {"coordinates": "10.5 -3.0", "spectral_type": kind, "magnitude": 8.0, "distance_pc": 10.0}
     rows = [{"name": name, **star, **rates} for name, rates in targets.items()]
-    sections = {"plan": QUICK | {"targets": rows} | changes.pop("plan", {}), "orbit": {"days": 3.0}} | changes
-    return plan(Study.build(sections, "test"))
+    asked = {"completeness": "closed form", "targets": rows} | changes.pop("plan", {})
+    return plan(Study.build({"plan": asked, "orbit": {"days": 3.0}} | changes, "test"))
 
 
 def rate(answer: Any, name: str, energy: Any) -> Any:
@@ -31,14 +29,6 @@ def rate(answer: Any, name: str, energy: Any) -> Any:
     seen = above > 0
     grid = np.log(table["energy"].value[seen])
     return np.exp(np.interp(np.log(energy), grid, np.log(above[seen])))
-
-
-def energy_scale(kind: str) -> tuple[float, float]:
-    """Return the energy of the light and the star's luminosity in Kepler's band, erg per second of duration."""
-    star = Source.from_library(kind).at_magnitude(8.0)
-    sphere = 4 * np.pi * (10 * u.pc).to_value(u.cm) ** 2
-    luminosity = sphere * through("Kepler", star.wavelength_nm, star.flux_flam)
-    return EnergyScale.of_star(star, 10.0, flare_k=10_000.0).erg_per_s, luminosity
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +46,9 @@ def answer(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 def test_rates_by_mass_and_age_equal_published_values(answer: Any) -> None:
     """Davenport et al. 2019 (TIME.md, section 3), whose energies are those of the star's light in the Kepler band."""
-    light, luminosity = energy_scale("K5V")
+    star = Source.from_library("K5V").at_magnitude(8.0)
+    light = EnergyScale.of_star(star, 10.0, flare_k=10_000.0).erg_per_s
+    luminosity = 4 * np.pi * (10 * u.pc).to_value(u.cm) ** 2 * through("Kepler", star.wavelength_nm, star.flux_flam)
     assert rate(answer, "young", 1e33 * light / luminosity) == pytest.approx(0.074131, rel=2e-5)
     # Fewer flares of older stars.
     assert rate(answer, "old", 1e33) < rate(answer, "young", 1e33)

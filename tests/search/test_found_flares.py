@@ -44,15 +44,14 @@ def found(events: list[Event], seed: int, settings: tuple[str, ...] = FAINT) -> 
 
 
 @cache
-def snr_per_amplitude() -> float:
-    """Return the S/N of a flare of half-width 1 s and amplitude 1 against the noise of the quiescent star."""
+def faint_snr() -> float:
     event = "events=[{peak_s=1000.0, half_width_s=100.0, amplitude=1e-4}]"
-    (row,) = stare(paper(*FAINT, "stare.search=false", event)).events
-    return float(row["snr"] / 1e-4 / np.sqrt(100.0))
+    return float(stare(paper(*FAINT, "stare.search=false", event)).events["snr"][0])
 
 
 def amplitude_of(snr: float, half_width_s: float) -> float:
-    return float(snr / snr_per_amplitude() / np.sqrt(half_width_s))
+    """Return the amplitude of a flare with an S/N against the noise of the quiescent star."""
+    return float(1e-4 * snr / faint_snr() * np.sqrt(100.0 / half_width_s))
 
 
 def test_bright_flare_is_found_once() -> None:
