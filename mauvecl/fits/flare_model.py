@@ -164,31 +164,26 @@ class FlareModel:
         grid = np.unique(np.concatenate([GRID_NM, *nodes]))
         bodies = np.array([blackbody(grid, float(k)) for k in kelvin])
         scale = _flux_ratios(star, band, kelvin)
-        extra = [balmer_continuum(grid, electron_temperature_k)] if jump else []
-        extra += [line.profile(grid) for line in chosen]
+        balmer = [balmer_continuum(grid, electron_temperature_k)] if jump else []
         names = ("amplitude", *(["balmer"] if jump else []), *(f"line {line.name}" for line in chosen))
-        matrix = response_matrix(instrument, grid, order)
+        fluxes = np.vstack([scale[:, None] * bodies, *balmer, *(line.profile(grid) for line in chosen)])
         dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
-        fluxes = np.vstack([scale[:, None] * bodies, *extra])
-        counts = np.asarray((matrix @ fluxes.T).T) * dn
+        counts = np.asarray((response_matrix(instrument, grid, order) @ fluxes.T).T) * dn
         # Flux of each component in each range, and over all wavelengths, for an amplitude of one.
         light = [(f"{low:g}-{high:g} nm", _between(grid, fluxes, low, high)) for low, high in bands_nm]
-        balmer = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
-        whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
+        edge = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
+        whole = [(edge.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(edge.edge_flux)] if jump else []
         bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
         light.append(("bolometric", np.concatenate([bodies_flux, whole, np.ones(len(chosen))])))
         derived = _derived(kelvin, scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
-        return cls(_accepted_logs(kelvin), counts[:NODES], counts[NODES:], names, tuple(derived))
+        log_k = np.log(kelvin)
+        # The exponential of the last one must be a temperature that is accepted.
+        while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
+            log_k[-1] = np.nextafter(log_k[-1], 0.0)
+        return cls(log_k, counts[:NODES], counts[NODES:], names, tuple(derived))
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
-        """Return the model of exposures that are n times as long, with a known factor on all light.
-
-        Parameters
-        ----------
-        n : int
-        light : float
-            Mean share of the flare's light that reaches the detector.
-        """
+        """Return the model of exposures that are n times as long, of which a share `light` of all light arrives."""
         derived = list(self.derived)
         for k, each in enumerate(derived):
             if each.name.startswith("energy") and each.factors is not None:
@@ -295,14 +290,6 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
             values[:, q] = derived.offset + ratio(log_k) * over
     return values
-
-
-def _accepted_logs(kelvin: Float) -> Float:
-    """Return the logarithms of the nodes; the exponential of the last one is a temperature that is accepted."""
-    log_k = np.log(kelvin)
-    while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
-        log_k[-1] = np.nextafter(log_k[-1], 0.0)
-    return log_k
 
 
 def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
@@ -576,7 +563,16 @@ class Reduction(MeanSums):
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
         weights, _ = spanning_weights(spanning, spanning * inverse, nuisances, rows, LEAST)
         hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
-        light = light_factor(model, unknown, rows)
+        light = None
+        if unknown is not None and unknown.has_factor:
+            # The last row of the Cholesky factor's inverse depends on the factor alone, given the other unknowns.
+            row, precision = rows[-1], float(unknown.sd[-1]) ** -2.0
+            own = float(row @ unknown.spectra[-1])
+            scale = (own + np.sqrt(own**2 + 4.0 * precision)) / 2.0
+            light = LightFactor(
+                row, scale, 1.0 + float(unknown.mean[-1]), model.log_k, model.hot @ row, model.fixed @ row,
+                precision / scale**2, unknown.factor_prior,
+            )  # fmt: skip
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
 
     def quiescent_chi2(self, excess_dn: Float) -> Float:
@@ -584,11 +580,6 @@ class Reduction(MeanSums):
         inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=self.variance > 0.0)
         unknown = excess_dn @ self.rows.T
         return np.asarray(excess_dn**2 @ inverse - np.vecdot(unknown, unknown))
-
-    @property
-    def n_used(self) -> int:
-        """Number of used pixels."""
-        return int((self.variance > 0.0).sum())
 
 
 def spanning_weights(
@@ -618,20 +609,6 @@ def spanning_weights(
     return (vectors[:, large] / length[:, None] / np.sqrt(values[large])).T @ optimal, length
 
 
-def light_factor(model: FlareModel, unknown: Nuisances | None, rows: Float) -> LightFactor | None:
-    """Return the factor on all light if it is among the unknowns, from `Nuisances.around` and its `rows`."""
-    if unknown is None or not unknown.has_factor:
-        return None
-    # The last row of the Cholesky factor's inverse depends on the factor alone, given the other unknowns.
-    row, precision = rows[-1], float(unknown.sd[-1]) ** -2.0
-    own = float(row @ unknown.spectra[-1])
-    scale = (own + np.sqrt(own**2 + 4.0 * precision)) / 2.0
-    return LightFactor(
-        row, scale, 1.0 + float(unknown.mean[-1]), model.log_k, model.hot @ row, model.fixed @ row,
-        precision / scale**2, unknown.factor_prior,
-    )  # fmt: skip
-
-
 def variance_of(
     quiet: Expectation, added_dn: Float | None = None, highest_dn: Float | None = None
 ) -> tuple[Float, NDArray[np.bool_]]:
@@ -651,12 +628,9 @@ def variance_of(
 
 
 def usable_variance(
-    quiet: Expectation,
-    added_dn: Float | None = None,
-    skipped_nm: Ranges = (),
-    nuisances: Nuisances | None = None,
+    quiet: Expectation, added_dn: Float | None = None, skipped_nm: Ranges = (), nuisances: Nuisances | None = None,
     highest_dn: Float | None = None,
-) -> tuple[Float, NDArray[np.bool_]]:
+) -> tuple[Float, NDArray[np.bool_]]:  # fmt: skip
     """Return `variance_of` without skipped pixels, at the unknowns' means; raises InputError without a pixel."""
     if nuisances and nuisances.mean_dn.any():
         added_dn = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn

@@ -219,7 +219,10 @@ def intervals(
     give no limit within the model's temperatures.
     """
     low, high = profile.ends(best, at_nodes, allowed)
-    x = _temperature_samples(profile.nodes, low, high)
+    start, stop = np.where(np.isnan(low), profile.nodes[0], low), np.where(np.isnan(high), profile.nodes[-1], high)
+    # Samples are even in the angle of a sine, because the remaining rise goes to zero at the ends like a root.
+    angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
+    x = (start + stop)[:, None] / 2 + (stop - start)[:, None] / 2 * np.sin(angle)
     products, factor_at = profile.products(x), profile.factor_at(x)
     faces, light = list(profile.faces(products)), profile.reduction.light
     least, factor = best.gain[:, None] - allowed, profile.factor(best.log_k, best.linear)
@@ -257,14 +260,6 @@ def intervals(
     return np.maximum(lows, model.bounds) if profile.bounded else lows, highs
 
 
-def _temperature_samples(nodes: Float, low: Float, high: Float) -> Float:
-    """Return log temperatures between the ends of intervals, or those of the model if undefined, (n, n_sample)."""
-    first, last = np.where(np.isnan(low), nodes[0], low), np.where(np.isnan(high), nodes[-1], high)
-    # Samples are even in the angle of a sine, because the remaining rise goes to zero at the ends like a root.
-    angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
-    return (first + last)[:, None] / 2 + (last - first)[:, None] / 2 * np.sin(angle)
-
-
 def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:
     """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
 
@@ -297,8 +292,18 @@ def _ratio_ends(products: Products, faces: list[Face], per: Float, least: Float)
                 # Without a blackbody the light is recombination, or there is none, which every ratio allows.
                 np.copyto(highs, np.inf, where=allowed)
             continue
-        yt, yf, tt, tf, ff, explained, (by_y, by_t, by_f) = products.less_lines(list(face.some[1:]), per)
-        rest = least - explained
+        # Products of sums y, blackbody t and recombination f, the fixed component 0 over `per`, less their projections
+        # on the lines of the face.
+        lines, edge = face.some[1:], products.gram[0, 0] / per**2
+        y, t, f = products.fixed[lines], products.cross[lines], products.gram[lines, 0].reshape(-1, 1, 1) / per
+        inverse = np.linalg.inv(products.gram[np.ix_(lines, lines)])
+        by_y, by_t, by_f = (np.tensordot(inverse, each, 1) for each in (y, t, f))
+        yt, tt = (each - np.sum(t * by, axis=0) for each, by in ((products.along, by_y), (products.power, by_t)))
+        yf, tf, ff = (
+            each - np.sum(f * by, axis=0)
+            for each, by in ((products.fixed[0] / per, by_y), (products.cross[0] / per, by_t), (edge, by_f))
+        )
+        rest = least - np.sum(y * by_y, axis=0)
         # (yt + r yf)^2 = rest |t + r f|^2 at the ends r.
         a, b, c = yf**2 - rest * ff, yt * yf - rest * tf, yt**2 - rest * tt
         inside = b**2 - a * c
@@ -383,7 +388,12 @@ def _simulated_thresholds(
     distances = np.concatenate([-distances, distances])
     out = np.repeat(distances, len(noise))
     draws = np.column_stack([np.ones(out.size), out, np.tile(noise, (distances.size, 1))])
-    tried = _nodes_around(nodes, x, error)
+    # Evenly spaced nodes around the temperatures, (n, TRIED).
+    last = nodes.size - 1
+    step = (nodes[-1] - nodes[0]) / last
+    stride = np.clip(2 * REACH * error / step / (TRIED - 1), 1, last // (TRIED - 1)).astype(np.intp)
+    first = np.rint((x - nodes[0]) / step).astype(np.intp) - stride * (TRIED // 2)
+    tried = np.clip(first, 0, last - stride * (TRIED - 1))[:, None] + stride[:, None] * np.arange(TRIED)
     root = np.empty((rows.size, out.size))
     for start in range(0, rows.size, ENDS_AT_ONCE):
         some = slice(start, start + ENDS_AT_ONCE)
@@ -428,26 +438,13 @@ def _sums_at_end(
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
     changes = np.linalg.qr(np.dstack([slope, hot, *fixed, reduction.spline(x, 2)]))[0]
-    changes = _orthogonal_to(normal, changes)
-    return np.concatenate([mean[:, None], normal[:, None], changes.transpose(0, 2, 1)], axis=1), np.vecdot(mean, there)
-
-
-def _orthogonal_to(normal: Float, directions: Float) -> Float:
-    """Return orthonormal directions of a space, (n, k, n_direction), less a unit vector in it, (n, k)."""
-    along = normal[:, None] @ directions
-    # The largest component comes first, so that rounding does not decide on the sign of the reflection.
+    # The directions orthogonal to the gradient: its largest component comes first, so that rounding does not decide on
+    # the sign of the reflection.
+    along = normal[:, None] @ changes
     order = (np.abs(along).argmax(axis=2)[:, :, None] + np.arange(along.shape[2])) % along.shape[2]
-    along, directions = (np.take_along_axis(values, order, axis=2) for values in (along, directions))
-    return np.asarray(directions @ np.linalg.qr(along.transpose(0, 2, 1), mode="complete")[0][:, :, 1:])
-
-
-def _nodes_around(nodes: Float, x: Float, error: Float) -> NDArray[np.intp]:
-    """Return the numbers of evenly spaced nodes around log temperatures with some errors, shape (n, TRIED)."""
-    last = nodes.size - 1
-    step = (nodes[-1] - nodes[0]) / last
-    stride = np.clip(2 * REACH * error / step / (TRIED - 1), 1, last // (TRIED - 1)).astype(np.intp)
-    first = np.rint((x - nodes[0]) / step).astype(np.intp) - stride * (TRIED // 2)
-    return np.asarray(np.clip(first, 0, last - stride * (TRIED - 1))[:, None] + stride[:, None] * np.arange(TRIED))
+    along, changes = (np.take_along_axis(values, order, axis=2) for values in (along, changes))
+    changes = changes @ np.linalg.qr(along.transpose(0, 2, 1), mode="complete")[0][:, :, 1:]
+    return np.concatenate([mean[:, None], normal[:, None], changes.transpose(0, 2, 1)], axis=1), np.vecdot(mean, there)
 
 
 def _as_probable(root: Float, out: Float, z: float) -> Float:
@@ -529,7 +526,7 @@ def covariance(
     log_k, linear, light = best.log_k, best.linear, reduction.light
     fixed = np.broadcast_to(reduction.fixed, (log_k.size, *reduction.fixed.shape))
     columns = [reduction.spline(log_k)[:, None], fixed, (linear[:, :1] * reduction.spline(log_k, 1))[:, None]]
-    gradients = [gradient_of(model, log_k, linear)]
+    gradients = [_gradient(model, log_k, linear)]
     if other is not None:
         columns.append(other.sums[:, None])
         gradients.append(other.quantities[:, :, None])
@@ -557,7 +554,7 @@ def covariance(
     return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1) + own)
 
 
-def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:
+def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
     """Return derivatives with respect to amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
     n, m = linear.shape
     gradient = np.zeros((n, len(model.derived), m + 1))
@@ -620,25 +617,6 @@ class Products:
         amplitude = (self.along - np.sum(self.cross[which] * alone, axis=0)) / power
         others, gain = alone - amplitude * share, gain + amplitude**2 * power
         return Face(which, hot, self.bounded, inverse, others, gain, amplitude, power, share)
-
-    def less_lines(self, lines: list[int], per: Float) -> tuple[Float, Float, Float, Float, Float, Float, list[Float]]:
-        """Return products of sums y, blackbody t and recombination f less their projections on some lines.
-
-        Recombination, the fixed component 0, is divided by `per`. After yt, yf, tt, tf and ff follow the decrease of
-        chi-squared by the lines, and the lines' amplitudes in each of y, t and f.
-        """
-        inverse = np.linalg.inv(self.gram[np.ix_(lines, lines)])
-        y, t, f = self.fixed[lines], self.cross[lines], self.gram[lines, 0].reshape(-1, 1, 1) / per
-        by = [np.tensordot(inverse, each, 1) for each in (y, t, f)]
-
-        def less(whole: Float, one: Float, other: Float) -> Float:
-            return np.asarray(whole - np.sum(one * other, axis=0))
-
-        return (
-            less(self.along, t, by[0]), less(self.fixed[0] / per, f, by[0]), less(self.power, t, by[1]),
-            less(self.cross[0] / per, f, by[1]), less(self.gram[0, 0] / per**2, f, by[2]),
-            np.sum(y * by[0], axis=0), by,
-        )  # fmt: skip
 
 
 class FactorAt(NamedTuple):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -225,7 +226,7 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
+    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
     log_k, linear, cut = problem.pilot()
     near, every = bool(cut.any()), np.arange(len(cut))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
@@ -248,24 +249,14 @@ def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         yield rows[start : start + BATCH]
 
 
-@dataclass(frozen=True, eq=False)
 class _Problem:
     """Exposures, and the model of the flares that are fitted to them."""
 
-    raw: NDArray[Any]  # frames, shape (n, n_pixel)
-    mean_dn: Float  # of frames without a flare
-    quiet: Expectation
-    model: FlareModel
-    nuisances: Nuisances | None
-    levels: tuple[float, ...]
-    skipped_nm: Ranges
-
-    @classmethod
-    def of(
-        cls, frames: ArrayLike, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None,
+    def __init__(
+        self, frames: ArrayLike, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None,
         levels: Sequence[float], skipped_nm: Ranges,
-    ) -> Self:  # fmt: skip
-        """Subtract the mean without a flare from exposures; raises InputError as `fit` does."""
+    ) -> None:  # fmt: skip
+        """Raise InputError as `fit` does."""
         raw = np.atleast_2d(np.asarray(frames))
         if raw.ndim != 2 or not len(raw) or raw.shape[1] != quiet.wavelength_nm.size:
             raise InputError(
@@ -275,20 +266,12 @@ class _Problem:
             raise InputError("frames must hold finite numbers, but some are undefined", key="frames")
         if not levels:
             raise InputError.of("levels", levels, "at least one probability")
-        mean = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
-        return cls(raw, mean, quiet, model, nuisances, tuple(levels), skipped_nm)
-
-    @property
-    def rises(self) -> list[float]:
-        """Rises of chi-squared at the ends of intervals of each level."""
-        return [float(scipy.stats.chi2.isf(1 - level, 1)) for level in self.levels]
-
-    def reduction(
-        self, added_dn: Float | None, highest_dn: Float | None = None, clipped: NDArray[np.bool_] | None = None
-    ) -> Reduction:
-        """Return the reduction of exposures with a flare; see `Reduction.of`."""
-        return Reduction.of(self.model, self.quiet, added_dn, self.nuisances, self.skipped_nm, highest_dn=highest_dn,
-                            clipped=clipped)  # fmt: skip
+        self.raw, self.quiet, self.model, self.nuisances, self.levels = raw, quiet, model, nuisances, tuple(levels)
+        #: Mean of the frames without a flare, and rises of chi-squared at the ends of intervals of each level.
+        self.mean_dn = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
+        self.rises = [float(scipy.stats.chi2.isf(1 - level, 1)) for level in levels]
+        #: Reduction of exposures with a flare, for its mean and further options of `Reduction.of`.
+        self.reduction = partial(Reduction.of, model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
 
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
         """Yield frames less their mean without a flare, in blocks that fit into a processor's cache."""
@@ -370,7 +353,7 @@ class _Problem:
             own, clipped = rows[some], None
             if near and (raw[own].max(axis=0) > ceiling).any():
                 clipped = clipped_pixels(raw[own], quiet)
-            reduction = self.reduction(mean, highest, clipped)
+            reduction = self.reduction(mean, highest_dn=highest, clipped=clipped)
             yield from ((batch, reduction) for batch in _batches(own))
 
     def measured(self, rows: NDArray[np.intp], reduction: Reduction) -> Measurement:
@@ -394,22 +377,17 @@ class _Problem:
         return self.measurement(model, reduction, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
 
     def measurement(
-        self,
-        model: FlareModel,
-        reduction: Reduction,
-        profile: Profile,
-        best: BestFit,
-        quiescent: Float,
-        ends: tuple[Float, Float],
-        second: tuple[float, Slopes] | None = None,
-    ) -> Measurement:
+        self, model: FlareModel, reduction: Reduction, profile: Profile, best: BestFit, quiescent: Float,
+        ends: tuple[Float, Float], second: tuple[float, Slopes] | None = None,
+    ) -> Measurement:  # fmt: skip
         """Return the measurement of best fits with the ends of their intervals.
 
         `quiescent` is chi-squared without a flare. A second blackbody is given by its log temperature and the
         derivatives with respect to it.
         """
         chi2 = quiescent - best.gain
-        dof = reduction.n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
+        n_used = int(np.count_nonzero(reduction.variance))
+        dof = n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
         factor, log_k = profile.factor(best.log_k, best.linear), best.log_k
         spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])
         if second is not None:
@@ -515,7 +493,7 @@ def forecast_model(
     one, own, slopes = single, reduction, None
     if isinstance(model, TwoTemperatures):
         second, log_k = float(log_k[1]), log_k[:1]
-        one, own = model.at(second), model.reduction_at(second, reduction)
+        one, own = model.at(second), reduction.with_second(second, model.end(second))
         slopes = model.slopes(second, reduction, log_k, linear)
     sums = linear[0] @ np.vstack([own.spline(log_k), own.fixed])
     spread = covariance(one, own, BestFit(log_k, linear, np.array([sums @ sums])), np.array([factor]), slopes)[0]
@@ -554,14 +532,14 @@ class TwoTemperatures:
         assert spline is not None
         return spline
 
-    def _end(self, log_k: float) -> int:
+    def end(self, log_k: float) -> int:
         """Return the number of nodes that are at least `APART` nodes below a temperature."""
         nodes = self.single.log_k
         return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
 
     def at(self, log_k: float) -> FlareModel:
         """Return a model of lower temperatures with a blackbody of a second temperature as another component."""
-        single, end = self.single, self._end(log_k)
+        single, end = self.single, self.end(log_k)
 
         def area(x: Float | float) -> Float:
             # The ratio of the flux at the telescope to that at the surface is proportional to the area.
@@ -580,10 +558,6 @@ class TwoTemperatures:
             (single.linear[0], "second", *single.linear[1:]),
             (*map(both, single.derived, single.splines), kelvin, share),
         )  # fmt: skip
-
-    def reduction_at(self, log_k: float, reduction: Reduction) -> Reduction:
-        """Return the response to the flares of `at`, from that of the model of one blackbody."""
-        return reduction.with_second(log_k, self._end(log_k))
 
     def slopes(self, log_k: float, reduction: Reduction, lower: Float, linear: Float) -> Slopes:
         """Return derivatives with respect to a second log temperature of flares with lower ones, (n,), and amplitudes.
@@ -634,13 +608,20 @@ def fit_two_temperatures(
     if any(derived.ratio is not None for derived in model.derived):
         raise InputError("the model must have blackbodies, with or without lines, and no Balmer jump", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    problem = _Problem.of(frames, expectation, model, nuisances, levels, skipped_nm)
+    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
     parts, order, two = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
     for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
         whole, quiescent = problem.profile(reduction, rows), problem.quiescent_chi2(reduction, rows)
-        for here, log_k, profile, best, ends in _Search(two, whole, reduction, problem.rises).fits():
+        search = _Search(two, whole, reduction, problem.rises)
+        low, high = search.intervals()
+        best_node = search.gain.argmax(axis=1)
+        # Exposures with the same best second temperature are measured together.
+        for node in np.unique(best_node):
+            here, log_k = np.flatnonzero(best_node == node), float(search.grid[node])
+            profile, ends = search.profile(int(node), here), (low[:, here], high[:, here])
+            best = replace(profile.best(profile.gain_at_nodes()), gain=search.gain[here, node])
             second = log_k, two.slopes(log_k, reduction, best.log_k, best.linear)
             parts.append(problem.measurement(two.at(log_k), reduction, profile, best, quiescent[here], ends, second))
             order.append(rows[here])
@@ -648,65 +629,45 @@ def fit_two_temperatures(
 
 
 class _Search:
-    """Fit of exposures with a common variance over second temperatures."""
+    """Largest gains of exposures with a common variance at second temperatures in and next to their intervals."""
 
-    def __init__(self, model: TwoTemperatures, profile: Profile, reduction: Reduction, allowed: list[float]) -> None:
-        self._model, self._whole, self._reduction, self._allowed = model, profile, reduction, allowed
-        nodes = reduction.log_k
-        #: Second log temperatures that may be tried.
-        self._grid = np.linspace(nodes[2 * APART], nodes[-1], PER_NODE * (nodes.size - 1 - 2 * APART) + 1)
-        self._gain = np.full((len(profile.sums), self._grid.size), -np.inf)
+    def __init__(self, model: TwoTemperatures, whole: Profile, reduction: Reduction, allowed: list[float]) -> None:
+        self._model, self._whole, self._reduction, self._allowed = model, whole, reduction, allowed
+        log_k = reduction.log_k
+        #: Second log temperatures that may be tried, and the largest gain at each, minus infinity if not tried.
+        self.grid = np.linspace(log_k[2 * APART], log_k[-1], PER_NODE * (log_k.size - 1 - 2 * APART) + 1)
+        self.gain = np.full((len(whole.sums), self.grid.size), -np.inf)
+        n, nodes = self.gain.shape
+        wanted = np.zeros((n, nodes), np.bool_)
+        wanted[:, ::COARSE] = True
+        # Twice around the intervals, since the first one may be a single temperature.
+        for margin in (COARSE, COARSE // 4, None):
+            for node in np.flatnonzero(wanted.any(axis=0)):
+                rows = np.flatnonzero(wanted[:, node] & np.isinf(self.gain[:, node]))
+                if rows.size:
+                    self.gain[rows, node] = self.profile(int(node), rows).best().gain
+            if margin is not None:
+                inside = self.gain >= self.gain.max(axis=1)[:, None] - max(allowed)
+                low = np.maximum(inside.argmax(axis=1) - margin, 0)
+                high = np.minimum(nodes - 1 - inside[:, ::-1].argmax(axis=1) + margin, nodes - 1)
+                wanted[:] = False
+                for share in np.linspace(0.0, 1.0, TRIES + 1):
+                    wanted[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
 
-    def _profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
-        own = self._model.reduction_at(float(self._grid[node]), self._reduction)
+    def profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
+        """Return the profile of some exposures at a second temperature."""
+        log_k = float(self.grid[node])
+        own = self._reduction.with_second(log_k, self._model.end(log_k))
         return BoundedProfile(own, *self._whole.rows(rows)[1:])
 
-    def _evaluate(self, wanted: NDArray[np.bool_]) -> None:
-        """Compute the largest gain at second temperatures, (n, n_node)."""
-        for node in np.flatnonzero(wanted.any(axis=0)):
-            rows = np.flatnonzero(wanted[:, node] & np.isinf(self._gain[:, node]))
-            if rows.size:
-                self._gain[rows, node] = self._profile(int(node), rows).best().gain
-
-    def _evaluate_intervals(self) -> None:
-        """Compute the largest gain at second temperatures in and next to the intervals."""
-        n, nodes = self._gain.shape
-        coarse = np.zeros((n, nodes), np.bool_)
-        coarse[:, ::COARSE] = True
-        self._evaluate(coarse)
-        # Twice, since the first interval may be a single temperature.
-        for margin in (COARSE, COARSE // 4):
-            inside = self._gain >= self._gain.max(axis=1)[:, None] - max(self._allowed)
-            low = np.maximum(inside.argmax(axis=1) - margin, 0)
-            high = np.minimum(nodes - 1 - inside[:, ::-1].argmax(axis=1) + margin, nodes - 1)
-            fine = np.zeros((n, nodes), np.bool_)
-            for share in np.linspace(0.0, 1.0, TRIES + 1):
-                fine[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
-            self._evaluate(fine)
-
-    def fits(self) -> Iterator[tuple[NDArray[np.intp], float, BoundedProfile, BestFit, tuple[Float, Float]]]:
-        """Yield exposures with the same best second temperature, and their fits.
-
-        These are the numbers of the exposures, the logarithm of the temperature, the profile at it, the best fits, and
-        the ends of intervals, (n_level, n, n_derived).
-        """
-        self._evaluate_intervals()
-        low, high = self._intervals()
-        best_node = self._gain.argmax(axis=1)
-        for node in np.unique(best_node):
-            rows = np.flatnonzero(best_node == node)
-            profile = self._profile(int(node), rows)
-            best = replace(profile.best(profile.gain_at_nodes()), gain=self._gain[rows, node])
-            yield rows, float(self._grid[node]), profile, best, (low[:, rows], high[:, rows])
-
-    def _intervals(self) -> tuple[Float, Float]:
-        """Return the ends of intervals, which are the outermost ones at all second temperatures."""
-        gain = self._gain.max(axis=1)
+    def intervals(self) -> tuple[Float, Float]:
+        """Return the ends of intervals, (n_level, n, n_derived): the outermost ones at all second temperatures."""
+        gain = self.gain.max(axis=1)
         shape = len(self._allowed), gain.size, len(self._model.names)
         lows, highs = np.full(shape, np.inf), np.full(shape, -np.inf)
-        for node in np.flatnonzero((self._gain >= gain[:, None] - max(self._allowed)).any(axis=0)):
-            rows = np.flatnonzero(self._gain[:, node] >= gain - max(self._allowed))
-            profile, model = self._profile(int(node), rows), self._model.at(float(self._grid[node]))
+        for node in np.flatnonzero((self.gain >= gain[:, None] - max(self._allowed)).any(axis=0)):
+            rows = np.flatnonzero(self.gain[:, node] >= gain - max(self._allowed))
+            profile, model = self.profile(int(node), rows), self._model.at(float(self.grid[node]))
             at_nodes = profile.gain_at_nodes()
             own = profile.best(at_nodes)
             for k, rise in enumerate(self._allowed):
@@ -718,21 +679,18 @@ class _Search:
                 low, high = intervals(model, some, limit, at_nodes[there], rise)
                 lows[k, rows[there]] = np.minimum(lows[k, rows[there]], low)
                 highs[k, rows[there]] = np.maximum(highs[k, rows[there]], high)
-        for k, rise in enumerate(self._allowed):
-            lows[k, :, -2], highs[k, :, -2] = self._second_ends(gain, rise)
+        for k, n in np.ndindex(shape[:2]):
+            lows[k, n, -2], highs[k, n, -2] = self._second_ends(n, np.sqrt(self._allowed[k]))
         return lows, highs
 
-    def _second_ends(self, gain: Float, allowed: float) -> tuple[Float, Float]:
-        """Return the ends of the second temperature's interval, interpolated between the tried nodes."""
-        low, high = np.full(gain.size, -np.inf), np.full(gain.size, np.inf)
-        for k in range(gain.size):
-            tried = np.flatnonzero(np.isfinite(self._gain[k]))
-            root = np.sqrt(np.maximum(gain[k] - self._gain[k, tried], 0.0)) - np.sqrt(allowed)
-            inside = np.flatnonzero(root <= 0)
-            x = self._grid[tried]
-            a, b = inside[0], inside[-1]
-            if a > 0:
-                low[k] = np.exp(np.interp(0.0, [root[a], root[a - 1]], [x[a], x[a - 1]]))
-            if b < tried.size - 1:
-                high[k] = np.exp(np.interp(0.0, [root[b], root[b + 1]], [x[b], x[b + 1]]))
+    def _second_ends(self, n: int, root: float) -> tuple[float, float]:
+        """Return the ends of the second temperature's interval of an exposure, interpolated between the tried nodes."""
+        tried = np.isfinite(self.gain[n])
+        x, gain, low, high = self.grid[tried], self.gain[n, tried], -np.inf, np.inf
+        over = np.sqrt(gain.max() - gain) - root
+        a, b = np.flatnonzero(over <= 0)[[0, -1]]
+        if a > 0:
+            low = float(np.exp(np.interp(0.0, [over[a], over[a - 1]], [x[a], x[a - 1]])))
+        if b < x.size - 1:
+            high = float(np.exp(np.interp(0.0, [over[b], over[b + 1]], [x[b], x[b + 1]])))
         return low, high

@@ -9,7 +9,7 @@ over. Those of all light change that of the flare as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
@@ -103,12 +103,8 @@ def _columns_of(found: Measurement, q: int) -> list[Column]:
         text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
         for side, values in zip(("lower", "higher"), ends, strict=True):
             named = f"{column}_{side.removesuffix('er')}_{100 * level:.0f}"
-            columns.append(Column(named, partial(_column, values, q), unit, f"{side} {text}"))
+            columns.append(Column(named, partial(lambda ends, _: ends[:, q], values), unit, f"{side} {text}"))
     return columns
-
-
-def _column(values: Float, q: int, _: object) -> Float:
-    return values[:, q]
 
 
 @validated
@@ -206,21 +202,14 @@ def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -
 
 
 def fit_bins(
-    raw: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    nuisances: Nuisances | None,
-    stare: Stare,
-    first: NDArray[np.intp],
-    count: NDArray[np.intp],
-    levels: Sequence[float] = LEVELS,
-    skipped_nm: Ranges = (),
-) -> MeasuredBins:
+    raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare,
+    first: NDArray[np.intp], count: NDArray[np.intp], levels: Sequence[float] = LEVELS, skipped_nm: Ranges = (),
+) -> MeasuredBins:  # fmt: skip
     """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
     strengths, end = known_strengths(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
-        mean = [*strengths[a:b].mean(axis=0), *spreads_of(stare, a, b).values()]
+        mean = [*strengths[a:b].mean(axis=0), *_spreads_of(stare, a, b)]
         alike.setdefault((float(b - a), *np.round(mean, DIGITS).tolist()), []).append(k)
     parts = []
     for (length, star, sky, dark, light, *spreads), rows in alike.items():
@@ -232,7 +221,13 @@ def fit_bins(
         )  # fmt: skip
         unknown = Nuisances.of(stacked, {}) if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
         for of, sd in zip(CHANGING, spreads, strict=True):
-            unknown = _with_change(unknown, stacked, of, sd)
+            name = CHANGED_PART[of]
+            if not sd > 0.0 or name in unknown.names:
+                continue
+            if name == "star":
+                unknown = unknown.with_spectrum(name, stacked.net_source_dn, sd)
+            elif spectrum_of(name, stacked).any():
+                unknown = unknown.joined(Nuisances.of(stacked, {name: sd}))
         added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
         own = unknown if unknown.names else None
         parts.append(fit(added, stacked, model.stacked(n, light), own, levels=levels, skipped_nm=skipped_nm))
@@ -240,24 +235,14 @@ def fit_bins(
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, measurement)
 
 
-def spreads_of(stare: Stare, first: int, end: int) -> dict[Changing, float]:
-    """Return the standard deviations of the unknown changes of a stare, averaged over some frames."""
+def _spreads_of(stare: Stare, first: int, end: int) -> list[float]:
+    """Return the standard deviations of the unknown changes of a stare, averaged over some frames, by `CHANGING`."""
     variances = {of: sd**2 / (end - first) for of, sd in stare.jitters.items()} | {"star": 0.0}
     for unknown in stare.unknowns:
         variances[unknown.of] += (unknown.sd * float(unknown.curve[first:end].mean())) ** 2
     if stare.pointing is not None:
         variances["light"] += stare.pointing.depth**2
-    return {of: float(np.sqrt(variances[of])) for of in CHANGING}
-
-
-def _with_change(unknown: Nuisances, quiet: Expectation, of: Changing, sd: float) -> Nuisances:
-    """Return nuisance parameters with an unknown change of a stare, unless they have one of the same kind."""
-    name = CHANGED_PART[of]
-    if not sd > 0.0 or name in unknown.names:
-        return unknown
-    if name == "star":
-        return unknown.with_spectrum(name, quiet.net_source_dn, sd)
-    return unknown.joined(Nuisances.of(quiet, {name: sd})) if spectrum_of(name, quiet).any() else unknown
+    return [float(np.sqrt(variances[of])) for of in CHANGING]
 
 
 def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
@@ -267,7 +252,8 @@ def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> 
     return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
 
 
-Pair = tuple[Float, Float]
+#: Whitens sums, (n, n_frame, n_sum), to the shape (n, n_frame n_sum).
+Whiten = Callable[[Float], Float]
 
 #: Parameters, all but the first as logarithms; the temperature at the end is relative to that at the peak.
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
@@ -288,7 +274,7 @@ class _Level:
     # Sums of a blackbody of amplitude 1 for a curve of 1, over log temperature.
     flare: scipy.interpolate.CubicSpline
 
-    def around(self, flare: Pair | None) -> Float:
+    def around(self, flare: tuple[Float, Float] | None) -> Float:
         """Return the changes for unit amplitude next to a flare of known strengths, shape (n_frame, n_sum)."""
         if flare is None or not self.curve.any():
             return self.sums
@@ -308,74 +294,61 @@ class _Data:
     jitters: tuple[_Level, ...]  # levels that differ from frame to frame
     reduction: Reduction
     model: FlareModel
-    gain: Float
     shape: Shape
+    spread: scipy.interpolate.CubicSpline  # covariance that a blackbody of amplitude 1 adds, over log temperature
 
     def intrinsic(self, values: Float) -> Float:
         """Return values of the frames that are proportional to the light, before the known losses of it."""
         return np.asarray(values / np.where(self.light > 0, self.light, 1.0))
 
     @cached_property
-    def spread(self) -> scipy.interpolate.CubicSpline:
-        """Covariance that a blackbody of amplitude 1 adds, over log temperature."""
-        weights = self.reduction.weights
-        added = np.einsum("ip,jp,tp->tij", weights, weights, self.model.hot * self.gain, optimize=True)
-        return scipy.interpolate.CubicSpline(self.model.log_k, added)
+    def flare(self) -> Callable[[Float], tuple[Float, Float, Float, Float]]:
+        """Function of the parameters that returns the amplitude and log temperature of each frame, and their slopes.
 
-    @cached_property
-    def strengths(self) -> Callable[[Float], Pair]:
-        """Function of the parameters that returns the amplitude and log temperature of each frame."""
+        These are the derivatives by the parameters, each of shape (6, n_frame).
+        """
+        return array_cache(2)(self._flare)
 
-        @array_cache(2)
-        def strengths(theta: Float) -> Pair:
-            rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
-            log_k = theta[3] + np.log(self._cooled(theta)[0])
-            return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
-
-        return strengths
-
-    @cached_property
-    def slopes(self) -> Callable[[Float], Pair]:
-        """Function that returns the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
-        return array_cache(2)(self._slopes)
-
-    def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
-        """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
-        since = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0)
-        end = min(float(np.exp(theta[4])), 1.0)
-        return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end
-
-    def _slopes(self, theta: Float) -> Pair:
-        rise, log_k = self.strengths(theta)
+    def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
         width, amplitude, fold = np.exp(theta[[1, 2, 5]])
+        rise = amplitude * self.light * self.shape.mean_over(self.edges, theta[0], width)
+        # Temperatures over that at the peak, as in `Cooling`.
+        since, end = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0), min(float(np.exp(theta[4])), 1.0)
+        cooled = end + (1.0 - end) * np.exp(-since / fold)
+        log_k, (coolest, hottest) = theta[3] + np.log(cooled), self.model.log_k[[0, -1]]
         tau, span = (self.edges - theta[0]) / width, np.diff(self.edges, axis=1)[:, 0]
         at, factor = self.shape.at(tau), amplitude * self.light / span
         of_rise, of_log_k = np.zeros((2, len(PARAMETERS), rise.size))
         of_rise[0], of_rise[1] = factor * (at[:, 0] - at[:, 1]), rise - factor * width * np.diff(at * tau, axis=1)[:, 0]
         of_rise[2] = rise
-        cooled, since, end = self._cooled(theta)
         falling = (cooled - end) / cooled
         of_log_k[0], of_log_k[3], of_log_k[5] = (since > 0.0) * falling / fold, 1.0, falling * since / fold
         if theta[4] < 0.0:
             of_log_k[4] = end / cooled * (1.0 - (cooled - end) / (1.0 - end))
-        inside = (log_k > self.model.log_k[0]) & (log_k < self.model.log_k[-1])
-        return of_rise, of_log_k * inside
+        of_log_k *= (log_k > coolest) & (log_k < hottest)
+        return rise, np.clip(log_k, coolest, hottest), of_rise, of_log_k
 
-    def whitening(self, theta: Float | None, *, none: bool = False) -> _Whitening:
+    def whitening(self, theta: Float | None, *, none: bool = False) -> Whiten:
         """Return the whitening of residuals for the covariances of a flare, or of frames without one.
+
+        Unknown levels shrink the values along their directions.
 
         With `none`, the unknown levels are those of frames without a flare, whose residuals are then compared.
         """
         covariance, flare = self.quiet_covariance, None
         if theta is not None:
-            flare = self.strengths(theta)
+            flare = self.flare(theta)[:2]
             covariance = covariance + flare[0][:, None, None] * self.spread(flare[1])
         for jitter in self.jitters:
             changes = jitter.sd * jitter.around(flare)
             covariance = covariance + changes[:, :, None] * changes[:, None, :]
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+
+        def plain(values: Float) -> Float:
+            return np.asarray((inverse @ values.transpose(1, 2, 0)).transpose(2, 0, 1).reshape(len(values), -1))
+
         if not self.unknown:
-            return _Whitening(inverse, np.zeros((0, self.sums.size)), np.zeros(0))
+            return plain
         changes = np.array([unknown.around(None if none else flare) for unknown in self.unknown])
         spectra = np.einsum("tij,utj->tiu", inverse, changes).reshape(self.sums.size, -1)
         # The prior acts as one more datum, which is not among the residuals because its mean is zero.
@@ -385,32 +358,24 @@ class _Data:
         values, vectors = np.linalg.eigh(basis @ basis.T)
         nonzero = values > 1e-12
         directions = vectors[:, nonzero].T @ basis / np.sqrt(values[nonzero])[:, None]
-        return _Whitening(inverse, directions, 1.0 - np.sqrt(np.maximum(1.0 - values[nonzero], 0.0)))
+        shrink = 1.0 - np.sqrt(np.maximum(1.0 - values[nonzero], 0.0))
 
-    def residuals(self, theta: Float, whitening: _Whitening) -> Float:
+        def marginalised(values: Float) -> Float:
+            sums = plain(values)
+            return np.asarray(sums - (shrink * (sums @ directions.T)) @ directions)
+
+        return marginalised
+
+    def residuals(self, theta: Float, whiten: Whiten) -> Float:
         """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
-        rise, log_k = self.strengths(theta)
-        return np.asarray(whitening.of((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0])
+        rise, log_k, *_ = self.flare(theta)
+        return np.asarray(whiten((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0])
 
-    def jacobian(self, theta: Float, whitening: _Whitening) -> Float:
+    def jacobian(self, theta: Float, whiten: Whiten) -> Float:
         """Return the derivatives of `residuals` with respect to the parameters, shape (n, 6)."""
-        (rise, log_k), (of_rise, of_log_k) = self.strengths(theta), self.slopes(theta)
+        rise, log_k, of_rise, of_log_k = self.flare(theta)
         hot, slope = self.reduction.spline(log_k), self.reduction.spline(log_k, 1)
-        return np.asarray(-whitening.of(of_rise[..., None] * hot + (rise * of_log_k)[..., None] * slope).T)
-
-
-@dataclass(frozen=True, eq=False)
-class _Whitening:
-    """Inverse Cholesky factors of the frames' covariances, and how much directions of unknown levels shrink."""
-
-    inverse: Float  # shape (n_frame, n_sum, n_sum)
-    directions: Float  # orthonormal, shape (n_unknown, n_frame n_sum)
-    shrink: Float
-
-    def of(self, values: Float) -> Float:
-        """Return whitened sums, shape (n, n_frame n_sum), of sums (n, n_frame, n_sum)."""
-        plain = (self.inverse @ values.transpose(1, 2, 0)).transpose(2, 0, 1).reshape(len(values), -1)
-        return np.asarray(plain - (self.shrink * (plain @ self.directions.T)) @ self.directions)
+        return np.asarray(-whiten(of_rise[..., None] * hot + (rise * of_log_k)[..., None] * slope).T)
 
 
 @dataclass(frozen=True)
@@ -426,7 +391,7 @@ class _Quantity:
     def value(self, theta: Float, data: _Data) -> float:
         """Return the quantity of some parameters."""
         if self.spline is not None:
-            rise, log_k = data.strengths(theta)
+            rise, log_k, *_ = data.flare(theta)
             return self.factor * float(np.sum(data.intrinsic(rise) * self.spline(log_k)[:, 0]))
         if self.place == 0:
             return float(theta[0])
@@ -439,7 +404,7 @@ class _Quantity:
             gradient = np.zeros(len(PARAMETERS))
             gradient[[self.place, 3] if self.place == 4 else self.place] = 1.0
             return gradient
-        (rise, log_k), (of_rise, of_log_k) = data.strengths(theta), data.slopes(theta)
+        rise, log_k, of_rise, of_log_k = data.flare(theta)
         light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
         total = float(np.sum(data.intrinsic(rise) * light))
         return np.asarray(data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total)
@@ -511,9 +476,9 @@ def fit_cooling(
         raise InputError(f"the model must be a blackbody alone, but consists of {', '.join(model.linear)}", key="model")
     raw, stare = checked_frames(frames, quiet, stare)
     data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
-    fit = _BestFit.of(data, _limits(model, stare), peak_s, half_width_s, cooling=cooling)
+    fit = _BestFit.of(data, stare.frame_s, peak_s, half_width_s, cooling=cooling)
     theta, free, best = fit.theta, fit.free, fit.chi2
-    jacobian = data.jacobian(theta, fit.whitening)[:, free]
+    jacobian = data.jacobian(theta, fit.whiten)[:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
     estimates = np.array([quantity.value(theta, data) for quantity in quantities])
@@ -522,9 +487,7 @@ def fit_cooling(
     spread = slopes @ covariance @ slopes.T
     ends = fit.ends(quantities, estimates, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
-    empty = np.full(theta.shape, -np.inf)
-    without = data.whitening(theta, none=True)
-    none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
+    none = float(np.sum(data.whitening(theta, none=True)(data.sums[None]) ** 2))
     return Measurement(
         tuple(quantity.name for quantity in quantities), tuple(quantity.unit for quantity in quantities),
         (-np.inf,) + (0.0,) * (len(quantities) - 1),
@@ -535,14 +498,9 @@ def fit_cooling(
 
 
 def cooling_course(
-    event: Event,
-    measurement: Measurement,
-    frames: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    stare: Stare,
+    event: Event, measurement: Measurement, frames: Float, quiet: Expectation, model: FlareModel, stare: Stare,
     skipped_nm: Ranges = (),
-) -> CoolingCourse:
+) -> CoolingCourse:  # fmt: skip
     """Return a flare in the quantities of a fit and in each frame; parameters as for `fit_cooling`."""
     data = _data(frames, quiet, model, None, stare, event.form, skipped_nm)
     cooling = event.temperature
@@ -551,24 +509,19 @@ def cooling_course(
     logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
     theta = np.array([event.peak_s, *logs])
     values = {quantity.name: quantity.value(theta, data) for quantity in _quantities(data, stare, cooling=True)}
-    rise, log_k = data.strengths(theta)
+    rise, log_k, *_ = data.flare(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
-    drawn_dn = less_known(frames, quiet, known_strengths(stare, quiet), used[None])[:, 0]
-    mean_dn = rise * (model.hot_spline(log_k) @ used)
-    drawn_dn = drawn_dn - _summed_levels(drawn_dn - mean_dn, mean_dn, quiet, stare, used)
-    return CoolingCourse(np.array([values[name] for name in measurement.names]), drawn_dn, mean_dn, np.exp(log_k))
-
-
-def _summed_levels(residual_dn: Float, flare_dn: Float, quiet: Expectation, stare: Stare, used: Float) -> Float:
-    """Return what the unknown changes of a stare add to the sum over pixels, as its residuals tell."""
-    if not stare.unknowns:
-        return np.zeros_like(residual_dn)
     strengths = known_strengths(stare, quiet)
-    components = Components(quiet, np.zeros((0, used.size)), used[None])
-    changes, noise = components.directions(strengths), np.sqrt(components.covariance(strengths)[:, 0, 0])
-    own = {of: change[:, 0] + (flare_dn if of == "light" else 0.0) for of, change in changes.items()}
-    levels = np.array([unknown.sd * unknown.curve * own[unknown.of] for unknown in stare.unknowns])
-    return np.asarray(fitted_amplitudes(levels, np.ones(len(levels)), residual_dn, noise**2) @ levels)
+    drawn_dn = less_known(frames, quiet, strengths, used[None])[:, 0]
+    mean_dn = rise * (model.hot_spline(log_k) @ used)
+    if stare.unknowns:
+        # What the unknown changes add to the sum over pixels follows from its residuals.
+        components = Components(quiet, np.zeros((0, used.size)), used[None])
+        changes, variance = components.directions(strengths), components.covariance(strengths)[:, 0, 0]
+        own = {of: change[:, 0] + (mean_dn if of == "light" else 0.0) for of, change in changes.items()}
+        levels = np.array([unknown.sd * unknown.curve * own[unknown.of] for unknown in stare.unknowns])
+        drawn_dn = drawn_dn - fitted_amplitudes(levels, np.ones(len(levels)), drawn_dn - mean_dn, variance) @ levels
+    return CoolingCourse(np.array([values[name] for name in measurement.names]), drawn_dn, mean_dn, np.exp(log_k))
 
 
 def cooling_event(measurement: Measurement, shape: Shape) -> Event:
@@ -581,73 +534,51 @@ def cooling_event(measurement: Measurement, shape: Shape) -> Event:
 
 
 def _data(
-    raw: Float,
-    quiet: Expectation,
-    model: FlareModel,
-    nuisances: Nuisances | None,
-    stare: Stare,
-    shape: Shape,
+    raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare, shape: Shape,
     skipped_nm: Ranges,
-) -> _Data:
+) -> _Data:  # fmt: skip
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
     clipped = clipped_pixels(raw, quiet)
     reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
     components = Components(quiet, np.zeros((0, weights.shape[1])), weights)
-    covariance = components.covariance(strengths)
+    covariance, changes = components.covariance(strengths), components.directions(strengths)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
-    gain = np.asarray(quiet.gain_dn_per_electron) * np.ones(weights.shape[1])
-    unknown, jitters = _levels(nuisances, model, reduction, stare, components.directions(strengths))
-    light = strengths[:, 3]
-    if nuisances is not None:
-        sums, light = sums - weights @ nuisances.mean_dn, nuisances.mean_factor * light
-    return _Data(sums, edges, light, covariance, unknown, jitters, reduction, model, gain, shape)
-
-
-def _levels(
-    nuisances: Nuisances | None, model: FlareModel, reduction: Reduction, stare: Stare, changes: Mapping[str, Float]
-) -> tuple[tuple[_Level, ...], tuple[_Level, ...]]:
-    """Return the unknown levels of a stare, constant or not, and its jitters."""
+    light, ones, jitters = strengths[:, 3], np.ones(stare.n_frames), dict(stare.jitters)
 
     def level(of: Changing, sd: float, curve: Float) -> _Level:
         of_flare = curve if of == "light" else np.zeros_like(curve)
         return _Level(sd, curve[:, None] * changes[of], of_flare, reduction.spline)
 
-    ones, jitters = np.ones(stare.n_frames), dict(stare.jitters)
     if stare.pointing is not None:
         jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
     unknown = [level(each.of, each.sd, each.curve) for each in stare.unknowns]
-    constant = nuisances and zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True)
-    for sd, spectrum, of_flare in constant or ():
-        spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ reduction.weights.T)
-        sums = np.tile(reduction.weights @ spectrum, (stare.n_frames, 1))
-        unknown.append(_Level(float(sd), sums, ones * float(of_flare.any()), spline))
-    return tuple(unknown), tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0)
+    if nuisances is not None:
+        sums, light = sums - weights @ nuisances.mean_dn, nuisances.mean_factor * light
+        for sd, spectrum, of_flare in zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True):
+            spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ weights.T)
+            constant = np.tile(weights @ spectrum, (stare.n_frames, 1))
+            unknown.append(_Level(float(sd), constant, ones * float(of_flare.any()), spline))
+    each_frame = tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0)
+    added = np.einsum("ip,jp,tp->tij", weights, weights, model.hot * quiet.gain_dn_per_electron, optimize=True)
+    spread = scipy.interpolate.CubicSpline(model.log_k, added)
+    return _Data(sums, edges, light, covariance, tuple(unknown), each_frame, reduction, model, shape, spread)
 
 
-def _start(data: _Data, whitening: _Whitening, peak_s: float, half_width_s: float, cooling: bool) -> Float:
+def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cooling: bool) -> Float:
     """Return starting parameters: the best amplitude and temperature at the given peak and half-width."""
     rise = data.light * data.shape.mean_over(data.edges, peak_s, half_width_s)
     if not rise.any():
         raise InputError.of("peak_s", peak_s, "the peak of a flare with light in the stare")
     nodes = slice(None, None, EVERY)
-    templates = whitening.of(rise[:, None] * data.reduction.hot[nodes, None])
-    power, along = np.sum(templates**2, axis=1), templates @ whitening.of(data.sums[None])[0]
+    templates = whiten(rise[:, None] * data.reduction.hot[nodes, None])
+    power, along = np.sum(templates**2, axis=1), templates @ whiten(data.sums[None])[0]
     best = int(np.argmax(np.maximum(along, 0.0) ** 2 / power))
     amplitude, log_k = max(float(along[best] / power[best]), 1e-6), data.reduction.log_k[nodes][best]
     # Somewhat hotter at the peak than on average, if it cools.
     first, last = (0.1, -0.3) if cooling else (0.0, 0.0)
     return np.array([peak_s, np.log(half_width_s), np.log(amplitude), log_k + first, last, np.log(2.0 * half_width_s)])
-
-
-def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
-    frame, whole = stare.frame_s, float(stare.start_s[-1] - stare.start_s[0]) + stare.frame_s
-    first = float(stare.start_s[0])
-    coolest, hottest = float(model.log_k[0]), float(model.log_k[-1])
-    low = np.array([first - whole, np.log(0.1 * frame), np.log(1e-9), coolest + 1e-9, coolest - hottest, np.log(frame)])
-    high = np.array([first + 2 * whole, np.log(whole), np.log(1e9), hottest - 1e-9, 0.0, np.log(100 * whole)])
-    return low, high
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
@@ -672,35 +603,42 @@ class _BestFit:
     """Best fit of a flare to all frames, and the ends of intervals from profiles of chi-squared about it."""
 
     data: _Data
-    whitening: _Whitening
+    whiten: Whiten
     theta: Float  # shape (n_parameter,)
     free: NDArray[np.intp]  # places of fitted parameters
     limits: tuple[Float, Float]
     chi2: float
 
     @classmethod
-    def of(cls, data: _Data, limits: tuple[Float, Float], peak_s: float, half_width_s: float, *, cooling: bool) -> Self:
+    def of(cls, data: _Data, frame_s: float, peak_s: float, half_width_s: float, *, cooling: bool) -> Self:
         """Fit a flare from a starting point, with the covariance of the frames at the fit before."""
         free = np.arange(len(PARAMETERS) if cooling else 4)
-        whitening = data.whitening(None)
-        theta = np.clip(_start(data, whitening, peak_s, half_width_s, cooling), *limits)
+        first, last = data.edges[0, 0], data.edges[-1, 0]
+        whole, coolest, hottest = last - first + frame_s, data.model.log_k[0], data.model.log_k[-1]
+        limits = (
+            np.array([first - whole, *np.log([0.1 * frame_s, 1e-9]), coolest + 1e-9, coolest - hottest,
+                      np.log(frame_s)]),
+            np.array([first + 2 * whole, *np.log([whole, 1e9]), hottest - 1e-9, 0.0, np.log(100 * whole)]),
+        )  # fmt: skip
+        whiten = data.whitening(None)
+        theta = np.clip(_start(data, whiten, peak_s, half_width_s, cooling), *limits)
 
         def with_free(values: Float) -> Float:
             return np.concatenate([values, theta[free.size :]])
 
         def residuals(values: Float) -> Float:
-            return data.residuals(with_free(values), whitening)
+            return data.residuals(with_free(values), whiten)
 
         def jacobian(values: Float) -> Float:
-            return data.jacobian(with_free(values), whitening)[:, free]
+            return data.jacobian(with_free(values), whiten)[:, free]
 
         low, high = (end[free] for end in limits)
         for refits in range(REFITS + 1):
-            whitening = data.whitening(theta) if refits else whitening
+            whiten = data.whitening(theta) if refits else whiten
             start, scale = np.clip(theta[free], low + 1e-9, high - 1e-9), np.where(free == 0, np.exp(theta[1]), 1.0)
             solution = scipy.optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=scale)
             theta = with_free(solution.x)
-        return cls(data, whitening, theta, free, limits, 2 * float(solution.cost))
+        return cls(data, whiten, theta, free, limits, 2 * float(solution.cost))
 
     def ends(self, quantities: Sequence[_Quantity], estimates: Float, rises: Sequence[float]) -> Float:
         """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity), for rises of chi-squared.
@@ -726,8 +664,7 @@ class _BestFit:
         """
         data, free, (low, high), there = self.data, self.free, self.limits, self.theta.copy()
         for number in range(NEWTON_STEPS):
-            residuals = data.residuals(there, self.whitening)
-            every = data.jacobian(there, self.whitening)
+            residuals, every = data.residuals(there, self.whiten), data.jacobian(there, self.whiten)
             # A flare that does not cool leaves the cooling time without any effect.
             power = np.sum(every**2, axis=0)
             free = free[power[free] > 0.0]

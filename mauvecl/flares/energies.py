@@ -104,16 +104,10 @@ class EnergyScale:
             )
         source.magnitude(band)  # raises InputError if the spectrum does not cover the band
         return cls._of_light(
-            source.wavelength_nm,
-            source.flux_flam,
-            sphere_cm2=4 * np.pi * (distance_pc * PARSEC_CM) ** 2,
-            star=f"{source.name} at {distance_pc:g} pc",
-            band=band,
-            flare=Blackbody(flare_k) if flare is None else flare,
-            kind=kind,
-            geometry=geometry,
-            photosphere_k=source.temperature_k if photosphere_k is None else photosphere_k,
-        )
+            source.wavelength_nm, source.flux_flam, 4 * np.pi * (distance_pc * PARSEC_CM) ** 2,
+            f"{source.name} at {distance_pc:g} pc", band, flare or Blackbody(flare_k), kind, geometry,
+            source.temperature_k if photosphere_k is None else photosphere_k,
+        )  # fmt: skip
 
     @classmethod
     def of_blackbody(
@@ -130,31 +124,14 @@ class EnergyScale:
     ) -> Self:
         """Return the scale for a star that is a blackbody of given radius and temperature.
 
-        Parameters
-        ----------
-        radius_rsun, temperature_k : float
-        band, flare_k, flare, kind, geometry
-            As `of_star`.
-        photosphere_k : float, optional
-            For ``replaces``; the star's temperature by default.
-
-        Raises
-        ------
-        InputError
-            For an impossible value or an unknown band.
+        Other arguments are those of `of_star`; the photosphere of ``replaces`` has the star's temperature by default.
         """
         wavelength, _ = _response(band)
         return cls._of_light(
-            wavelength,
-            blackbody(wavelength, temperature_k),
-            sphere_cm2=4 * np.pi * (radius_rsun * SUN_CM) ** 2,
-            star=f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii",
-            band=band,
-            flare=Blackbody(flare_k) if flare is None else flare,
-            kind=kind,
-            geometry=geometry,
-            photosphere_k=temperature_k if photosphere_k is None else photosphere_k,
-        )
+            wavelength, blackbody(wavelength, temperature_k), 4 * np.pi * (radius_rsun * SUN_CM) ** 2,
+            f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii", band, flare or Blackbody(flare_k),
+            kind, geometry, temperature_k if photosphere_k is None else photosphere_k,
+        )  # fmt: skip
 
     @classmethod
     def shibayama2013(
@@ -179,27 +156,24 @@ class EnergyScale:
 
     @classmethod
     def _of_light(
-        cls,
-        wavelength_nm: Float,
-        flux_flam: Float,
-        *,
-        sphere_cm2: float,
-        star: str,
-        band: str,
-        flare: FlareSpectrum,
-        kind: Kind,
-        geometry: Geometry,
-        photosphere_k: float | None,
-    ) -> Self:
+        cls, wavelength_nm: Float, flux_flam: Float, sphere_cm2: float, star: str, band: str, flare: FlareSpectrum,
+        kind: Kind, geometry: Geometry, photosphere_k: float | None,
+    ) -> Self:  # fmt: skip
         """Return the scale for the light that a flare of amplitude 1 adds to a flux, over a sphere around the star."""
         check_scales(flare)
         light = added_light(wavelength_nm, flux_flam, flare, band, geometry, photosphere_k)
+        lost = 0.0
         if kind == "band":
             flux = light.hot * flux_in_band(band, flare)
-            lost = light.lost and light.lost * _through(wavelength_nm, flux_flam, band)
+            if light.lost:
+                lost = light.lost * _through(wavelength_nm, flux_flam, band)
         else:
             flux = light.hot * flare.bolometric_flux()
-            lost = light.lost and light.lost * _bolometric(wavelength_nm, flux_flam, band, photosphere_k)
+            if light.lost and photosphere_k is not None:
+                # The bolometric flux of the blackbody with the star's photons in the band.
+                body = photons(wavelength_nm, blackbody(wavelength_nm, photosphere_k), band)
+                share = light.lost * photons(wavelength_nm, flux_flam, band) / body
+                lost = share * STEFAN_BOLTZMANN * photosphere_k**4
         how = f"{star}, flare of {flare.describe()}"
         if geometry == "replaces":
             how += f" in place of photosphere of {photosphere_k:g} K"
@@ -261,13 +235,6 @@ def _through(wavelength_nm: Float, flux_flam: Float, band: str) -> float:
     return _integral(wavelength, response * np.interp(wavelength, wavelength_nm, flux_flam, left=0.0, right=0.0))
 
 
-def _bolometric(wavelength_nm: Float, flux_flam: Float, band: str, photosphere_k: float | None) -> float:
-    """Return the bolometric flux of the blackbody with a spectrum's photons in a band, erg s-1 cm-2."""
-    assert photosphere_k is not None
-    body = photons(wavelength_nm, blackbody(wavelength_nm, photosphere_k), band)
-    return photons(wavelength_nm, flux_flam, band) / body * STEFAN_BOLTZMANN * photosphere_k**4
-
-
 def _integral(wavelength_nm: Float, flux_flam: Float) -> float:
     # erg s-1 cm-2 A-1 over nm.
     return 10.0 * float(np.trapezoid(flux_flam, wavelength_nm))
@@ -312,16 +279,9 @@ class Rates(ABC):
         """Return the rates with all energies multiplied by a factor."""
 
     def in_band(self, band: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> Self:
-        """Return the rates with energies in another band, or bolometric energies.
+        """Return the rates with energies in another band of `host.stars.bands`, or "bolometric" ones.
 
-        Parameters
-        ----------
-        band : str
-            A name of `host.stars.bands`, or "bolometric".
-        flare_k : float
-            Temperature of the flares, which are blackbodies.
-        flare : FlareSpectrum, optional
-            Spectrum of the flares, instead of blackbodies.
+        The flares are blackbodies of a temperature, or have another spectrum.
         """
         return replace(self.times_energy(band_factor(self.band, band, flare_k, flare)), band=band)
 

@@ -136,15 +136,7 @@ class Curve(Section):
     def mean_over(
         self, start_s: Annotated[NDArray[np.float64], Unit("s")], frame_s: Duration, orbit_s: Duration = ORBIT_S
     ) -> Float:
-        """Return the exact mean over each frame, shape (n_frame,).
-
-        Parameters
-        ----------
-        start_s : ndarray, shape (n_frame,)
-        frame_s : float
-        orbit_s : float
-            Period of a sinusoid without a given period.
-        """
+        """Return the exact mean over each frame, shape (n_frame,); a sinusoid has the orbit's period by default."""
         import numpy as np
 
         if self.amplitude is None:

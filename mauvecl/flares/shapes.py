@@ -59,9 +59,9 @@ class Shape(ABC):
         """Return the integral from tau to the end, in half-widths, without cancellation; shape of tau."""
 
     @property
-    @abstractmethod
     def peak_at(self) -> float:
-        """Position of the maximum, tau."""
+        """Position of the maximum, tau: zero unless a shape has another."""
+        return 0.0
 
     @property
     @abstractmethod
@@ -176,10 +176,6 @@ class Davenport2014(Shape):
             total = coefficient + total * clipped
         return np.asarray(total)
 
-    @property
-    def peak_at(self) -> float:
-        return 0.0
-
     @cached_property
     def square_integral(self) -> float:
         rise = (self.RISE**2).integ(lbnd=-1)(0.0)
@@ -291,16 +287,8 @@ class Fiducial(Shape):
         return np.asarray(self.BOX - np.clip(t, 0.0, self.BOX) + self.FOLD * np.exp(-late / self.FOLD))
 
     @property
-    def peak_at(self) -> float:
-        return 0.0
-
-    @property
     def square_integral(self) -> float:
         return self.BOX + self.FOLD / 2
-
-    @cached_property
-    def width(self) -> float:
-        return self.BOX + self.FOLD * float(np.log(2))
 
 
 @validated

@@ -139,17 +139,11 @@ class Event:
         return scale.energy(self.equivalent_duration_s)
 
     def total_energy(self, scale_of: Callable[[float], EnergyScale], nodes: Float | None = None) -> float:
-        """Return the energy of a flare that may cool, erg.
+        """Return the energy of a flare that may cool, erg, for the energy scales of temperatures in K.
 
         Frames interpolate the light of a flare that cools between the spectra of a few temperatures. The energy is that
-        of the interpolated light, which is the light that is drawn.
-
-        Parameters
-        ----------
-        scale_of : callable
-            Returns the energy scale for a temperature in K.
-        nodes : ndarray, shape (n_temperature,), optional
-            Temperatures of the spectra: `temperatures_of` all flares of the stare; by default of this flare alone.
+        of the interpolated light, which is the light that is drawn. `nodes` are the temperatures of the spectra,
+        `temperatures_of` all flares of the stare; by default of this flare alone.
         """
         cooling = _cooling_of(self)
         if cooling is None:
@@ -432,19 +426,13 @@ class Stare:
         for name in spread:
             if name not in STARE_CHANGES["jitters"]:
                 raise InputError.of("jitters", name, f"one of {', '.join(STARE_CHANGES['jitters'])}")
+        warmth = over_frames(Sinusoid(thermal) if isinstance(thermal, int | float) else thermal)
+        star, light, glow = (1.0 + over_frames(curve) for curve in (variability, throughput, sky))
         return cls(
-            start,
-            float(frame_s),
-            1.0 + over_frames(variability),
-            1.0 + over_frames(throughput),
-            1.0 + over_frames(sky),
-            temperature_c + over_frames(Sinusoid(thermal) if isinstance(thermal, int | float) else thermal),
-            spread.get("light", 0.0),
-            spread.get("sky", 0.0),
-            spread.get("temperature", 0.0),
-            _unknowns(start, float(frame_s), orbit_s, offsets or {}, drifts or {}, cycles or {}),
-            pointing,
-        )
+            start, float(frame_s), star, light, glow, temperature_c + warmth,
+            spread.get("light", 0.0), spread.get("sky", 0.0), spread.get("temperature", 0.0),
+            _unknowns(start, float(frame_s), orbit_s, offsets or {}, drifts or {}, cycles or {}), pointing,
+        )  # fmt: skip
 
     @property
     def jitters(self) -> dict[Changing, float]:
@@ -485,14 +473,7 @@ class Stare:
         return np.column_stack([self.start_s[first], self.start_s[last] + self.frame_s])
 
     def pointing_losses(self, numbers: NDArray[np.uint64], seed: int) -> Float:
-        """Return the share of all light that frames of stares lose in drifts, shape (n_stare, n_frame).
-
-        Parameters
-        ----------
-        numbers : ndarray, shape (n_stare,)
-            Numbers of the stares.
-        seed : int
-        """
+        """Return the share of all light that the frames of some stares lose in drifts, shape (n_stare, n_frame)."""
         from mauvecl.noise.reference import pointing_losses
 
         if self.pointing is None:
@@ -530,13 +511,9 @@ def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float
 
 
 def _unknowns(
-    start: Float,
-    frame_s: float,
-    orbit_s: float,
-    offsets: Mapping[Changing, float],
-    drifts: Mapping[Changing, float],
+    start: Float, frame_s: float, orbit_s: float, offsets: Mapping[Changing, float], drifts: Mapping[Changing, float],
     cycles: Mapping[Changing, float],
-) -> tuple[StareUnknown, ...]:
+) -> tuple[StareUnknown, ...]:  # fmt: skip
     middle = (start[0] + start[-1] + frame_s) / 2
     hours = (start + frame_s / 2 - middle) / HOUR_S
     sine, cosine = (Sinusoid(1.0, orbit_s, phase).mean_over(start, frame_s) for phase in (0.0, np.pi / 2))

@@ -152,20 +152,14 @@ class StareScene:
         weights[:, :n_pixel] = components.weights
         constants = weights[:, :n_pixel].astype(np.float64) @ (scene.base_dn[0] - x.mean_raw_dn)
         curves = np.reshape([u.sd * u.curve for u in stare.unknowns], (len(stare.unknowns), stare.n_frames))
+        factors = [part for row in components.coefficients(stare).T[: len(STEADY)] for part in (row, row - 1.0)]
         return cls(
-            components,
-            stare,
-            scene,
-            _padded(stare.numbers, np.uint32),
-            _known(components, stare),
-            _padded(curves, np.float32),
+            components, stare, scene, _padded(stare.numbers, np.uint32),
+            _padded(np.stack([*factors, stare.light]), np.float32), _padded(curves, np.float32),
             np.array([layout.MOVED.index(u.of) for u in stare.unknowns], np.uint32),
-            _stare_job(stare, x.conditions["dark_slope_per_c"]),
-            _mixtures(components, scene.base_dn[0]),
-            spectra,
-            weights,
-            constants.astype(np.float32),
-        )
+            _stare_job(stare, x.conditions["dark_slope_per_c"]), _mixtures(components, scene.base_dn[0]),
+            spectra, weights, constants.astype(np.float32),
+        )  # fmt: skip
 
     @property
     def counts(self) -> bool:
@@ -314,12 +308,6 @@ def _stare_job(stare: Stare, dark_slope_per_c: float) -> NDArray[np.void]:
     job["temperature_jitter"] = stare.temperature_jitter_c
     job["dark_slope"] = dark_slope_per_c
     return job
-
-
-def _known(components: Components, stare: Stare) -> Floats:
-    rows = components.coefficients(stare)[:, : len(STEADY)].T
-    changes = [part for row in rows for part in (row, row - 1.0)]
-    return np.asarray(_padded(np.stack([*changes, stare.light]), np.float32))
 
 
 def _not_joint_error(name: str) -> InputError:
@@ -528,33 +516,28 @@ def method_for(components: Components, stare: Stare, processes: Processes = NONE
     return "cumulants"
 
 
-def _over_sd(components: Components) -> list[Float]:
-    """Return the standardised third to seventh cumulants of each sum, shape (n_statistic,) each."""
-    x, w = components.quiet, components.weights
-    photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
-    sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))
-    cumulants = []
-    for order in range(3, 8):
-        cumulant = x.dark_step_dn ** (order - 1) * dark
-        if x.photon_noise == "poisson":
-            cumulant = cumulant + x.gain_dn_per_electron ** (order - 1) * photons
-        cumulants.append(np.sum(w**order * cumulant, axis=1) / sd**order)
-    return cumulants
-
-
 def _fourths_are_needed(components: Components) -> bool:
     """Return whether neglecting cumulants beyond the third could be noticed.
 
     Raises InputError if neglecting those beyond the fourth could be noticed.
     """
-    shapes = _over_sd(components)
+    x, w = components.quiet, components.weights
+    photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
+    sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))
+    # Standardised third to seventh cumulants of each sum, (n_statistic,) each.
+    shapes = []
+    for order in range(3, 8):
+        cumulant = x.dark_step_dn ** (order - 1) * dark
+        if x.photon_noise == "poisson":
+            cumulant = cumulant + x.gain_dn_per_electron ** (order - 1) * photons
+        shapes.append(np.sum(w**order * cumulant, axis=1) / sd**order)
     least = 5.0 * np.sqrt(2.0 * CLASSES) / FRAMES_TO_NOTICE
     beyond = truncation_distance(shapes, fourth_power=False)
     if (beyond > least).any():
         row = int(np.argmax(beyond))
         raise InputError(
             f"the sum with spectral weight {row} has a skewness of {abs(shapes[0][row]):.2g} in a frame "
-            f"of {components.quiet.name}, too much for method 'cumulants'; use method 'pixels'",
+            f"of {x.name}, too much for method 'cumulants'; use method 'pixels'",
             key="method",
         )
     g3, g4 = shapes[0], shapes[1]

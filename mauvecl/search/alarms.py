@@ -21,9 +21,9 @@ from mauvecl.search.flare_fits import (
     KELVIN,
     PEAK,
     WIDTH,
+    BetterFitError,
     BlendFit,
     Block,
-    Ends,
     Factor,
     FittedFlares,
     Quantity,
@@ -98,7 +98,19 @@ def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor 
     net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
     search = _StareSearch(SummedStare(survey, net), threshold)
     search.run()
-    return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
+    found = []
+    for number, block in enumerate(search.blocks(), 1):
+        theta = np.array([candidate.theta for candidate in block])
+        rows, measured = search.sums.block(theta, search.thetas), list[Measured]()
+        best = rows.fit(theta)
+        while not measured:
+            try:
+                measured = [_measured(rows, best, j, energy) for j in range(len(block))]
+            except BetterFitError as better:
+                best = rows.fit(better.theta)
+        for candidate, values in zip(block, measured, strict=True):
+            found.append(Alarm(candidate.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
+    return sorted(found, key=lambda alarm: -alarm.rho)
 
 
 @dataclass(eq=False)
@@ -325,58 +337,29 @@ class _StareSearch:
 Measured = tuple[FittedFlares, dict[str, tuple[float, float]], str]
 
 
-def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]:
-    """Measure all flares of a finished search."""
-    measured_alarms = []
-    for number, block in enumerate(search.blocks(), 1):
-        theta = np.array([candidate.theta for candidate in block])
-        rows = search.sums.block(theta, search.thetas)
-        better: BlendFit | None = rows.fit(theta)
-        while better is not None:
-            # If profiling finds a better fit, start again from it.
-            best, better, measured = better, None, list[Measured]()
-            for j in range(len(block)):
-                gain = rows.without(best, j).chi2 - best.chi2
-                values = _measured(rows, best, j, gain, energy)
-                if isinstance(values, BlendFit):
-                    better = values
-                    break
-                measured.append(values)
-        for candidate, values in zip(block, measured, strict=True):
-            measured_alarms.append(Alarm(candidate.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
-    return measured_alarms
-
-
-def _measured(rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None) -> Measured | BlendFit:
-    """Measure a flare, or return a better fit of its block if profiling finds one."""
-    sums, theta = rows.sums, best.theta[j]
-    snr = float(np.sqrt(max(gain, 0.0)))
-    if missing := _why_unmeasured(rows, best, j):
+def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Measured:
+    """Measure a flare; raises BetterFitError if profiling finds a better fit of its block."""
+    sums, theta, (low, high) = rows.sums, best.theta[j], rows.sums.bounds
+    snr = float(np.sqrt(max(rows.without(best, j).chi2 - best.chi2, 0.0)))
+    at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))
+    missing = "" if best.converged else "its fit did not converge"
+    if at_low[WIDTH] or at_high[WIDTH]:
+        missing = f"its best fit is {'wider' if at_high[WIDTH] else 'narrower'} than the half-widths of the bank"
+    if at_low[PEAK] or at_high[PEAK]:
+        missing = "its best fit peaks outside the stare"
+    if missing:
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    outcome = _intervals(rows, best, j, snr, covariance, energy)
-    if isinstance(outcome, BlendFit):
-        return outcome
     area, coloured = sums.survey.bank.shape.equivalent_duration, KELVIN in sums.free
-    return FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured), *outcome
-
-
-def _why_unmeasured(rows: Block, best: BlendFit, j: int) -> str:
-    """Return why a flare cannot be measured; empty if it can."""
-    theta, (low, high) = best.theta[j], rows.sums.bounds
-    at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))
-    if at_low[PEAK] or at_high[PEAK]:
-        return "its best fit peaks outside the stare"
-    if at_low[WIDTH] or at_high[WIDTH]:
-        return f"its best fit is {'wider' if at_high[WIDTH] else 'narrower'} than the half-widths of the bank"
-    return "" if best.converged else "its fit did not converge"
+    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured)
+    return fitted, *_intervals(rows, best, j, snr, covariance, energy)
 
 
 def _intervals(
     rows: Block, best: BlendFit, j: int, snr: float, covariance: Float, energy: Factor | None
-) -> tuple[dict[str, tuple[float, float]], str] | BlendFit:
-    """Return the intervals of a flare's values and a note, or a better fit of its block if profiling finds one."""
+) -> tuple[dict[str, tuple[float, float]], str]:
+    """Return the intervals of a flare's values, and a note."""
     area = np.log(rows.sums.survey.bank.shape.equivalent_duration)
     quantities = {
         "peak_s": Quantity(PEAK), "amplitude": Quantity(AMPLITUDE), "half_width_s": Quantity(WIDTH),
@@ -391,12 +374,10 @@ def _intervals(
             continue
         middle, slope = quantity.of(best.theta[j])
         sd = float(np.sqrt(slope @ covariance @ slope))
-        interval: Ends | BlendFit = middle - sd, middle + sd, False
+        low, high, is_open = middle - sd, middle + sd, False
         if snr <= MAX_PROFILED_SNR:
-            interval = rows.interval(best, j, quantity, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
-        if isinstance(interval, BlendFit):
-            return interval
-        ends, is_open = np.array(interval[:2]), interval[2]
+            low, high, is_open = rows.interval(best, j, quantity, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+        ends = np.array([low, high])
         if quantity.column != PEAK:
             ends = np.exp(ends if quantity.factor is None else ends + area)
         intervals[name] = (float(ends[0]), float(ends[1]))

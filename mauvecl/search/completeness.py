@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Self
@@ -390,27 +389,21 @@ def fit_power_law(
         """Return recovered flares per day and dex of true energy, for a rate of 1 above the pivot."""
         return np.asarray((alpha - 1) * np.log(10) * 10 ** ((1 - alpha) * (x - pivot)) * chance)
 
-    def cost(alpha: float, log10_rate: float | None = None) -> float:
-        """Return the negative log likelihood, by default at the best rate for the exponent."""
+    def best_rate(alpha: float) -> float:
+        """Return the logarithm of the most likely rate for an exponent."""
+        return float(np.log10(logs.size / (days * step * seen(alpha).sum())))
+
+    def cost(alpha: float) -> float:
+        """Return the negative log likelihood at the best rate for an exponent, less a constant."""
         flares = seen(alpha)
         at = np.interp(recovered, x, flares) if blur is None else blur @ flares
-        mean = days * step * flares.sum()
-        rate = logs.size / mean if log10_rate is None else 10**log10_rate
-        return float(mean * rate - np.sum(np.log(np.maximum(at, 1e-300))) - logs.size * np.log(rate * days))
+        return float(-np.sum(np.log(np.maximum(at, 1e-300))) - logs.size * np.log(10) * best_rate(alpha))
 
     alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
-    log10_rate = float(np.log10(logs.size / (days * step * seen(alpha).sum())))
-    covariance = np.linalg.inv(_curvature(lambda point: cost(point[0], point[1]), np.array([alpha, log10_rate])))
-    alpha_sd, log10_rate_sd = np.sqrt(np.diag(covariance)).tolist()
-    return FittedPowerLaw(alpha, alpha_sd, log10_rate, log10_rate_sd, 10**pivot, logs.size)
-
-
-def _curvature(cost: Callable[[Float], float], at: Float) -> Float:
-    """Return second derivatives by central differences, (2, 2)."""
+    # The curvature of the profile likelihood gives the error of the exponent; that of the rate has a part that is
+    # independent of it, by Poisson's law, and one by the best rate that changes with the exponent.
     h = 1e-3
-
-    def second(i: Float, j: Float) -> float:
-        return (cost(at + i + j) - cost(at + i - j) - cost(at - i + j) + cost(at - i - j)) / (4 * h * h)
-
-    steps = h * np.eye(2)
-    return np.array([[second(i, j) for j in steps] for i in steps])
+    alpha_sd = h / float(np.sqrt(cost(alpha + h) - 2 * cost(alpha) + cost(alpha - h)))
+    along = (best_rate(alpha + h) - best_rate(alpha - h)) / (2 * h) * alpha_sd
+    log10_rate_sd = float(np.hypot(along, 1 / (np.log(10) * np.sqrt(logs.size))))
+    return FittedPowerLaw(alpha, alpha_sd, best_rate(alpha), log10_rate_sd, 10**pivot, logs.size)

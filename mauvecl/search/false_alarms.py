@@ -38,7 +38,7 @@ a stare are drawn from a widened distribution and weighted accordingly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,14 +46,13 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_counts
+from mauvecl.flares.stare import select_frames
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.search import BATCH
 from mauvecl.search.templates import Bank
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from mauvecl.search.search import Search, Survey
 
 Float = NDArray[np.float64]
@@ -114,7 +113,16 @@ class TemplateGrid:
     @classmethod
     def from_bank(cls, bank: Bank) -> TemplateGrid:
         """Compute the correlations between all neighbouring templates of a bank."""
-        rows = _unit_filters(bank)
+        # Detrended templates of unit length on common frames, (n_phase, n_frame), for each half-width. Zeros on both
+        # sides leave room for shifts.
+        room = max(-template.first for template in bank.templates)
+        size = 2 * room + max(template.first + template.time.size for template in bank.templates)
+        rows = [np.zeros((len(template.phases), size + room)) for template in bank.templates]
+        for template, filters in zip(bank.templates, rows, strict=True):
+            begin = 2 * room + template.first
+            for phase, own in enumerate(filters):
+                shape = template.detrended(phase, bank.baseline.powers)
+                own[begin : begin + shape.size] = shape / np.linalg.norm(shape)
         per_frame, onset, width = [], [], []
         for k, (template, filters) in enumerate(zip(bank.templates, rows, strict=True)):
             # The phases within a frame are followed by those of the next onset.
@@ -122,7 +130,13 @@ class TemplateGrid:
             for p, own in enumerate(filters, len(filters)):
                 per_frame.append(1 / template.stride)
                 onset.append(_neighbour_correlations(own, [onsets[p - 1], onsets[p + 1]]))
-                width.append(_neighbour_correlations(own, [_aligned(own, others) for others in _next_to(rows, k)]))
+                aligned = []
+                for others in _next_to(rows, k):
+                    # The filter, of the others at any shift, that has the largest correlation with this one.
+                    along = np.array([scipy.signal.correlate(own, other, method="fft") for other in others])
+                    which, shift = np.unravel_index(int(np.argmax(along)), along.shape)
+                    aligned.append(np.roll(others[which], int(shift) - own.size + 1))
+                width.append(_neighbour_correlations(own, aligned))
         directions = list(bank.directions)
         temperature = [
             _neighbour_correlations(direction, _next_to(directions, k)) for k, direction in enumerate(directions)
@@ -159,32 +173,9 @@ class TemplateGrid:
         return density, np.array(rows), np.array(temperatures)
 
 
-def _unit_filters(bank: Bank) -> list[Float]:
-    """Return the detrended templates of each half-width, of unit length, on common frames, (n_phase, n_frame)."""
-    # Zeros on both sides leave room for shifts.
-    room = max(-template.first for template in bank.templates)
-    size = 2 * room + max(template.first + template.time.size for template in bank.templates)
-    rows = []
-    for template in bank.templates:
-        filters = np.zeros((len(template.phases), size + room))
-        for phase, own in enumerate(filters):
-            shape = template.detrended(phase, bank.baseline.powers)
-            begin = 2 * room + template.first
-            own[begin : begin + shape.size] = shape / np.linalg.norm(shape)
-        rows.append(filters)
-    return rows
-
-
 def _next_to(values: list[Float], k: int) -> list[Float]:
     """Return the neighbours of an element."""
     return values[max(k - 1, 0) : k] + values[k + 1 : k + 2]
-
-
-def _aligned(own: Float, others: Float) -> Float:
-    """Return the filter, of some others at any shift, that has the largest correlation with one."""
-    correlations = [scipy.signal.correlate(own, other, method="fft") for other in others]
-    which = int(np.argmax([values.max() for values in correlations]))
-    return np.roll(others[which], int(np.argmax(correlations[which])) - own.size + 1)
 
 
 def _neighbour_correlations(own: Float, neighbours: list[Float]) -> tuple[float, ...]:
@@ -263,13 +254,11 @@ class SampledRate:
         p = self.probability[self._trusted]
         return np.asarray(self.error[self._trusted] / (1 - p) / -np.log1p(-p))
 
-    def _fit(self) -> Float:
-        """Fit a polynomial to log(rate / Q) as a function of the centred threshold."""
+    def _fit(self) -> np.polynomial.Polynomial:
+        """Fit a polynomial to log(rate / Q) as a function of the threshold."""
         u, p = self.thresholds[self._trusted], self.probability[self._trusted]
-        relative = self._relative
         logs = np.log(-np.log1p(-p) / self.days) - scipy.special.log_ndtr(-u)
-        columns = np.vander(u - u.mean(), min(POWERS, u.size), increasing=True) / relative[:, None]
-        return np.asarray(np.linalg.pinv(columns) @ (logs / relative))
+        return np.polynomial.Polynomial.fit(u, logs, min(POWERS, u.size) - 1, w=1 / self._relative)
 
     def under(self, shifts: UnknownShifts) -> SampledRate:
         """Return the rate for stares whose noise differs from the noise that the search assumes."""
@@ -280,11 +269,18 @@ class SampledRate:
         low, high = self.thresholds[0] / shifts.scales.max(), self.thresholds[-1] / shifts.scales.min()
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
-        polynomial = np.polynomial.polynomial.polyval(fine - self.thresholds[self._trusted].mean(), self._fit())
-        rates = np.exp(scipy.special.log_ndtr(-fine) + polynomial)
+        rates = np.exp(scipy.special.log_ndtr(-fine) + self._fit()(fine))
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
-            each = shifts.alarm_probability(threshold, self.days, lambda u: np.interp(u, fine, rates))
+            # Probability of an alarm in each draw of a stare.
+            per_day, largest = np.zeros((2, shifts.weights.size))
+            for shift, share in zip(shifts.shifts, shifts.shares.T, strict=True):
+                per_day += share * np.interp((threshold - shift) / shifts.scales, fine, rates).mean(axis=1)
+                largest = np.where(share > 0, shift, largest)
+            each = -np.expm1(-self.days * per_day)
+            if shifted:
+                # A few templates with a large mean suffice for an alarm.
+                each = 1 - np.exp(-self.days * per_day) * scipy.special.ndtr(threshold - largest)
             probability[k] = shifts.weights @ each
             spread = np.sqrt(np.sum((shifts.weights * (each - probability[k])) ** 2))
             error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
@@ -298,9 +294,7 @@ class SampledRate:
         if self.shifted:
             logs = np.log(-np.log1p(-self.probability[trusted]) / self.days)
             return float(scipy.interpolate.PchipInterpolator(self.thresholds[trusted], logs)(threshold)), error
-        coefficients = self._fit()
-        at = (threshold - self.thresholds[trusted].mean()) ** np.arange(coefficients.size)
-        return float(scipy.special.log_ndtr(-threshold) + at @ coefficients), error
+        return float(scipy.special.log_ndtr(-threshold) + self._fit()(threshold)), error
 
     def threshold(self, rate: float) -> Interval:
         """Return the threshold for a number of false alarms per star-day, with a 95 % interval.
@@ -362,7 +356,10 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
             for n, nearby in enumerate(values):
                 c = along[n][:, None] * correlated[n, n_sum, at]
                 r = directions @ correlated[n, :n_sum, at].T - own[n] * c
-                nearby.append(_near(np.array([r, c]), weight, LADDER[0]))
+                # Only for these G may be positive.
+                near = np.flatnonzero(_reach(r, c, LADDER[-1]) > LADDER[0] - BELOW / LADDER[0])
+                w = np.broadcast_to(weight[:, None], r.shape)
+                nearby.append(np.array([each.reshape(-1)[near] for each in (r, c, w)]))
         for n, nearby in enumerate(values):
             estimates[first + n] = _estimates(np.concatenate(nearby, axis=1))
     estimates *= shares[-1]
@@ -392,13 +389,6 @@ def _noise_of_chosen(
 
 #: Nodes and weights of an integral over exp(-x).
 _X, _W = np.polynomial.laguerre.laggauss(NODES)
-
-
-def _near(rho: Float, weight: Float, u: float) -> Float:
-    """Return r, c and w of the values for which G may be positive at a threshold of at least u, shape (3, n)."""
-    near = np.flatnonzero(_reach(rho[0], rho[1], LADDER[-1]) > u - BELOW / u)
-    weights = np.broadcast_to(weight[:, None], rho.shape[1:])
-    return np.array([each.reshape(-1)[near] for each in (rho[0], rho[1], weights)])
 
 
 def _reach(r: Float, c: Float, u: float) -> Float:
@@ -445,21 +435,6 @@ class UnknownShifts:
     shifts: Float  # means of values, ascending, shape (n_shift,)
     shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
 
-    def alarm_probability(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
-        """Return the probability of an alarm in each draw of a stare of some star-days, shape (n_draw,).
-
-        `rate` returns the false alarms per star-day at a threshold for the noise that the search assumes.
-        """
-        rates = np.zeros(self.weights.size)
-        largest = np.zeros(self.weights.size)
-        for shift, share in zip(self.shifts, self.shares.T, strict=True):
-            rates += share * rate((threshold - shift) / self.scales).mean(axis=1)
-            largest = np.where(share > 0, shift, largest)
-        if not self.shifts.any():
-            return np.asarray(-np.expm1(-days * rates))
-        # A few templates with a large mean suffice for an alarm.
-        return np.asarray(1 - np.exp(-days * rates) * scipy.special.ndtr(threshold - largest))
-
 
 #: Largest length of the part of a stare that importance sampling uses, star-days.
 SAMPLED_DAYS = 2.0
@@ -477,7 +452,9 @@ MAX_SHIFT = 60.0
 
 def sampled_rate(survey: Survey, seed: int) -> SampledRate:
     """Estimate the false-alarm rate of a survey by importance sampling, including the unknowns of its stare."""
-    part = survey.of_days(SAMPLED_DAYS)
+    part, n = survey, int(SAMPLED_DAYS * DAY_S / survey.stare.frame_s)
+    if survey.stare.n_frames > n:
+        part = replace(survey, stare=select_frames(survey.stare, slice(0, n)))
     return sample_rate(part.search, seed=seed).under(draw_shifts(survey, seed, part))
 
 

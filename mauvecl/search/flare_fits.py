@@ -47,15 +47,13 @@ LOG_AMPLITUDES = (-27.0, 14.0)
 CONVERGED, MAX_EVALUATIONS = 1e-7, 100
 #: Relative tolerance of the root of the rise of chi-squared at an end of an interval, and largest number of refits.
 CLOSE, MAX_REFITS = 0.02, 12
-#: Distances beyond an end of an interval, relative to its distance from the fit, at which to look for other optima.
-BEYOND = (1.5, 1.5, 1.5)
+#: Distance from the fit, relative to that of an end of an interval, at which to look for other optima, and how often.
+BEYOND, PROBES = 1.5, 3
 #: Fall of chi-squared during profiling that indicates a better fit.
 BETTER = 0.05
 
 #: Logarithm of a factor in a profiled product as a function of log temperature, with its derivative.
 Factor = Callable[[float], tuple[float, float]]
-#: Ends of a 68 % interval, and whether one of them is a bound of the fit.
-Ends = tuple[float, float, bool]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +97,6 @@ class Held:
     def apply(self, theta: Float) -> None:
         """Set the parameter that follows from the others."""
         theta[self.flare, self.quantity.column] += self.value - self.quantity.of(theta[self.flare])[0]
-
-    def tie(self, derivatives: Float, theta: Float) -> None:
-        """Add to derivatives by the others, (n_row, n_flare, 4), their effect through this parameter."""
-        slope = self.quantity.of(theta[self.flare])[1]
-        derivatives[:, self.flare] -= derivatives[:, self.flare, self.quantity.column, None] * slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,32 +191,22 @@ class SummedStare:
         noise = self.noise(every, light, span)[used[span]]
         whiten = np.linalg.inv(np.linalg.cholesky(noise))
         data = np.einsum("tij,tj->ti", whiten, (self.net[span] - others)[used[span]])
-        terms = self._level(used, max(last - first for first, last in windows))
-        columns = np.einsum("tij,tp->tijp", whiten, terms).reshape(data.size, -1)
+        # Baseline terms, (n_frame, n_term): splines in time with pieces as long as the largest window, and curves.
+        baseline, time, terms = self.survey.bank.baseline, self.edges[used].mean(axis=1), list[Float]()
+        if baseline.powers:
+            length = float(time[-1] - time[0]) or 1.0
+            pieces = max(1, round(length / max(last - first for first, last in windows)))
+            place = np.clip((time - time[0]) / length, 0.0, 1.0) * pieces
+            degree = max(baseline.powers)
+            knots = np.concatenate([np.zeros(degree), np.arange(pieces + 1.0), np.full(degree, float(pieces))])
+            terms += list(scipy.interpolate.BSpline.design_matrix(place, knots, degree).toarray().T)
+        if baseline.cycle and self.survey.curves is not None:
+            terms += list(self.survey.curves[:, used])
+        design = np.reshape(terms, (len(terms), time.size)).T
+        columns = np.einsum("tij,tp->tijp", whiten, design).reshape(data.size, -1)
         basis = scipy.linalg.orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), rcond=1e-9)
         flat = data.ravel()
         return Block(self, used, whiten, basis, flat - basis @ (basis.T @ flat))
-
-    def _level(self, used: NDArray[np.bool_], length_s: float) -> Float:
-        """Return the baseline terms of a block: splines in time with pieces of a length, and curves.
-
-        The shape is (n_frame, n_term).
-        """
-        powers = self.survey.bank.baseline.powers
-        time = self.edges[used].mean(axis=1)
-        terms: list[Float] = []
-        if powers:
-            span = float(time[-1] - time[0]) or 1.0
-            pieces = max(1, round(span / length_s))
-            place = np.clip((time - time[0]) / span, 0.0, 1.0) * pieces
-            degree = max(powers)
-            inner = np.arange(pieces + 1, dtype=np.float64)
-            knots = np.concatenate([np.zeros(degree), inner, np.full(degree, float(pieces))])
-            design = scipy.interpolate.BSpline.design_matrix(place, knots, degree).toarray()
-            terms += list(design.T)
-        if self.survey.bank.baseline.cycle and self.survey.curves is not None:
-            terms += list(self.survey.curves[:, used])
-        return np.array(terms).reshape(len(terms), time.size).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +277,9 @@ class Block:
             every = whole(x)
             model, derivatives = self.model(every)
             if held is not None:
-                held.tie(derivatives, every)
+                # The other parameters have an effect through the one that follows from them.
+                slope, own = held.quantity.of(every[held.flare])[1], derivatives[:, held.flare]
+                own -= own[:, held.quantity.column, None] * slope
             columns = np.column_stack([-derivatives[:, moved], self.data - model])
             return np.asarray(np.linalg.qr(columns, mode="r"))
 
@@ -324,41 +309,40 @@ class Block:
         covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
         return covariance
 
-    def interval(self, best: BlendFit, j: int, quantity: Quantity, rises: float) -> Ends | BlendFit:
-        """Return the interval of a flare's quantity from the profile likelihood, or a better fit if that finds one.
+    def interval(self, best: BlendFit, j: int, quantity: Quantity, rises: float) -> tuple[float, float, bool]:
+        """Return the interval of a flare's quantity from the profile likelihood, and whether the fit ends it.
 
-        Chi-squared rises by `rises` at its ends.
+        Chi-squared rises by `rises` at its ends. Raises BetterFitError if profiling finds a better fit.
         """
         covariance, theta = self.covariance(best.theta), best.theta
-        weights, ends = np.zeros(theta.shape), (-np.inf, np.inf)
+        weights, bounds = np.zeros(theta.shape), (-np.inf, np.inf)
         middle, weights[j] = quantity.of(theta[j])
         if quantity.factor is None:
-            ends = self.sums.bounds[0][quantity.column], self.sums.bounds[1][quantity.column]
+            bounds = self.sums.bounds[0][quantity.column], self.sums.bounds[1][quantity.column]
         along = np.einsum("iajb,jb->ia", covariance, weights)
         variance = float(np.sum(weights * along))
         sd = np.sqrt(variance) if variance > 0 else 1e-3
-        interval_ends: list[tuple[float, bool]] = []
-        for sign, end in zip((-1.0, 1.0), ends, strict=True):
-            furthest = abs(end - middle)
+        ends, is_open = [], False
+        for sign, bound in zip((-1.0, 1.0), bounds, strict=True):
+            furthest = abs(bound - middle)
 
             def refit(step: float, start: Float | None, sign: float = sign) -> BlendFit:
                 straight = theta + along * sign * step / variance if variance > 0 else theta
                 held = Held(j, quantity, float(middle + sign * step))
                 return self.fit(straight if start is None else start, held)
 
-            reached, probes = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
-            while probes and not isinstance(reached, BlendFit) and reached.step < furthest:
+            step, short, there = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest)
+            for _ in range(PROBES):
+                if step >= furthest:
+                    break
                 # Another optimum may follow beyond a rise.
-                step = min(reached.step * probes.pop(0), furthest)
-                fits = [refit(step, start) for start in (None, reached.theta, theta)]
-                one = min(fits, key=lambda fit: fit.chi2)
+                probe = min(BEYOND * step, furthest)
+                one = min((refit(probe, start) for start in (None, there, theta)), key=lambda fit: fit.chi2)
                 if one.chi2 - best.chi2 < rises * (1.0 - CLOSE) ** 2:
-                    reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
-            if isinstance(reached, BlendFit):
-                return self.fit(reached.theta)
-            interval_ends.append((float(middle + sign * reached.step), reached.open))
-        (low, open_low), (high, open_high) = interval_ends
-        return low, high, open_low or open_high
+                    step, short, there = _interval_end(refit, best.chi2, rises, probe, furthest, one.theta)
+            ends.append(float(middle + sign * step))
+            is_open |= short
+        return ends[0], ends[1], is_open
 
     def without(self, blended: BlendFit, j: int) -> BlendFit:
         """Fit all flares except flare `j`."""
@@ -369,26 +353,23 @@ class Block:
         return self.fit(rest)
 
 
-@dataclass(frozen=True, eq=False)
-class _IntervalEnd:
-    """One end of an interval from the profile likelihood."""
+class BetterFitError(Exception):
+    """Profiling finds a better fit, near the parameters `theta`."""
 
-    step: float  # distance from the best fit
-    open: bool  # chi-squared does not rise enough within the range of the fit
-    theta: Float  # parameters at the end
+    def __init__(self, theta: Float) -> None:
+        self.theta = theta
 
 
 def _interval_end(
     refit: Callable[[float, Float | None], BlendFit], chi2: float, rises: float, step: float, furthest: float,
     start: Float | None = None,
-) -> _IntervalEnd | BlendFit:  # fmt: skip
-    """Return the end of an interval on one side of the best fit, at which chi-squared has risen by `rises`.
+) -> tuple[float, bool, Float]:  # fmt: skip
+    """Find the end of an interval on one side of the best fit, at which chi-squared has risen by `rises`.
 
-    If a fit is better than the best one, it is returned instead.
-
-    `refit` returns the best fit at a distance from the best one, from given or extrapolated starting parameters. `step`
-    is the first guess of the distance, `furthest` that to the bound of the fit, and `start` the first starting
-    parameters.
+    Returns its distance from the best fit, whether chi-squared does not rise enough within the range of the fit, and
+    the parameters there. `refit` returns the best fit at a distance from the best one, from given or extrapolated
+    starting parameters. `step` is the first guess of the distance, `furthest` that to the bound of the fit, and `start`
+    the first starting parameters.
     """
     inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
     for _ in range(MAX_REFITS):
@@ -396,10 +377,10 @@ def _interval_end(
         step = min(step, furthest)
         fit = refit(step, start)
         if fit.chi2 - chi2 < -BETTER:
-            return fit
+            raise BetterFitError(fit.theta)
         root = float(np.sqrt(max(fit.chi2 - chi2, 0.0) / rises))
         if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
-            return _IntervalEnd(step, at_end and root < 1.0 - CLOSE, fit.theta)
+            return step, at_end and root < 1.0 - CLOSE, fit.theta
         start = fit.theta
         if root < 1.0:
             inner, root_inner = step, root
@@ -411,7 +392,7 @@ def _interval_end(
             # The root of the rise is nearly linear: use regula falsi, but keep away from both ends.
             share = (1.0 - root_inner) / (root_outer - root_inner)
             step = inner + (outer - inner) * float(np.clip(share, 0.08, 0.92))
-    return _IntervalEnd(step, root < 1.0 - CLOSE, fit.theta)
+    return step, root < 1.0 - CLOSE, fit.theta
 
 
 #: Largest number of steps of a fit, and the change of chi-squared at which it has converged.
@@ -467,18 +448,12 @@ class SingleFlareFit:
     bank: Bank  # bank of the search, which defines shape, baseline and windows
     templates: Templates  # effect of flares on the sums of a frame
 
-    def run(
-        self,
-        sums: NDArray[Any],
-        frames: SearchedFrames,
-        peak_s: Float,
-        half_width_s: Float,
-    ) -> FittedFlares:
+    def run(self, sums: NDArray[Any], frames: SearchedFrames, peak: Float, half_width_s: Float) -> FittedFlares:
         """Fit one flare to each of several light curves: sums of some frames less their mean, (n, n_frame, n_sum).
 
-        Starting points are the peak and half-width of the template that detected each flare, (n,).
+        Starting points are the peak in s and half-width of the template that detected each flare, (n,).
         """
-        peak, log_width = peak_s, np.log(half_width_s)
+        log_width = np.log(half_width_s)
         several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE))
         sums, start_s, variance, curves = self._averaged(several, sums, frames)
         weight, level = self._windows(start_s, peak, np.exp(log_width), variance, curves)
@@ -487,8 +462,8 @@ class SingleFlareFit:
         edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
         y = _remove_baseline(np.asarray(sums[:, used], np.float64), weight, level)
 
-        def inner_products(peak: Float, log_width: Float) -> tuple[Float, Float]:
-            """Return products of shape and derivatives with each other, (n, 3, 3), and with the sums, (n, 3, K)."""
+        def inner_products(peak: Float, log_width: Float) -> Float:
+            """Return products of shape and derivatives with each other and with the sums, shape (n, 3, 3 + n_sum)."""
             width = np.exp(log_width)
             step = DIFFERENCE * width
             here, later, wider = (
@@ -499,20 +474,19 @@ class SingleFlareFit:
                 np.stack([here, (later - here) / DIFFERENCE, (wider - here) / DIFFERENCE], 2), weight, level
             )
             weighted = three * weight[:, :, None]
-            return np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
+            both = np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
+            return np.concatenate(both, axis=2)
 
         return self._climbed(inner_products, peak, log_width)
 
-    def _climbed(
-        self, inner_products: Callable[[Float, Float], tuple[Float, Float]], peak: Float, log_width: Float
-    ) -> FittedFlares:
+    def _climbed(self, inner_products: Callable[[Float, Float], Float], peak: Float, log_width: Float) -> FittedFlares:
         """Climb to the largest gains from starting points, by damped Newton steps (Marquardt 1963)."""
         n = peak.size
         products = inner_products(peak, log_width)
-        log_kelvin, amplitude, gain = self._brightest(products)
-        damping = np.full(n, DAMPING)
-        going = np.ones(n, np.bool_)
+        state = np.array([peak, log_width, *self._brightest(products)])
+        damping, going = np.full(n, DAMPING), np.ones(n, np.bool_)
         for _ in range(STEPS):
+            peak, log_width, log_kelvin, amplitude, gain = state
             information, pull = self._normal(products, amplitude, log_kelvin)
             diagonal = np.einsum("nii->ni", information)
             damped = information + (damping[:, None] * diagonal + 1e-12)[:, :, None] * np.eye(4)
@@ -520,22 +494,15 @@ class SingleFlareFit:
             move = np.where(going[:, None], np.clip(move, -LARGEST_STEP, LARGEST_STEP), 0.0)
             there = peak + move[:, 1] * np.exp(log_width), log_width + move[:, 2]
             tried = inner_products(*there)
-            kelvin, best, reached = self._brightest(tried)
-            better = going & (reached > gain)
-            small = np.abs(reached - gain) < ENOUGH
-            peak, log_width, log_kelvin, amplitude, gain = (
-                np.where(better, a, b)
-                for a, b in zip(
-                    (*there, kelvin, best, reached), (peak, log_width, log_kelvin, amplitude, gain), strict=True
-                )
-            )
-            products = tuple(  # type: ignore[assignment]
-                np.where(better[:, None, None], a, b) for a, b in zip(tried, products, strict=True)
-            )
+            reached = np.array([*there, *self._brightest(tried)])
+            better, small = going & (reached[4] > gain), np.abs(reached[4] - gain) < ENOUGH
+            state = np.where(better, reached, state)
+            products = np.where(better[:, None, None], tried, products)
             damping = np.where(better, damping / EASIER, damping * HARDER)
             going &= ~(small & better) & (damping < 1e6)
             if not going.any():
                 break
+        peak, log_width, log_kelvin, amplitude, gain = state
         information, _ = self._normal(products, amplitude, log_kelvin)
         covariance, n_free = np.zeros((n, 4, 4)), 4 if self.templates.coloured else 3
         covariance[:, :n_free, :n_free] = np.linalg.pinv(information[:, :n_free, :n_free], hermitian=True)
@@ -546,9 +513,9 @@ class SingleFlareFit:
         area, snr = self.bank.shape.equivalent_duration, np.sqrt(np.maximum(gain, 0.0))
         return FittedFlares.of(theta, covariance, area, snr, coloured=self.templates.coloured)
 
-    def _brightest(self, products: tuple[Float, Float]) -> tuple[Float, Float, Float]:
+    def _brightest(self, products: Float) -> tuple[Float, Float, Float]:
         """Return log temperature, amplitude and fall of chi-squared of the best fits of given shapes."""
-        shapes, data = products
+        shapes, data = np.split(products, [3], axis=2)
         length = np.sqrt(np.maximum(shapes[:, 0, 0], 1e-300))
         sums = data[:, 0] / length[:, None]
         profile = Profile(self.templates.mean_sums, sums)
@@ -596,9 +563,9 @@ class SingleFlareFit:
             terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
         return weight, terms
 
-    def _normal(self, products: tuple[Float, Float], amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
+    def _normal(self, products: Float, amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
         """Return information and gradient for log amplitude, peak in half-widths, log half-width, log temperature."""
-        shapes, data = products
+        shapes, data = np.split(products, [3], axis=2)
         spline = self.templates.mean_sums.spline
         r, dr = spline(log_kelvin), spline(log_kelvin, 1) * self.templates.coloured
         # Each derivative is a product of one in time and one in the sums.

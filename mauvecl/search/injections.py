@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,15 +142,21 @@ class InjectionSite:
 
 def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[InjectionSite, ...]:
     """Return the sites of flares of several half-widths that peak at one time."""
-    bank = survey.bank
-    reaches = [_Reach.of(bank, width, peak_s) for width in widths_s]
-    search, first = _search_near(survey, reaches)
+    bank, reaches = survey.bank, [_Reach.of(survey.bank, width, peak_s) for width in widths_s]
+    if survey.stare.n_frames <= WHOLE:
+        search, first = survey.search, 0
+    else:
+        # Only the frames that templates cover are searched.
+        limits = min(reach.begin_s for reach in reaches), max(reach.end_s for reach in reaches)
+        first, last = np.searchsorted(survey.stare.start_s, limits).tolist()
+        tried = {width for reach in reaches for width in reach.half_widths_s}
+        search = survey.frames.part(slice(first, last)).search(replace(bank, half_widths_s=tuple(sorted(tried))))
     stare = search.stare
     edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
     near = _near_templates(search, reaches, means, bank.directions @ survey.response)
     # Flares of several half-widths share templates.
-    places, index = np.unique(np.concatenate([templates.places for templates in near]), return_inverse=True)
+    places, index = np.unique(np.concatenate([own for own, _, _ in near]), return_inverse=True)
     numbers, onsets = np.divmod(places, search.n_grid)
     filters = np.empty((places.size, stare.n_frames), np.float32)
     for number in np.unique(numbers):
@@ -158,28 +164,24 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
         filters[mine] = np.rint(search.in_time(search.grid[number], onsets[mine]) / STEP) * STEP
     filter_widths_s = np.array([row.template.half_width_s for row in search.grid])[numbers]
     sites = []
-    for width, mean, templates in zip(widths_s, means, near, strict=True):
-        mine, index = np.split(index, [templates.places.size])
+    for width, mean, (own_places, peaks_s, counts) in zip(widths_s, means, near, strict=True):
+        mine, index = np.split(index, [own_places.size])
         own = filters[mine]
         used = np.flatnonzero(own.any(axis=0))
         ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
         arrays = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32), filter_widths_s[mine]
-        sites.append(InjectionSite(width, peak_s, first + ends.start, *arrays, templates.peaks_s, templates.counts))
+        sites.append(InjectionSite(width, peak_s, first + ends.start, *arrays, peaks_s, counts))
     return tuple(sites)
 
 
-class _NearTemplates(NamedTuple):
-    """Templates that may detect a flare."""
-
-    places: NDArray[np.int64]  # row in the search times `n_grid`, plus the onset; shape (n_template,)
-    peaks_s: Float  # shape (n_template,)
-    counts: NDArray[np.bool_]  # whether they count as a detection, shape (n_temperature, n_template)
-
-
-def _near_templates(search: Search, reaches: Sequence[_Reach], means: Float, along: Float) -> list[_NearTemplates]:
+def _near_templates(
+    search: Search, reaches: Sequence[_Reach], means: Float, along: Float
+) -> list[tuple[NDArray[np.int64], Float, NDArray[np.bool_]]]:
     """Return the templates that may detect each flare.
 
-    `means` are those of the flares, and `along` is their light along the bank's directions.
+    These are their rows in the search times `n_grid` plus their onsets, (n_template,), the times of their peaks, and
+    whether they count as a detection, (n_temperature, n_template). `means` are those of the flares, and `along` is
+    their light along the bank's directions.
     """
     seen: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
@@ -196,7 +198,7 @@ def _near_templates(search: Search, reaches: Sequence[_Reach], means: Float, alo
         places, times, values = (np.concatenate(part, axis=-1) for part in zip(*templates, strict=True))
         counts = values >= OVERLAP * values.max(initial=0)
         used = counts.any(axis=0)
-        near.append(_NearTemplates(places[used], times[used], counts[:, used]))
+        near.append((places[used], times[used], counts[:, used]))
     return near
 
 
@@ -218,18 +220,6 @@ class _Reach:
         first, last = peak_s - (BEFORE * near[-1] + width_s), peak_s + AFTER * max(width_s, near[-1])
         lead, tail = (frames * bank.frame_s for frames in bank.window(near[-1]))
         return cls(tuple(near), first, last, first - lead, last + tail + bank.frame_s)
-
-
-def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
-    """Return a search of the frames that templates cover, and the first of these frames."""
-    stare = survey.stare
-    if stare.n_frames <= WHOLE:
-        return survey.search, 0
-    ends = min(reach.begin_s for reach in reaches), max(reach.end_s for reach in reaches)
-    part = slice(*(int(k) for k in np.searchsorted(stare.start_s, ends)))
-    near = {width for reach in reaches for width in reach.half_widths_s}
-    bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
-    return survey.frames.part(part).search(bank), part.start
 
 
 #: Number of stares per batch.
@@ -310,16 +300,9 @@ class Injections:
             sites, self.threshold, survey.bank.directions, survey.response, self.photons, single, start, refit
         )
         return StaresRequest(
-            self.quiescent,
-            frames.stare,
-            self.draws,
-            self.seed,
-            start=start,
-            method=self.method,
-            processes=self.processes,
-            reduction=injecting,
-            glow=True,
-        )
+            self.quiescent, frames.stare, self.draws, self.seed, start=start, method=self.method,
+            processes=self.processes, reduction=injecting, glow=True,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,25 +365,6 @@ class CriticalAmplitudes:
             _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
         )
 
-    def best(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> tuple[Float, NDArray[np.int64]]:
-        """Return the largest value of all templates and its template, shape (n_amplitude, n_draw) each."""
-        a, b, c = self.values(site, drawn)
-        values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])
-        values[:, ~site.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
-        flat = np.moveaxis(values, 2, 1).reshape(len(amplitudes), a.shape[1], -1)
-        which = flat.argmax(axis=2)
-        largest = np.take_along_axis(flat, which[:, :, None], axis=2)[:, :, 0]
-        return largest.astype(np.float64), which % a.shape[2]
-
-    def sums(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> Single:
-        """Return frames with the flare less their known mean, shape (n_amplitude, n_draw, n_frame, n_sum)."""
-        here, mean = site.frames, drawn.mean(site)
-        glow = np.sqrt(np.maximum(site.mean, 0))
-        own = np.einsum("kj,jmt->mtk", self.photons.astype(np.float32), drawn.own[:, :, here] * glow)
-        rise = mean[:, :, None] * self.response.astype(np.float32)
-        noise = np.moveaxis(drawn.noise[:, :, here], 0, 2)
-        return np.asarray([noise + x * rise + np.sqrt(x) * own for x in amplitudes.astype(np.float32)])
-
     def _critical(self, site: InjectionSite, values: tuple[Single, Single, Single]) -> Single:
         a, b, c = values
         left = np.float32(self.threshold) - a
@@ -421,12 +385,21 @@ class CriticalAmplitudes:
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue
-            value, template = (each[:, 0] for each in self.best(site, drawn, row))
-            alarm = value >= self.threshold
+            a, b, c = (each[:, 0] for each in self.values(site, drawn))
+            values = np.array([a + x * b + np.sqrt(x) * c for x in row.astype(np.float32)])
+            values[:, ~site.counts] = -np.inf
+            flat = values.reshape(len(row), -1).astype(np.float64)
+            alarm = flat.max(axis=1) >= self.threshold
             if not alarm.any():
                 continue
-            sums, which = self.sums(site, drawn, row[alarm])[:, 0], template[alarm]
-            recovered = refit.fit.run(sums, self.frames.part(site.frames), site.peaks_s[which], site.widths_s[which])
+            which = flat.argmax(axis=1)[alarm] % len(site.filters)
+            # Frames with the flare less their known mean, (n_amplitude, n_frame, n_sum).
+            here, shining = site.frames, np.sqrt(np.maximum(site.mean, 0))
+            own = np.einsum("kj,jt->tk", self.photons.astype(np.float32), drawn.own[:, 0, here] * shining)
+            rise = drawn.mean(site)[0][:, None] * self.response.astype(np.float32)
+            noise = drawn.noise[:, 0, here].T
+            sums = np.array([noise + x * rise + np.sqrt(x) * own for x in row[alarm].astype(np.float32)])
+            recovered = refit.fit.run(sums, self.frames.part(here), site.peaks_s[which], site.widths_s[which])
             for name, values in refit.compared(recovered, row[alarm], site).items():
                 estimates[name][d, alarm] = values
         return estimates

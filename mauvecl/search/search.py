@@ -36,12 +36,9 @@ from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.noise.unknowns import NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from mauvecl.flares.frames import Components
     from mauvecl.flares.stare import Stare
 
@@ -312,7 +309,12 @@ class Trend:
 
         The result has the shape (n_stare, n_frame, n_sum).
         """
-        return self._moved(self._changes(amplitudes))
+        changes = self._changes(amplitudes)
+        light = changes["light"] + 1
+        star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
+        warm = np.expm1(self.slope_per_c * changes["temperature"])
+        each = (change[..., None] for change in (star, sky, changes["light"], warm))
+        return np.asarray(sum(change * known for change, known in zip(each, self.known, strict=True)))
 
     def part(self, part: slice) -> Trend:
         """Return the trend of some frames."""
@@ -329,8 +331,7 @@ class Trend:
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
-        linear = np.array([self._linear[of] for of in self.of])
-        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
+        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, self._linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
 
     def fitted(self, sums: Float) -> Float:
@@ -340,11 +341,10 @@ class Trend:
         n, n_unknown = len(y), len(self.of)
         amplitudes = np.zeros((n, n_unknown))
         for _ in range(STEPS):
-            changes = means._changes(amplitudes)
-            left = y - means._moved(changes)
+            left = y - means.effect(amplitudes)
             size = np.sqrt(np.sum(left**2, axis=2) * weight)
             trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
-            gradient = means._gradient(changes)
+            gradient = means._gradient(amplitudes)
             weighted = gradient * trusted[:, None, :, None]
             information = np.einsum("nutk,nvtk->nuv", weighted, gradient, optimize=True) + np.eye(n_unknown)
             pull = np.einsum("nutk,ntk->nu", weighted, left, optimize=True) - amplitudes
@@ -352,10 +352,11 @@ class Trend:
         return amplitudes
 
     @cached_property
-    def _linear(self) -> dict[str, Float]:
-        """Mean response of the sums to each kind of change, shape (n_sum,)."""
+    def _linear(self) -> Float:
+        """Mean response of the sums to the change of each unknown, shape (n_unknown, n_sum)."""
         star, sky, near, dark = self.known.mean(axis=1)
-        return {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
+        each = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
+        return np.array([each[of] for of in self.of])
 
     @cached_property
     def _blocks(self) -> tuple[NDArray[np.int64], Float, Trend]:
@@ -363,7 +364,6 @@ class Trend:
         number = self.frames // max(1, round(BLOCK_S / self.frame_s))
         first = np.flatnonzero(np.diff(number, prepend=-1))
         weight = np.add.reduceat(1.0 / self.variance, first)
-
         curves = np.add.reduceat(self.curves / self.variance, first, axis=1) / weight
         known = np.add.reduceat(self.known / self.variance[:, None], first, axis=1) / weight[:, None]
         means = replace(self, frames=number[first], variance=1.0 / weight, curves=curves, known=known)
@@ -377,16 +377,9 @@ class Trend:
             changes[of] = amplitudes[:, these] @ self.curves[these]
         return changes
 
-    def _moved(self, changes: Mapping[str, Float]) -> Float:
-        """Return the effect of changes on the sums, (n_stare, n_frame, n_sum)."""
-        light = changes["light"] + 1
-        star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
-        warm = np.expm1(self.slope_per_c * changes["temperature"])
-        each = (change[..., None] for change in (star, sky, changes["light"], warm))
-        return np.asarray(sum(change * known for change, known in zip(each, self.known, strict=True)))
-
-    def _gradient(self, changes: Mapping[str, Float]) -> Float:
-        """Return the derivatives of `_moved` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
+    def _gradient(self, amplitudes: Float) -> Float:
+        """Return the derivatives of `effect` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
+        changes = self._changes(amplitudes)
         light, star, sky = (1 + changes[of][..., None] for of in ("light", "star", "sky"))
         warm = np.exp(self.slope_per_c * changes["temperature"])[..., None]
         each = {
@@ -536,11 +529,6 @@ class Survey:
         return StaresRequest(
             self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
         )
-
-    def of_days(self, days: float) -> Survey:
-        """Return the survey of at most the first `days` star-days of the stare."""
-        n = int(days * DAY_S / self.stare.frame_s)
-        return self if self.stare.n_frames <= n else replace(self, stare=select_frames(self.stare, slice(0, n)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,5 @@
 """Rates of flares and the closed form of completeness, as plans state them: published values, tables and bands."""
 
-from pathlib import Path
 from typing import Any
 
 import astropy.units as u
@@ -14,15 +13,13 @@ from scipy import stats
 from mauvecl import SHAPES, EnergyScale, Source, Study, plan
 from mauvecl.search import completeness
 
-QUICK = {"completeness": "closed form"}
-
 
 def planned(targets: dict[str, dict[str, Any]], kind: str = "K5V", **changes: Any) -> Any:
     """Return the plan of stars of V = 8 in 10 pc that differ in their rates."""
     star = {"coordinates": "10.5 -3.0", "spectral_type": kind, "magnitude": 8.0, "distance_pc": 10.0}
     rows = [{"name": name, **star, **rates} for name, rates in targets.items()]
-    sections = {"plan": QUICK | {"targets": rows} | changes.pop("plan", {}), "orbit": {"days": 3.0}} | changes
-    return plan(Study.build(sections, "test"))
+    asked = {"completeness": "closed form", "targets": rows} | changes.pop("plan", {})
+    return plan(Study.build({"plan": asked, "orbit": {"days": 3.0}} | changes, "test"))
 
 
 def rate(answer: Any, name: str, energy: Any) -> Any:
@@ -34,17 +31,9 @@ def rate(answer: Any, name: str, energy: Any) -> Any:
     return np.exp(np.interp(np.log(energy), grid, np.log(above[seen])))
 
 
-def energy_scale(kind: str) -> tuple[float, float]:
-    """Return the energy of the light and the star's luminosity in Kepler's band, erg per second of duration."""
-    star = Source.from_library(kind).at_magnitude(8.0)
-    sphere = 4 * np.pi * (10 * u.pc).to_value(u.cm) ** 2
-    luminosity = sphere * through("Kepler", star.wavelength_nm, star.flux_flam)
-    return EnergyScale.of_star(star, 10.0, flare_k=10_000.0).erg_per_s, luminosity
-
-
 @pytest.fixture(scope="module")
 def answer(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    path: Path = tmp_path_factory.mktemp("rates") / "own.csv"
+    path = tmp_path_factory.mktemp("rates") / "own.csv"
     path.write_text("energy,rate\n1e31,2.0\n1e32,0.5\n1e34,0.001\n")
     return planned({
         "young": {"mass_msun": 0.5, "age_myr": 100.0}, "old": {"mass_msun": 0.5, "age_myr": 5000.0},
@@ -57,7 +46,9 @@ def answer(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 def test_rates_by_mass_and_age_equal_published_values(answer: Any) -> None:
     """Davenport et al. 2019 (TIME.md, section 3), whose energies are those of the star's light in the Kepler band."""
-    light, luminosity = energy_scale("K5V")
+    star = Source.from_library("K5V").at_magnitude(8.0)
+    light = EnergyScale.of_star(star, 10.0, flare_k=10_000.0).erg_per_s
+    luminosity = 4 * np.pi * (10 * u.pc).to_value(u.cm) ** 2 * through("Kepler", star.wavelength_nm, star.flux_flam)
     assert rate(answer, "young", 1e33 * light / luminosity) == pytest.approx(0.074131, rel=2e-5)
     # Fewer flares of older stars.
     assert rate(answer, "old", 1e33) < rate(answer, "young", 1e33)
@@ -99,11 +90,9 @@ def test_rates_of_a_table_are_converted_from_its_band(answer: Any) -> None:
 
 def test_yields_are_those_of_poisson_and_of_scattered_rates(answer: Any) -> None:
     """Compare with 200 000 draws, whose quantiles are known to half a per cent."""
-    table = answer.table
-    rng = np.random.default_rng(11)
-    scatter = {star["target"]: star["scatter"] for star in answer.stars}
+    rng, scatter = np.random.default_rng(11), {star["target"]: star["scatter"] for star in answer.stars}
     assert (scatter["own"], scatter["young"]) == (0.0, 0.5)
-    for row in table:
+    for row in answer.table:
         mean, sd = float(row["expected"]), float(scatter[row["target"]])
         if sd == 0:
             assert (row["low"], row["high"]) == tuple(stats.poisson.ppf([0.025, 0.975], mean))
@@ -117,26 +106,23 @@ def test_yields_are_those_of_poisson_and_of_scattered_rates(answer: Any) -> None
 def test_closed_form_completeness_agrees_with_white_noise() -> None:
     """Compare with matched filters of the correct width in 2000 drawn stretches; a test in 70 fails by chance."""
     answer = planned({"own": {"alpha": 1.8, "rate_per_day": 0.2, "at_erg": 1e33}}, plan={"scatter_dex": 0.0})
-    (star,), table, frame = answer.stars, answer.by_energy, 5.0
+    (star,), table, shape = answer.stars, answer.by_energy, SHAPES["davenport2014"]
     window, signal = star["window"].to_value("s"), float(star["signal_per_frame"])
-    per_second, shape = star["energy_per_second"].to_value("erg / s"), SHAPES["davenport2014"]
     # One false alarm per star-month of the default bank, by the closed form.
-    threshold = 4.72
-    rng, n = np.random.default_rng(3), round(window / frame)
-    edges = np.arange(n + 1) * frame
-    line = np.linalg.qr(np.stack([np.ones(n), np.arange(n)], axis=1))[0]
+    threshold, per_second = 4.72, star["energy_per_second"].to_value("erg / s")
+    rng, n = np.random.default_rng(3), round(window / 5.0)
+    edges, line = np.arange(n + 1) * 5.0, np.linalg.qr(np.stack([np.ones(n), np.arange(n)], axis=1))[0]
     first = int(np.argmax(table["recovered"] > 0.05))
     for row in table[first : first + 10 : 2]:
         energy = row["energy"].to_value("erg")
         half = 100.0 * (energy / 1e33) ** 0.39
         amplitude = energy / per_second / (half * shape.equivalent_duration)
-        tau = (edges - rng.uniform(0, window, 2000)[:, None]) / half
-        flare = shape.integral(tau[:, :-1], tau[:, 1:]) * half / frame
-        y = signal * amplitude * flare + rng.standard_normal(flare.shape)
+        flare = signal * amplitude * shape.mean_over(edges, rng.uniform(0, window, 2000)[:, None], half)
         template = flare - (flare @ line) @ line.T
         size = np.linalg.norm(template, axis=1)
+        y = flare + rng.standard_normal(flare.shape)
         statistic = np.sum(y * template, axis=1) / np.maximum(size, 1e-12)
-        found = ((statistic > threshold) & (signal * amplitude * size > threshold / 2)).mean()
+        found = ((statistic > threshold) & (size > threshold / 2)).mean()
         assert row["recovered"] == pytest.approx(found, abs=0.035)
 
 
@@ -152,18 +138,15 @@ def test_power_law_is_recovered_from_drawn_flares(alpha: float) -> None:
         return 0.2 * (energy / 1e33) ** (1 - alpha)
 
     steps = np.geomspace(form.energy_erg[0], form.energy_erg[-1], 100_001)
-    middle = np.sqrt(steps[1:] * steps[:-1])
-    days = 60 / float(np.sum((per_day(steps[:-1]) - per_day(steps[1:])) * form.at(middle)))
+    days = 60 / float(-np.diff(per_day(steps)) @ form.at(np.sqrt(steps[1:] * steps[:-1])))
     # Below nothing is recovered.
     least = float(form.energy_erg[np.argmax(form.probability > 1e-6)])
-    mean = per_day(least) * days
     inside = np.zeros((campaigns, 2), bool)
     for k in range(campaigns):
-        energy = least * (1 - rng.random(rng.poisson(mean))) ** (1 / (1 - alpha))
+        energy = least * (1 - rng.random(rng.poisson(per_day(least) * days))) ** (1 / (1 - alpha))
         energy = energy[rng.random(energy.size) < form.at(energy)]
-        fit = completeness.fit_power_law(
-            energy * 10 ** (error * rng.standard_normal(energy.size)), form, days, error_dex=error
-        )
+        blurred = energy * 10 ** (error * rng.standard_normal(energy.size))
+        fit = completeness.fit_power_law(blurred, form, days, error_dex=error)
         truth = np.log10(per_day(fit.pivot_erg))
         inside[k] = abs(fit.alpha - alpha) < fit.alpha_sd, abs(fit.log10_rate - truth) < fit.log10_rate_sd
     assert inside.mean(axis=0) == pytest.approx([0.68, 0.68], abs=0.05)

@@ -19,11 +19,6 @@ SEED = 2**63 + 12345
 #: Around the boundary of the counter's first word.
 FIRST, COUNT = 2**32 - 24, 40
 
-
-def pointing(**drifts: float) -> Any:
-    return Study.build({"stare": {"pointing": drifts}}, "test").stare.pointing
-
-
 WOBBLE: dict[str, Any] = {
     "jitters": {"light": 0.02, "sky": 0.03, "temperature": 0.1},
     "offsets": {"star": 0.01, "light": 0.02, "sky": 0.05, "temperature": 0.3},
@@ -31,7 +26,8 @@ WOBBLE: dict[str, Any] = {
     "thermal": 0.5,
     "gaps": [(20.0, 60.0)],
 }
-DRIFTING: dict[str, Any] = {"pointing": pointing(rate_per_h=100.0, duration_s=30.0, depth=0.9)}
+DRIFTS = Study().with_settings(["stare.pointing={rate_per_h=100.0, duration_s=30.0, depth=0.9}"]).stare.pointing
+DRIFTING: dict[str, Any] = {"pointing": DRIFTS}
 #: Payload, stare, sums, flare temperatures, scenarios, further words.
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, Any]]] = {
     "plain": ({}, {}, 1, 0, 0, {}),
@@ -85,9 +81,8 @@ def test_stares_equal_the_reference(stares: Stares, name: str, method: Any) -> N
     flares = stare_scene.Flares.of(components, stare, flare, amplitudes, COUNT)
     numbers = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64)
     frames = range(0, stare.n_frames, 1 if method == "cumulants" else 6)
-    ours = {"pixels": stare_reference.pixels, "cumulants": stare_reference.sums}[method](
-        scene, flares, numbers, frames, SEED
-    )
+    drawn = {"pixels": stare_reference.pixels, "cumulants": stare_reference.sums}[method]
+    ours = drawn(scene, flares, numbers, frames, SEED)
     np.testing.assert_array_equal(found[..., list(frames), :], ours if amplitudes is not None else ours[0])
     assert found.std() > 0
 
@@ -98,26 +93,23 @@ def test_splitting_changes_no_bit(engine: Engine, method: Any) -> None:
     """Check that stares depend on seed and number alone, and frames on their time, however calls are divided."""
     components, stare, flare, amplitudes, _ = case("electrons")
     how: dict[str, Any] = {"seed": SEED, "method": method}
-    whole = Stares(engine.open_device).frames(
-        components, stare, flare, first=FIRST, count=COUNT, amplitudes=amplitudes, **how
-    )
+
+    def part(a: int, b: int, tile: int | None = None) -> np.ndarray:
+        some: dict[str, Any] = {"first": FIRST + a, "count": b - a, "amplitudes": amplitudes[:, a:b]}
+        return Stares(engine.open_device, tile=tile).frames(components, stare, flare[a:b], **some, **how)
+
+    whole = part(0, COUNT)
     for tile in (None, 16):
-        parts = [
-            Stares(engine.open_device, tile=tile).frames(
-                components, stare, flare[a:b], first=FIRST + a, count=b - a, amplitudes=amplitudes[:, a:b], **how
-            )
-            for a, b in ((0, 1), (1, 23), (23, 40))
-        ]
+        parts = [part(a, b, tile) for a, b in ((0, 1), (1, 23), (23, 40))]
         np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
-    alone = Stares(engine.open_device).frames(
-        components, stare, flare * amplitudes[1][:, None, None], first=FIRST, count=COUNT, **how
-    )
+    device, scaled = Stares(engine.open_device), flare * amplitudes[1][:, None, None]
+    alone = device.frames(components, stare, scaled, first=FIRST, count=COUNT, **how)
     # The device multiplies in float32 what is multiplied in float64 here: whole DN may differ now and then.
     np.testing.assert_allclose(alone, whole[1], atol=5.0)
     # The frames that a gap leaves are those of the stare without it.
-    gapless = Stare.of(110.0, temperature_c=components.quiet.conditions["temperature_c"])
-    gapped = Stare.of(110.0, temperature_c=components.quiet.conditions["temperature_c"], gaps=[(20.0, 60.0)])
-    both = [Stares(engine.open_device).frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
+    warm = {"temperature_c": components.quiet.conditions["temperature_c"]}
+    gapless, gapped = (Stare.of(110.0, gaps=gaps, **warm) for gaps in ((), [(20.0, 60.0)]))
+    both = [device.frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
     np.testing.assert_array_equal(both[0][:, gapped.numbers], both[1])
 
 
@@ -137,14 +129,11 @@ class Beside:
 def test_sums_for_flares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:
     """Check their own normals and the light of the frames, for any share of drawn stares."""
     components, stare, *_ = case(name)
-    asked = stare_scene.StaresRequest(
-        components, stare, COUNT, SEED, start=FIRST, method=method, reduction=Beside(), glow=True
-    )  # fmt: skip
-    found = stares.reduced(asked)
+    how: dict[str, Any] = {"start": FIRST, "method": method, "reduction": Beside(), "glow": True}
+    asked = stare_scene.StaresRequest(components, stare, COUNT, SEED, **how)
+    found, scene = stares.reduced(asked), stare_scene.StareScene.of(components, stare)
     numbers, frames = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64), range(stare.n_frames)
-    np.testing.assert_array_equal(
-        found["glow"], stare_reference.glow(stare_scene.StareScene.of(components, stare), numbers, frames, SEED)
-    )
+    np.testing.assert_array_equal(found["glow"], stare_reference.glow(scene, numbers, frames, SEED))
     whole = stares.frames(components, stare, first=FIRST, count=COUNT, seed=SEED, method=method)
     np.testing.assert_array_equal(found["values"], whole)
     part = stares.reduced(asked, requests.Shard(0, FIRST + 5, 21))
