@@ -66,7 +66,6 @@ def stated_units(
     """Return the requested units of wavelength and flux that a header states, as text.
 
     Without names of columns (`is_named`), a header that mentions counts or magnitudes implies that there is no flux.
-    Raises InputError if it states several units, an unknown unit, or implies that there is no flux.
     """
     text = header[:MAX_HEADER]
     found = [_spelt(match[0].strip()) for match in _FLUX.finditer(text)]
@@ -213,10 +212,7 @@ _VACUUM = re.compile(r"(?:\b|_)vac(?:uum)?(?:\b|_)|\bvacuum", re.IGNORECASE)
 
 
 def medium_of(headers: Sequence[Mapping[str, Any]]) -> Medium | None:
-    """Return the medium of wavelengths that keywords of headers state, or None.
-
-    Raises InputError if keywords contradict each other, or one that states the medium has another value.
-    """
+    """Return the medium of wavelengths that keywords of headers state, which must agree, or None."""
     from mauvecl.host.tables.fits_tables import text_at
 
     found: dict[str, Medium] = {}

@@ -104,8 +104,9 @@ class NumberLines:
         self.expected = expected
         #: Lines above the rows without their marks, and all comments, and whether each is one.
         self.header: list[tuple[str, bool]] = []
-        #: Number and text of the line of each row.
+        #: Number and text of the line of each row, and messages on how these are read.
         self.lines: list[tuple[int, str]] = []
+        self.messages: list[str] = []
         numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if not _RULE.fullmatch(line)]
         comments = {number for number, line in numbered if _COMMENT.match(line) and not _BARRED.match(line)}
         start = _first_row([(number, line) for number, line in numbered if number not in comments])
@@ -118,29 +119,18 @@ class NumberLines:
                 self.lines.append((number, line.split("#", 1)[0].strip()))
         if not self.lines:
             raise InputError(f"it contains no numbers, but needs two columns: {expected}", key="columns")
-        self.cells = self._divided([line for _, line in self.lines])
-        #: Number of columns, and whether their cells contain arrays.
+        self.comments = "\n".join(line for line, _ in self.header)
+        rows = [line for _, line in self.lines]
+        mark = _mark(rows, commas=False)
+        self.cells = _split(rows, mark)
         self.n = len(self.cells[0])
-        self.holds_arrays = any(cell[:1] in ("(", "[") for cell in self.cells[0])
-
-    @property
-    def comments(self) -> str:
-        """Text of the header."""
-        return "\n".join(line for line, _ in self.header)
-
-    def _divided(self, lines: list[str]) -> list[list[str]]:
-        """Return the cells of the rows; raise InputError if commas may be decimal or divide columns."""
-        mark = _mark(lines, commas=False)
-        cells = _split(lines, mark)
-        if decimal := _has_decimal_commas(cells, "it"):
-            cells = _with_points(cells)
-        #: Messages on how the rows are read.
-        self.messages = [DECIMAL_COMMAS] if decimal else []
-        are_whole = all(len(row) > 1 and row[1].isdecimal() and "." not in "".join(row) for row in cells[:SAMPLE])
-        if mark == "," and len(cells) > 1 and are_whole:
-            fault = f"its line {shortened(lines[0], 60)} may hold decimal commas or columns; use decimal points"
+        if _has_decimal_commas(self.cells, "it"):
+            self.cells = _with_points(self.cells)
+            self.messages.append(DECIMAL_COMMAS)
+        are_whole = all(len(row) > 1 and row[1].isdecimal() and "." not in "".join(row) for row in self.cells[:SAMPLE])
+        if mark == "," and len(rows) > 1 and are_whole:
+            fault = f"its line {shortened(rows[0], 60)} may hold decimal commas or columns; use decimal points"
             raise InputError(fault, key="columns")
-        return cells
 
     def column(self, place: int, name: str, unit: str = "") -> Values:
         """Return a column of numbers."""
@@ -330,33 +320,28 @@ def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[s
 
 def text_table(text: str, what: str, commas: bool) -> Table:
     """Parse a table from text: ECSV, those of IPAC and CDS, and rows that marks or blanks divide into texts."""
-    if re.match(r"\s*# %ECSV", text):
-        return parse_ecsv(text, what)
-    form = _known_form(text)
-    if form is None:
-        return rows_of_text(text, what, commas)[0]
     from astropy.table import Table
 
-    lines = text.splitlines()
-    check_cells(lines, what)
+    if re.match(r"\s*# %ECSV", text):
+        return parse_ecsv(text, what)
+    lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
+    rows = [line for line in lines if not line.startswith("|")]
+    if is_described(text):
+        form = "ascii.mrt" if re.match(r"\s*Title:", text) else "ascii.cds"
+    elif lines and lines[0][0] == "|" and rows and not any("|" in line for line in rows):
+        # The headings of IPAC's tables have marks, their rows blanks.
+        form = "ascii.ipac"
+    else:
+        return rows_of_text(text, what, commas)[0]
+    check_cells(text.splitlines(), what)
     with reading(what, "give a whole table"):
         # Of an empty line astropy makes a row without values.
-        return Table.read([line for line in lines if line.strip()], format=form)
+        return Table.read([line for line in text.splitlines() if line.strip()], format=form)
 
 
 def is_described(text: str) -> bool:
     """Return whether a text is a machine-readable table of the journals, or of CDS with its description."""
     return re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]) is not None
-
-
-def _known_form(text: str) -> str | None:
-    """Return the name in astropy of a form with units and types of its own, or None."""
-    if is_described(text):
-        return "ascii.mrt" if re.match(r"\s*Title:", text) else "ascii.cds"
-    lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
-    rows = [line for line in lines if not line.startswith("|")]
-    # The headings of IPAC's tables have marks, their rows blanks.
-    return "ascii.ipac" if lines and lines[0][0] == "|" and rows and not any("|" in line for line in rows) else None
 
 
 def _mark(lines: Sequence[str], commas: bool) -> str:

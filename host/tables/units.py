@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.names import MISSING_WORDS, divided_unit, in_brackets, is_missing
+from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import DAY_S
 
@@ -34,7 +34,7 @@ _DENSITIES = {
     "wm-2um-1": "W / (m2 um)",
 } | {"jansky": "Jy", "janskys": "Jy", "jy": "Jy", "mjy": "mJy", "ujy": "uJy", "njy": "nJy"}
 # Lower-case spellings and astropy's names; astropy parses A as ampere.
-_SPELLINGS = {
+_WORDS = by_word({
     "Angstrom": "a aa ang angs angstrom angstroms angstroem angstroems ångström ångströms å",
     "nm": "nm nanometer nanometers nanometre nanometres",
     "um": "um micron microns micrometer micrometers micrometre micrometres",
@@ -43,8 +43,7 @@ _SPELLINGS = {
     "erg": "erg ergs", "J": "j joule joules", "W": "w watt watts",
     "s": "s sec secs second seconds", "photon": "photon photons ph phot",
     "sr": "sr ster sterad steradian steradians", "arcsec": "arcsec arcsecond arcseconds",
-}  # fmt: skip
-_WORDS = {spelling: name for name, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+})  # fmt: skip
 _TYPOGRAPHY = str.maketrans("µμ−–⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹·⋅×Å", "uu---+0123456789..*Å")
 #: Marks of LaTeX that say nothing of a unit.
 _LATEX = re.compile(r"\$|\\(?:mathrm|rm|text|,|;|:|!|(?=AA))")
@@ -194,16 +193,11 @@ _DAYS = EPOCHS_MJD | {"hjd": -2_400_000.5, "gjd": -2_400_000.5, "bmjd": 0.0, "mb
 #: Scale and position of the missions' own dates.
 _MISSION_DAYS = ("btjd", "tbjd", "bkjd", "kbjd")
 #: Units of time in words, by the names of astropy.
-_TIME_WORDS = {
-    word: name
-    for name, words in {
-        "d": "d day days", "h": "h hr hrs hour hours", "min": "min mins minute minutes",
-        "s": "s sec secs second seconds",
-        "ms": "ms msec msecs millisecond milliseconds", "us": "us usec microsecond microseconds",
-        "yr": "yr yrs year years",
-    }.items()
-    for word in words.split()
-}  # fmt: skip
+_TIME_WORDS = by_word({
+    "d": "d day days", "h": "h hr hrs hour hours", "min": "min mins minute minutes", "s": "s sec secs second seconds",
+    "ms": "ms msec msecs millisecond milliseconds", "us": "us usec microsecond microseconds",
+    "yr": "yr yrs year years",
+})  # fmt: skip
 _JULIAN = re.compile(
     rf"(?P<name>{'|'.join(sorted(set(_DAYS) - {'gps', 'unix'}, key=len, reverse=True))})"
     r"(?:[\s_(\[-]+(?P<scale>utc|tdb|tt|tai|tcb)[)\]]?)?"
@@ -405,8 +399,13 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
 
     found = np.full(len(texts), np.nan)
     filled = [k for k, text in enumerate(texts) if not is_missing(text)]
-    divided = [_without_zone(texts[k]) for k in filled]
-    cleaned, hours = [text for text, _ in divided], np.array([late for _, late in divided])
+    cleaned, hours = [], np.zeros(len(filled))
+    for place, text in enumerate(texts[k] for k in filled):
+        match = _ZONE.fullmatch(text)
+        cleaned.append(match[1] if match else text.removesuffix("Z"))
+        if match:
+            # The time zone is ahead of UTC.
+            hours[place] = float(f"{match[2]}1") * (int(match[3]) + int(match[4]) / 60)
 
     def parsed(dates: list[str]) -> Any:
         try:
@@ -422,14 +421,6 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
             raise InputError(fault, key=name)
     found[filled] = days - hours / 24
     return found
-
-
-def _without_zone(text: str) -> tuple[str, float]:
-    """Divide a date into that of its time zone, and the hours by which this is ahead of UTC."""
-    match = _ZONE.fullmatch(text)
-    if match is None:
-        return text.removesuffix("Z"), 0.0
-    return match[1], float(f"{match[2]}1") * (int(match[3]) + int(match[4]) / 60)
 
 
 def seconds_from_first(time: Float, unit: Any) -> tuple[Float, float]:
