@@ -326,10 +326,7 @@ Scale = Callable[[Float], u.Quantity]
 
 
 def _scale(what: str, role: Role, asked: Any, implied: str | None, messages: list[str]) -> tuple[Scale, bool]:
-    """Return the scale of a column, linear, logarithmic or of magnitudes, and whether its unit is assumed.
-
-    The unit is the user's, else the one that the file states, else the one that its format implies.
-    """
+    """Return the scale of a column, and whether its unit is assumed: neither the user's nor stated by the file."""
     unit, said = _stated(what, role, asked)
     messages += said
     is_bare_logarithm = unit is not None and str(unit) in ("dex", "dex(1)")

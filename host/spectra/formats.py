@@ -137,10 +137,8 @@ def _may_name(line: str, cells: Sequence[str]) -> bool:
     kinds = {role_of(cell).kind for cell in cells}
     if len(cells) == 2:
         # A light curve has no wavelengths.
-        is_time = any(
-            cell.lower() == "phase" or time_in_name(f"time {cell}") or "time" in words_of(cell) for cell in cells
-        )
-        return is_marked and (bool(kinds & set(AXES)) or is_time)
+        times = [one.lower() == "phase" or time_in_name(f"time {one}") or "time" in words_of(one) for one in cells]
+        return is_marked and (bool(kinds & set(AXES)) or any(times))
     return is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
 
 
@@ -169,10 +167,7 @@ def _units(lines: NumberLines, names_at: int) -> list[str]:
 
 
 def _of_another_length(lines: NumberLines) -> list[str]:
-    """Return the names of a line with fewer cells than the rows, for the columns from the left.
-
-    Raises InputError if a line that is no comment has another number of names than columns.
-    """
+    """Return the names of a comment with fewer cells than the rows; raise InputError for another number of names."""
     for line, is_comment in reversed(lines.header):
         cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
         cells = cells if len(cells) > 1 else bracketed(line)
@@ -184,9 +179,8 @@ def _of_another_length(lines: NumberLines) -> list[str]:
         is_plain = set(kinds) <= {"wavelength", "flux", "unknown"} and not any(role_of(c).logarithm for c in cells)
         in_order = is_plain and kinds.index("flux") > kinds.index("wavelength")
         if is_comment and len(cells) < lines.n:
-            lines.messages.append(
-                f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
-            )
+            said = f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
+            lines.messages.append(said)
             return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
         if not is_comment or not in_order:
             fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
@@ -292,11 +286,10 @@ class _Reader:
         return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
 
     def _is_survey_image(self, header: Any) -> bool:
-        """Return whether an image holds one spectrum with its errors and masks, as files of LAMOST and SDSS-I/II do.
+        """Return whether an image holds a flux in its first row, and its errors and masks in others.
 
-        https://dr5.lamost.org/v3/doc/data-production-description and
-        https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html: the first row is the flux; the others are its inverse
-        variance or error, wavelengths and masks.
+        LAMOST (https://dr5.lamost.org/v3/doc/data-production-description) and SDSS-I/II
+        (https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html) have such files.
         """
         is_plane = header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= MAX_PLANES
         return self.telescope.startswith(("LAMOST", "SDSS")) and "COEFF0" in header and is_plane
@@ -359,7 +352,7 @@ class _Reader:
         """Return the fluxes of an image, the names of its rows if it has several, and a note.
 
         Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless the user asks for a
-        part. Raises InputError for an image of more dimensions than rows and wavelengths.
+        part.
         """
         header = hdu.header
         shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]

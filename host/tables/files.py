@@ -211,9 +211,8 @@ MOST_PARTS = 512
 def parsing(what: str, remedy: str) -> Iterator[None]:
     """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
 
-    Parsers of TOML, YAML, FITS and tables raise many kinds of exceptions on damaged content: their own, those of Python
-    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims). The message begins with
-    `what`, the name of the content, and ends with the remedy.
+    Parsers raise many kinds of exceptions on damaged content: their own, those of Python (RecursionError,
+    OverflowError) and of NumPy (MemoryError for sizes that a header claims).
     """
     try:
         yield
@@ -283,10 +282,7 @@ def check_keys(text: str, what: str) -> None:
 
 
 def possible(data: Any, what: str, key: str = "", depth: int = 0) -> None:
-    """Raise InputError for values of nested data that are impossible in any study or instrument.
-
-    `key` and `depth` are those of the data in the whole.
-    """
+    """Raise InputError for values that are impossible in any study or instrument; `key` is that of nested data."""
     is_energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
     fault = _fault(data, LARGEST_ERG if is_energy else LARGEST)
     if depth > DEEPEST:
@@ -440,10 +436,7 @@ def check_header(lines: list[str], what: str) -> None:
 
 
 def check_cells(lines: list[str], what: str) -> None:
-    """Raise InputError for cells that extend over lines, and for a line that is long among many.
-
-    All cells of a column have the width of the widest.
-    """
+    """Raise InputError for cells that extend over lines, and for one wide line of many, whose width all would take."""
     limit = "MAUVECL_LARGEST_CONTENT_MIB"
     most = limit_bytes(limit)
     widest = max(map(len, lines), default=0)

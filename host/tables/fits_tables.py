@@ -339,8 +339,9 @@ class FitsTables(TableFile):
         self.hdus = hdus
         self.tables = [k for k, one in enumerate(hdus) if hasattr(one, "columns") and not one.is_image]
         self.images = [k for k, one in enumerate(hdus) if getattr(one, "is_image", False) and one.header.get("NAXIS")]
-        columns = {k: {str(name).lower() for name in hdus[k].columns.names} for k in self.tables}
-        fitting = [k for k in self.tables if all(columns[k] & {name.lower() for name in names} for names in wanted)]
+        titles = {k: [str(name) for name in hdus[k].columns.names] for k in self.tables}
+        lower = {k: {title.lower() for title in held} for k, held in titles.items()}
+        fitting = [k for k in self.tables if all(lower[k] & {name.lower() for name in names} for names in wanted)]
         at = None if hdu is None else self._number(hdu)
         if hdu is not None and at is None:
             held = ", ".join(self._label(k) for k in range(len(hdus)))
@@ -349,23 +350,13 @@ class FitsTables(TableFile):
         header: dict[str, Any] = {}
         for number in (0, at, self.chosen):
             header |= {} if number is None else dict(hdus[number].header)
-        super().__init__(what, header)
-        for k in range(1, 1 + len(self.columns)):
+        columns = [] if self.chosen is None else titles[self.chosen]
+        for k in range(1, 1 + len(columns)):
             if (scale := _time_scale(header, k)) and str(header.get(f"TFORM{k}", "")) == "2D":
-                self.header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
-                                "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of the columns of the chosen table."""
-        return [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the columns of the chosen table, of images, and of the columns of other tables."""
-        others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen
-                  for name in self.hdus[k].columns.names]  # fmt: skip
-        return [*self.columns, *(self._label(k) for k in self.images), *others]
+                header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
+                           "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
+        others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen for name in titles[k]]
+        super().__init__(what, header, [*columns, *map(self._label, self.images), *others], columns=columns)
 
     def named(self, name: str) -> Values | None:
         """Return a column of the chosen table, an image, ``EXTENSION/COLUMN``, or a column of one other table."""

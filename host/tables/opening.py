@@ -37,7 +37,7 @@ class LargeTable(TableFile):
         first = MemoryTable(next(pieces), what)
         # One row has the names and units.
         self.table, self.n_rows, self.file = MemoryTable(first.table[:1], what), 0, file
-        super().__init__(what, first.header, first.remarks)
+        super().__init__(what, first.header, first.names, first.remarks)
         self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
         tables = itertools.chain([first], (MemoryTable(piece, what) for piece in pieces))
         del first
@@ -59,11 +59,6 @@ class LargeTable(TableFile):
             fault = f"{self.what}: {column.name!r} must hold numbers or dates"
             raise InputError(f"{fault}, but a cell has more than {CELL} characters", key=column.name)
         return texts
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the columns."""
-        return self.table.names
 
     def _rows(self, start: int, stop: int) -> Any:
         self.file.seek(start * self.row.itemsize)

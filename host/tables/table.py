@@ -193,11 +193,7 @@ def _plain(text: Any) -> str:
 
 
 def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
-    """Return values in a unit.
-
-    The unit that a mapping gives takes precedence over that of the file; `key` is that of the mapping. Raises
-    InputError if neither states a unit, or for one of another kind.
-    """
+    """Return values in a unit; the one `given` by a mapping under `key` takes precedence over that of the file."""
     import astropy.units as u
 
     stated = given or values.unit or unit_in_name(values.name)
@@ -243,20 +239,20 @@ def is_known(text: str) -> bool:
 class TableFile(ABC):
     """A file with frames: its named values, and the keywords of its header."""
 
-    def __init__(self, what: str, header: dict[str, Any], remarks: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        what: str,
+        header: dict[str, Any],
+        names: list[str],
+        remarks: tuple[str, ...] = (),
+        columns: list[str] | None = None,
+    ) -> None:
         self.what, self.header = what, header
+        #: Names of everything that has values, and of the columns of its table.
+        self.names = names
+        self.columns = names if columns is None else columns
         #: Statements on how the file is read, for answers.
         self.remarks = remarks
-
-    @property
-    @abstractmethod
-    def names(self) -> list[str]:
-        """Names of everything that has values."""
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of the columns of its table."""
-        return self.names
 
     @abstractmethod
     def named(self, name: str) -> Values | None:
@@ -310,17 +306,12 @@ class MemoryTable(TableFile):
 
         meta = table.meta if isinstance(table.meta, dict) else {}
         header = {str(key): value for key, value in meta.items() if key != REMARKS}
-        super().__init__(what, header, meta.get(REMARKS, ()))
+        super().__init__(what, header, list(map(str, table.colnames)), meta.get(REMARKS, ()))
         self.table = table
         for name in table.colnames:
             if isinstance(table[name], Time):
                 # A column of dates with their scale.
                 self.header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": table[name].scale.upper()}
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the columns."""
-        return [str(name) for name in self.table.colnames]
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
@@ -339,10 +330,7 @@ class MemoryTable(TableFile):
 
 
 class Rows:
-    """Cells of a small table by the names of its columns, in any case.
-
-    For messages, `named` is the table, and `key` the key of errors, by default the column.
-    """
+    """Cells of a small table; for messages, `named` is the table and `key` the key of errors, by default the column."""
 
     def __init__(self, table: Table, named: str, key: str | None = None) -> None:
         self.table, self.named, self.key, self.n = _with_coordinates(table), named, key, len(table)

@@ -51,10 +51,7 @@ SAMPLE = 50
 
 
 def read_columns(what: str, kind: str, path: Path, unit: str = "") -> NDArray[np.float64]:
-    """Read times and values from a file, shape (n, 2); see `columns`.
-
-    `what` names the content and `kind` the values in messages.
-    """
+    """Read times and values, of a `kind` for messages, from a file, shape (n, 2); see `columns`."""
     return columns(f"{what} {shortened(path.name)}", read_text(path, what), f"times and {kind}", unit)
 
 
@@ -95,10 +92,7 @@ def _in_unit(values: NDArray[np.float64], header: str, unit: str) -> NDArray[np.
 
 
 class NumberLines:
-    """Header and rows of a text with numbers; the columns of the rows are parsed when they are read.
-
-    `expected` is what a row should have, for messages.
-    """
+    """Header and rows of a text, which should have the `expected` numbers; columns are parsed when they are read."""
 
     def __init__(self, text: str, expected: str) -> None:
         self.expected = expected
@@ -258,7 +252,10 @@ def _divided(
     """Find the names and units of columns, and return them with the rows."""
     if not cells:
         return Layout(mark, False, (), (), False), []
-    at = _first_of_width(cells, mark)
+    # The first line that has a cell for each column; a title has no mark.
+    widths = [len(row) for row in cells]
+    width = Counter(widths).most_common(1)[0][0]
+    at = next((k for k, n in enumerate(widths) if (n > 1 if mark else n == width)), 0)
     head, rows = cells[at], cells[at + 1 :]
     # The last mark ends the lines, unless it is that of an empty column which has a name.
     trailing = bool(mark and rows) and not any(row[-1] for row in rows)
@@ -267,15 +264,13 @@ def _divided(
         cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
     n = len(cells[at])
     is_row = all(map(_is_cell_of_row, cells[at]))
-    names: list[str] = []
-    units: list[str] = []
-    if is_row or any(map(_is_finite, cells[at])) or _are_dashes(cells[at]):
-        names, units = _names_above(n, [*above, *lines[:at]], mark)
-    if is_row and not names and at:
-        fault = f"{what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
-        raise InputError(fault, key="file")
-    if is_row:
-        names = names or [f"col{k + 1}" for k in range(n)]
+    is_headed = not is_row and not any(map(_is_finite, cells[at])) and not _are_dashes(cells[at])
+    names, units = ([], []) if is_headed else _names_above(n, [*above, *lines[:at]], mark)
+    if is_row and not names:
+        if at:
+            fault = f"{what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
+            raise InputError(fault, key="file")
+        names = [f"col{k + 1}" for k in range(n)]
     elif not names:
         names, at = cells[at], at + 1
     first, second = [*cells[at : at + 2], [], []][:2]
@@ -295,15 +290,6 @@ def _divided(
     stated = tuple(unit if is_stated(unit) else "" for unit in plain)
     decimal = _has_decimal_commas(cells[at:], what)
     return Layout(mark, decimal, tuple(_distinct(names)), stated, trailing), cells[at:]
-
-
-def _first_of_width(cells: list[list[str]], mark: str) -> int:
-    """Return the place of the first line that has a cell for each column."""
-    if mark:
-        # A title has no mark.
-        return next((k for k, row in enumerate(cells) if len(row) > 1), 0)
-    widths = [len(row) for row in cells]
-    return widths.index(Counter(widths).most_common(1)[0][0])
 
 
 def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
@@ -374,17 +360,14 @@ def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
     if mark == "|":
         # Marks around a line enclose it; one at its end alone may follow an empty cell.
         lines = [re.sub(r"^\s*\|(.*)\|\s*$", r"\1", line) for line in lines]
-    if any('"' in line for line in lines):
-        with parsing("it", "give text"):
-            quoted = csv.reader((line.strip(" ") for line in lines), delimiter=mark or " ", skipinitialspace=True)
-            return [list(map(unquoted, row)) for row in quoted]
-    if not mark:
-        rows = ((re.sub(r"\s#.*", "", line) if "#" in line else line).split() for line in lines)
+    is_quoted = any('"' in line for line in lines)
+    plain = unquoted if is_quoted or any("'" in line for line in lines) else str.strip
+    if mark or is_quoted:
+        rows = csv.reader((line.strip(" ") for line in lines), delimiter=mark or " ", skipinitialspace=True)
     else:
-        rows = (line.split(mark) for line in lines)
-    if any("'" in line for line in lines):
-        return [list(map(unquoted, row)) for row in rows]
-    return [list(map(str.strip, row)) for row in rows]
+        rows = ((re.sub(r"\s#.*", "", line) if "#" in line else line).split() for line in lines)
+    with parsing("it", "give text"):
+        return [list(map(plain, row)) for row in rows]
 
 
 def _with_dates(cells: list[list[str]]) -> list[list[str]]:

@@ -19,23 +19,18 @@ CASES = dict(cases(CORPUS / "spectrum_files.toml"))
 PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
 
 
-def noisy_text(n: int) -> bytes:
-    """Return a spectrum of n points as text that compresses badly."""
-    flux = np.random.default_rng(7).uniform(1e-13, 2e-13, n)
-    return "\n".join(f"{a:.9g} {b:.9e}" for a, b in zip(np.linspace(180.0, 1100.0, n), flux, strict=True)).encode()
-
-
 @PACKERS
 def test_packed_files_are_whole_or_refused(pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    content, path = noisy_text(4000), tmp_path / "star"
-    digests = set()
+    # Text that compresses badly.
+    flux = np.random.default_rng(7).uniform(1e-13, 2e-13, 4000)
+    rows = zip(np.linspace(180.0, 1100.0, 4000), flux, strict=True)
+    content, path, digests = "\n".join(f"{a:.9g} {b:.9e}" for a, b in rows).encode(), tmp_path / "star", set()
     for whole in (content, pack(content), pack(content[:9000]) + pack(content[9000:])):
         path.write_bytes(whole)
         digests.add(Source.read(path).digest)
     assert len(digests) == 1
-    packed = pack(content)
-    for size in (8, len(packed) // 2, len(packed) - 1):
-        path.write_bytes(packed[:size])
+    for size in (8, len(pack(content)) // 2, len(pack(content)) - 1):
+        path.write_bytes(pack(content)[:size])
         with refused("file"):
             Source.read(path)
 
@@ -93,13 +88,12 @@ def test_damaged_files_raise_or_are_read(name: str, tmp_path: Path) -> None:
     """Change random bytes of whole files with a fixed seed; only InputError may be raised."""
     rng = np.random.default_rng(14)
     path = written(CASES[f"spectrum_files {name}"], tmp_path)
-    content = path.read_bytes()
+    content = np.fromfile(path, np.uint8)
     for _ in range(60):
-        damaged = bytearray(content)
+        damaged = content.copy()
         # Headers stand at the front.
-        for place in rng.integers(0, min(len(damaged), 6000), 6):
-            damaged[place] = rng.integers(32, 127)
-        path.write_bytes(bytes(damaged))
+        damaged[rng.integers(0, min(content.size, 6000), 6)] = rng.integers(32, 127, 6)
+        damaged.tofile(path)
         try:
             Source.read(path)
         except InputError as error:

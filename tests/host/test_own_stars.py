@@ -244,11 +244,6 @@ def test_failed_downloads_raise(
     assert kept(tmp_path) == []
 
 
-def test_download_without_a_network_raises(tmp_path: Path) -> None:
-    reported = not_done(tmp_path, "fetch", "ngsl:HD 37202", "--from", "http://127.0.0.1:9/")
-    assert "mauvecl library add h_stis_ngsl_hd037202_v2.fits" in reported
-
-
 def test_documentation_and_help_list_all_collections(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/my-star.md").read_text(encoding="utf-8")
     named = {*re.findall(r'fetch "(\w+):', page), *re.findall(r"\b(\w+):\.\.\.", page)}

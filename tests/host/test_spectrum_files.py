@@ -10,7 +10,7 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
-from corpus import CORPUS, FLUX, NM, cases, per, value, written
+from corpus import CORPUS, FLUX, NM, cases, value, written
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -48,7 +48,8 @@ def test_units_may_be_those_of_astropy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
 def test_frequencies_of_arrays_may_rise_or_fall(order: slice) -> None:
-    assert is_right(Source.from_arrays((NM * u.nm).to(u.Hz, u.spectral())[order], (per("Jy") * u.Jy)[order]))
+    frequency, flux = (NM * u.nm).to(u.Hz, u.spectral()), value('per("Jy")') * u.Jy
+    assert is_right(Source.from_arrays(frequency[order], flux[order]))
 
 
 RANDOM = tomllib.loads((CORPUS / "spectrum_files.toml").read_text(encoding="utf-8"))["random"]
