@@ -54,8 +54,6 @@ class SpectrumTable:
 Float = NDArray[np.float64]
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 
-#: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
-SEGMENTS = ("segment", "sporder", "order", "stripe")
 #: Names of columns that qualify arrays: their step, their length, and the validity of points.
 STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
 #: Number, from 1, of the first valid point, to which a start refers (IUE's high dispersion, NEWSIPS manual 2.0).
@@ -185,7 +183,8 @@ def _selected_rows(
     identifiers = _identifiers(table, chosen, n)
     identifier = ""
     messages: tuple[str, ...] = ()
-    if n > 1 and not asked and {*held} & {*SEGMENTS}:
+    if n > 1 and not asked and {*held} & {"segment", "sporder", "order", "stripe"}:
+        # The segments of a detector, or echelle orders.
         rows = list(range(n))
         labels = [(identifiers[row] or [str(row + 1)])[0] for row in rows]
         messages = (f"its {n} segments ({listed(labels)}) are joined",)

@@ -196,8 +196,6 @@ _REMARKS = ("COMMENT", "HISTORY", "DESCRIP")
 _NO_FLUX = re.compile(r"err|unc|std|wgt|weight|sig|var|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
 _AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", re.IGNORECASE)
 _FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
-#: Largest number of rows of a single spectrum with its errors and masks, as in SDSS (spSpec) and LAMOST.
-MAX_PLANES = 6
 
 
 class _Reader:
@@ -291,7 +289,7 @@ class _Reader:
         LAMOST (https://dr5.lamost.org/v3/doc/data-production-description) and SDSS-I/II
         (https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html) have such files.
         """
-        is_plane = header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= MAX_PLANES
+        is_plane = header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= 6
         return self.telescope.startswith(("LAMOST", "SDSS")) and "COEFF0" in header and is_plane
 
     def _pairs(self) -> list[SpectrumTable]:

@@ -28,8 +28,6 @@ MAX_CARDS, MAX_EXTENSIONS, MAX_FIELDS = 100_000, 1000, 999
 #: Largest number of bytes after the last extension.
 MAX_AFTER = 2**20
 WHOLE = "give a whole FITS file"
-#: astropy's classes of extensions whose headers it cannot interpret.
-DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
 #: Bytes that are summed at a time.
 PIECE = 2**12 * BLOCK
 
@@ -110,7 +108,9 @@ def check_extensions(hdus: Any) -> None:
     from astropy.io import fits
 
     for number, hdu in enumerate(hdus):
-        if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
+        # astropy's classes of extensions whose headers it cannot interpret.
+        is_damaged = type(hdu).__name__ in ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
+        if is_damaged or (number > 0 and "SIMPLE" in hdu.header):
             raise InputError(f"its extension {number} has a damaged header; {WHOLE}", key="file")
         if not isinstance(hdu, fits.BinTableHDU):
             continue

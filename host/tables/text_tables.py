@@ -37,8 +37,6 @@ _RULE = re.compile(r"[\s,;|]*|\s*(?:={3,}(?:\s+|$))*|\s*(?=[-=:|]*\+)[-=+:|]+\s*
 _DAY, _CLOCK = re.compile(r"\d{4}-\d\d-\d\d"), re.compile(r"\d\d:\d\d(?::\d\d(?:\.\d*)?)?")
 #: Comments on times that are those of the start of frames.
 _AT_START = re.compile(r"\b(?:dates?|times?|H?JD)\b[^.]*\bat (?:the )?start of (?:the )?exposure", re.IGNORECASE)
-#: Types of the columns of an RDB table, below their names.
-_RDB = re.compile(r"\d*[NSM]")
 _QUOTED = re.compile(r'"[^"]*"')
 #: Words that occur in prose but not in names of columns.
 PROSE = re.compile(
@@ -284,7 +282,8 @@ def _divided(
     if not mark and all(name.endswith(",") for name in names[:-1]):
         # Commas divide the names and blanks the rows.
         names = [name.rstrip(",") for name in names]
-    if all(map(_RDB.fullmatch, units)):
+    if all(re.fullmatch(r"\d*[NSM]", unit) for unit in units):
+        # Types of the columns of an RDB table.
         units = []
     plain = [in_brackets(unit.strip("\"'")) for unit in units]
     stated = tuple(unit if is_stated(unit) else "" for unit in plain)

@@ -20,8 +20,6 @@ from mauvecl.schema.physical import DAY_S
 if TYPE_CHECKING:
     import astropy.units as u
 
-#: Longest text that is parsed as a unit.
-MAX_UNIT_LENGTH = 100
 #: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
 FluxKind = Literal["density", "total", "surface brightness", "other"]
 
@@ -107,8 +105,8 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     import astropy.units as u
 
     unknown = InputError.of("unit", text.strip(), f"a known unit: {expected}")
-    # astropy takes a comma for a structure of two units.
-    if not name or len(name) > MAX_UNIT_LENGTH or "," in name:
+    # astropy takes a comma for a structure of two units, and long for a long text.
+    if not name or len(name) > 100 or "," in name:
         raise unknown
     if match := _AMBIGUOUS.search(name):
         power = int(match[2] or match[3])
@@ -190,8 +188,6 @@ EPOCHS_MJD = {"mjd": 0.0, "rjd": -0.5, "jd": -2_400_000.5, "bjd": -2_400_000.5, 
 #: TJD is that of NASA (JD - 2440000.5) or of TESS.
 _DAYS = EPOCHS_MJD | {"hjd": -2_400_000.5, "gjd": -2_400_000.5, "bmjd": 0.0, "mbjd": 0.0, "hmjd": 0.0, "mhjd": 0.0,
                       "tbjd": 56_999.5, "kbjd": 54_832.5, "corot julian day": 51_544.5}  # fmt: skip
-#: Scale and position of the missions' own dates.
-_MISSION_DAYS = ("btjd", "tbjd", "bkjd", "kbjd")
 #: Units of time in words, by the names of astropy.
 _TIME_WORDS = by_word({
     "d": "d day days", "h": "h hr hrs hour hours", "min": "min mins minute minutes", "s": "s sec secs second seconds",
@@ -247,8 +243,8 @@ def time_unit(text: str) -> TimeUnit | None:
         return TimeUnit(_TIME_WORDS[word])
     if match := _JULIAN.fullmatch(word):
         name = match["name"]
-        mission = name in _MISSION_DAYS
-        scale = match["scale"] or match["end"] or ("tdb" if mission else "")
+        is_mission = name in ("btjd", "tbjd", "bkjd", "kbjd")
+        scale = match["scale"] or match["end"] or ("tdb" if is_mission else "")
         place = "BARYCENTER" if "b" in name else "HELIOCENTER" if name.startswith("h") else ""
         return TimeUnit("d", _DAYS[name] + float(match["less"] or match["plus"] or 0.0), scale, place)
     if (match := _SINCE.fullmatch(word)) and match["unit"] in _TIME_WORDS:
