@@ -56,9 +56,11 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
         def wrapper(*arguments: P.args, **named: P.kwargs) -> R:
             hashed = hashlib.sha256()
             for value in (*arguments, *sorted(named.items())):
-                is_array = isinstance(value, np.ndarray)
-                hashed.update((f"{value.dtype.str}{value.shape}" if is_array else repr(value)).encode())
-                hashed.update(np.ascontiguousarray(value).data if is_array else b"")
+                if isinstance(value, np.ndarray):
+                    hashed.update(f"{value.dtype.str}{value.shape}".encode())
+                    hashed.update(np.ascontiguousarray(value).data)
+                else:
+                    hashed.update(repr(value).encode())
             given = _Digest(hashed.digest())
             given.arguments = arguments, named
             return computed(given)

@@ -87,8 +87,8 @@ def _roles_by_number(lines: NumberLines, asked: Sequence[str]) -> list[Role]:
         lines.messages.append(f"the first two of its {n} columns are used, which have no names")
     wave, value = indices if len(indices) == 2 else (0, *(indices or [1]))
     roles = [Role(str(k + 1), "unknown") for k in range(max(n, 2))]
-    for k, kind in ((wave, "wavelength"), (value, "flux")):
-        roles[k] = replace(roles[k], kind=kind, score=1)
+    roles[wave] = replace(roles[wave], kind="wavelength", score=1)
+    roles[value] = replace(roles[value], kind="flux", score=1)
     return roles
 
 

@@ -361,6 +361,7 @@ def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
         lines = [re.sub(r"^\s*\|(.*)\|\s*$", r"\1", line) for line in lines]
     is_quoted = any('"' in line for line in lines)
     plain = unquoted if is_quoted or any("'" in line for line in lines) else str.strip
+    rows: Iterable[list[str]]
     if mark or is_quoted:
         rows = csv.reader((line.strip(" ") for line in lines), delimiter=mark or " ", skipinitialspace=True)
     else:
