@@ -12,9 +12,10 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.tables import table
 from mauvecl.host.tables.files import limit_bytes, reading
 from mauvecl.host.tables.names import matched
-from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values, number_in
+from mauvecl.host.tables.table import TableFile, Values, number_in
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
 
@@ -366,8 +367,8 @@ class FitsTables(TableFile):
         if at in self.images:
             return self.image(at)
         extension, _, column = name.partition("/")
-        if column and (table := self._number(extension)) in self.tables:
-            return self.column(table, column)
+        if column and (number := self._number(extension)) in self.tables:
+            return self.column(number, column)
         others = [found for k in self.tables if (found := self.column(k, name)) is not None]
         if len(others) > 1:
             raise InputError(f"{self.what} has {len(others)} columns called {name!r}; give EXTENSION/COLUMN", key=name)
@@ -441,7 +442,7 @@ class FitsTables(TableFile):
         size = int(hdu.header["NAXIS1"]) * n_rows + heap
         # Tables of text, and columns of variable length, cannot be read in pieces.
         is_whole = heap > 0 or hdu.header.get("XTENSION") == "TABLE"
-        small = size <= PIECE_BYTES or is_whole
+        small = size <= table.PIECE_BYTES or is_whole
         if is_whole and size > limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
             fault = f"{self.what}: the table {self._label(number)} has text or columns of variable length"
             raise InputError(f"{fault} and {size >> 20} MiB; use columns of fixed length", key="hdu")

@@ -109,7 +109,6 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     mapping = frame_files.FrameMapping(time="T", **how)
     whole = read_frames(path, mapping)
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 8 * 50 * 400)
-    monkeypatch.setattr("mauvecl.host.tables.fits_tables.PIECE_BYTES", 0)
     monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "1")
     pieces = read_frames(path, mapping)
     for found, wanted in zip((pieces.flux, pieces.error), whole.white_light, strict=True):
