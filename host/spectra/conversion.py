@@ -304,8 +304,8 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     for values, flux in raw.segments:
         nm, kept = _in_nm(axis(values), np.where(np.isin(flux, marks), np.nan, flux))
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
-        flam = light(kept).to_value(FLAM, u.spectral_density(u.Quantity(nm, u.nm)))
-        segments.append((nm[order], np.asarray(flam[order], np.float64)))
+        flam = np.asarray(light(kept).to_value(FLAM, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
+        segments.append((nm[order], flam[order]))
     nm, flam = _joined(segments, messages)
     if is_assumed_flux:
         _check_assumed_flux(flam, f"{table.remarks}\n{table.origin}")
