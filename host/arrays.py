@@ -36,17 +36,6 @@ class _Digest(bytes):
 
     arguments: Any = None
 
-    @classmethod
-    def of(cls, values: Iterable[Any]) -> _Digest:
-        hashed = hashlib.sha256()
-        for value in values:
-            if isinstance(value, np.ndarray):
-                hashed.update(f"{value.dtype.str}{value.shape}".encode())
-                hashed.update(np.ascontiguousarray(value).data)
-            else:
-                hashed.update(repr(value).encode())
-        return cls(hashed.digest())
-
 
 def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Cache the latest results of a function of arrays and plain values.
@@ -65,7 +54,14 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
         @wraps(function)
         def wrapper(*arguments: P.args, **named: P.kwargs) -> R:
-            given = _Digest.of((*arguments, *sorted(named.items())))
+            hashed = hashlib.sha256()
+            for value in (*arguments, *sorted(named.items())):
+                if isinstance(value, np.ndarray):
+                    hashed.update(f"{value.dtype.str}{value.shape}".encode())
+                    hashed.update(np.ascontiguousarray(value).data)
+                else:
+                    hashed.update(repr(value).encode())
+            given = _Digest(hashed.digest())
             given.arguments = arguments, named
             return computed(given)
 

@@ -27,6 +27,10 @@ CORPUS = Path(__file__).parent / "data" / "corpus"
 #: A spectrum that is not straight, so that a wrong column, unit, order or shift shows at each point.
 NM = np.arange(170.0, 1000.0, 2.0)
 FLUX = 1e-13 * (1.1 + np.sin(NM / 37.0)) * np.exp(-(((NM - 560.0) / 300.0) ** 2))
+DENSITY = FLUX * u.erg / (u.s * u.cm**2 * u.AA)
+#: The wavelengths in air, by Birch & Downs 1994 as in VALD, above 200 nm (Morton 2000, ApJS 130, 403).
+SQUARE = (1000 / NM) ** 2
+INDEX = 1 + 8.34254e-5 + 2.406147e-2 / (130 - SQUARE) + 1.5998e-4 / (38.9 - SQUARE)
 #: A light curve of 60 frames.
 K = np.arange(60)
 #: Wavelengths of SDSS and LAMOST, Angstrom.
@@ -37,12 +41,6 @@ LIGHT = np.round(RNG.normal(1000, 5, K.size), 3)
 SPECTRA = RNG.normal(1000.0, 5.0, (K.size, 5)) * np.linspace(0.5, 1.5, 5)
 
 
-def per(unit: str) -> Any:
-    """Return the flux in another unit."""
-    density = FLUX * u.erg / (u.s * u.cm**2 * u.AA)
-    return density.to_value(u.Unit(unit), u.spectral_density(NM * u.nm))
-
-
 def at(row: int, value: Any, column: Any) -> Any:
     """Return a column with another value in a row."""
     changed = np.array(column, object if isinstance(value, str) else np.result_type(column, type(value)))
@@ -50,21 +48,9 @@ def at(row: int, value: Any, column: Any) -> Any:
     return changed.astype(str) if isinstance(value, str) else changed
 
 
-def in_air(nm: Any) -> Any:
-    """Return wavelengths in air, by Birch & Downs 1994 as in VALD, above 200 nm (Morton 2000, ApJS 130, 403)."""
-    square = (1000 / nm) ** 2
-    index = 1 + 8.34254e-5 + 2.406147e-2 / (130 - square) + 1.5998e-4 / (38.9 - square)
-    return np.where(nm > 205, nm / index, nm)
-
-
 def curve(angstrom: Any) -> Any:
     """Return the light of a curved spectrum, erg s-1 cm-2 A-1."""
     return 1e-13 * (1.5 + np.sin(angstrom / 370.0))
-
-
-def dates(mjd: Any, form: str) -> Any:
-    """Return dates in barycentric dynamical time."""
-    return Time(Time(mjd, format="mjd", scale="tdb"), format=form)
 
 
 def tiles(image: Any, how: str, **header: Any) -> bytes:
@@ -78,9 +64,11 @@ def tiles(image: Any, how: str, **header: Any) -> bytes:
 
 NAMES: dict[str, Any] = {
     "np": np, "nm": NM, "wide": np.arange(170.0, 1100.0), "flux": FLUX, "k": K,
-    "t": 20.0 * K + 100.0, "light": LIGHT, "error": 0 * K + 5.0, "per": per,
+    "t": 20.0 * K + 100.0, "light": LIGHT, "error": 0 * K + 5.0,
+    "per": lambda unit: DENSITY.to_value(u.Unit(unit), u.spectral_density(NM * u.nm)),
     "spectra": SPECTRA, "waves": np.linspace(250.5, 650.5, 5), "mixed": RNG.permutation(SPECTRA.size),
-    "at": at, "air": in_air(NM), "shuffled": RNG.permutation(K.size), "dates": dates, "nan": np.nan,
+    "at": at, "air": np.where(NM > 205, NM / INDEX, NM), "shuffled": RNG.permutation(K.size), "nan": np.nan,
+    "dates": lambda mjd, form: Time(Time(mjd, format="mjd", scale="tdb"), format=form),
     "hidden": lambda values, rows: MaskedColumn(values, mask=np.isin(np.arange(len(values)), rows)),
     "every": slice(None), "good": np.outer([1, 1], np.abs(np.arange(1024) - 506.5) < 487) > 0,
     "curve": curve, "grid": GRID, "tiles": tiles, "fibres": lambda low, high, ids: np.float32(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import ContentEquality, set_read_only
-from mauvecl.host.tables.files import Numbers, read_numbers
+from mauvecl.host.tables.files import Numbers, parse_numbers, text_and_name
 from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -29,7 +29,7 @@ def _opened(path: str | Path, what: str) -> Iterator[tuple[Numbers, str]]:
 
     Errors that are raised in the block begin with the name of the file.
     """
-    table = read_numbers(path, what)
+    table = parse_numbers(*text_and_name(path, what))
     source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
     try:
         yield table, f"{table.meta.get('tag', 'A')}: {source}"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
-from mauvecl.host.tables.names import key_of
+from mauvecl.host.tables.names import by_word, key_of
 from mauvecl.host.tables.units import NO_FLUX, SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
@@ -22,7 +22,7 @@ Kind = Literal[
     "width", "magnitude", "throughput", "luminosity", "unknown",
 ]  # fmt: skip
 
-_MEANINGS = {
+_WORDS = by_word({
     "wave": "wavelength wavelengths wave waves wavel lambda lambdas lam wl wlen wav wvl wln awav λ w",
     "other axis": "frequency freq nu ν energy wavenumber wavenum wn",
     "flux": "flux fluxes flx flam fnu fλ fν sflux irradiance photlam photnu jy",
@@ -51,8 +51,7 @@ _MEANINGS = {
     "air": "air",
     "neutral": "density densities dens spectral total data cal calibrated of the in",
     "label": "obs observed source dered dereddened corr rest norm normalized normalised bolo smooth smoothed raw star",
-}  # fmt: skip
-_WORDS = {word: meaning for meaning, words in _MEANINGS.items() for word in words.split()}
+})  # fmt: skip
 # Words of a name that may be joined: FLUXERR, loglam, wavehi.
 _GLUED = sorted((w for w in _WORDS if len(w) > 2 or w in ("lo", "hi", "wl", "bg", "dq")), key=len, reverse=True)
 _LAMBDA, _NU = "(?:lambda|lam|λ)", "(?:nu|ν)"
@@ -92,6 +91,7 @@ _UCD: dict[str, Kind] = {"em.wl": "wavelength", "em.freq": "wavelength", "em.ene
 class Role:
     """Role of a column as inferred from its name, unit and UCD."""
 
+    name: str
     kind: Kind
     score: int = 0  # score of the name for the kind, comparable among columns of one kind
     logarithm: str = ""  # base of the logarithm, "10" or "e", if the column contains logarithms; otherwise empty
@@ -134,7 +134,7 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     per_frequency = kind in ("flux", "model") and not total and bool(_PER_FREQUENCY & set(words))
     # VOTable says so by the second word of a UCD, as in phot.flux.density;em.freq.
     per_frequency |= kind == "flux" and ucd.lower().startswith("phot.flux.density;em.freq")
-    return Role(kind, score, logarithm, total, per_frequency, stated)
+    return Role(name, kind, score, logarithm, total, per_frequency, stated)
 
 
 def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
@@ -156,30 +156,22 @@ def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
         return "counts", 0
     if "width" in has:
         return "width", 0
+    others = has - {"flux", "total", "wave", "other axis", "vacuum", "air", "neutral"}
     if is_flux or ("weak flux" in has and not is_axis):
         # Limits of a flux are those of its confidence interval.
-        return ("error", 0) if has & {"low", "high"} else ("flux", _flux_score(words, has))
+        if has & {"low", "high"}:
+            return "error", 0
+        score = 3 if is_axis or others - {"weak flux"} else 5 if words in (("flux",), ("fluxes",)) else 4
+        return "flux", score if is_flux else score - 2
     if has & {"low", "high"} and (is_axis or "bin" in has):
         return ("lower edge" if "low" in has else "upper edge"), 1
     if is_axis:
-        return "wavelength", _axis_score(words, has)
+        score = (4 if "wave" in has else 2) - (2 if others else 0) - (1 if "air" in has else 0)
+        # A "w" may be a weight.
+        return "wavelength", 0 if words == ("w",) else score
     if "magnitude" in has and words != ("st",):
         return "magnitude", 0
     return ("model", 1) if "model" in has else ("unknown", 0)
-
-
-def _flux_score(words: Sequence[str], has: set[str]) -> int:
-    others = has - {"flux", "total", "weak flux", "vacuum", "air", "neutral"}
-    score = 3 if others else 5 if words in (("flux",), ("fluxes",)) else 4
-    return score if has & {"flux", "total"} else score - 2
-
-
-def _axis_score(words: Sequence[str], has: set[str]) -> int:
-    # A "w" may be a weight.
-    if words == ("w",):
-        return 0
-    others = has - {"wave", "other axis", "vacuum", "air", "neutral"}
-    return (4 if "wave" in has else 2) - (2 if others else 0) - (1 if "air" in has else 0)
 
 
 @lru_cache(maxsize=1024)
@@ -269,8 +261,8 @@ def _unglued(chunk: str) -> list[str] | None:
     for word in _GLUED:
         if chunk.startswith(word):
             rest = chunk[len(word) :]
-            if rest in _WORDS or (rest and len(rest) > 1 and _unglued(rest)):
-                return [word, *(_unglued(rest) or [])]
+            if (rest in _WORDS or len(rest) > 1) and (words := _unglued(rest)):
+                return [word, *words]
     # wmin, efluxes
     if chunk[:1] == "w" and _WORDS.get(chunk[1:]) in ("low", "high"):
         return ["w", chunk[1:]]
@@ -304,15 +296,16 @@ def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str
     return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
 
 
-def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
+def choose(roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
     """Choose the columns of wavelength, or of both edges of each bin, and of flux, of which the user may name some."""
+    names = [role.name for role in roles]
     wanted = [_named(name, names) for name in asked]
     axes = [i for i in wanted if roles[i].kind in AXES] or (wanted[:1] if len(wanted) == 2 else [])
-    wavelength = (axes[0],) if axes else _wavelength(names, roles)
+    wavelength = (axes[0],) if axes else _wavelength(roles, names)
     rest = [i for i in wanted if i not in wavelength]
     if len(rest) > 1:
         raise InputError.of("columns", asked, "one flux, and one wavelength at most")
-    return wavelength, rest[0] if rest else _flux(names, roles, wavelength)
+    return wavelength, rest[0] if rest else _flux(roles, names, wavelength)
 
 
 def _named(name: str, names: Sequence[str]) -> int:
@@ -326,7 +319,7 @@ def _named(name: str, names: Sequence[str]) -> int:
     return indices[0]
 
 
-def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
+def _wavelength(roles: Sequence[Role], names: Sequence[str]) -> tuple[int, ...]:
     best, low, high = (_best(kind, roles) for kind in AXES)
     if best:
         return (_only("wavelength", names, best),)
@@ -336,10 +329,10 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
     raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
 
 
-def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ...]) -> int:
-    rest = [i for i in range(len(names)) if i not in wavelength]
+def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ...]) -> int:
     if best := _best("flux", roles, wavelength) or _best("model", roles, wavelength):
         return _only("flux", names, best)
+    rest = [i for i in range(len(names)) if i not in wavelength]
     unknown = [i for i in rest if roles[i].kind == "unknown"]
     if len(rest) == len(unknown) == 1:
         return unknown[0]

@@ -54,8 +54,6 @@ class SpectrumTable:
 Float = NDArray[np.float64]
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 
-#: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
-SEGMENTS = ("segment", "sporder", "order", "stripe")
 #: Names of columns that qualify arrays: their step, their length, and the validity of points.
 STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
 #: Number, from 1, of the first valid point, to which a start refers (IUE's high dispersion, NEWSIPS manual 2.0).
@@ -71,10 +69,8 @@ class RawSpectrum:
 
     segments: list[tuple[Float, Float]]  # wavelengths and fluxes of each segment, shape (n,) each
     table: SpectrumTable
-    wavelength_name: str
-    flux_name: str
-    wavelength_role: Role
-    flux_role: Role
+    axis: Role
+    light: Role
     messages: tuple[str, ...] = ()
 
 
@@ -86,11 +82,10 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
     named: list[int] = []
     rest: list[str] = []
     for word in asked:
-        fits = [i for i, label in enumerate(labels) if label == word.lower()]
-        if (place := numbered("table", word)) is not None:
-            if place >= len(tables):
-                raise InputError.of("table", place + 1, f"between 1 and {len(tables)}")
-            fits = [place]
+        place = numbered("table", word)
+        if place is not None and place >= len(tables):
+            raise InputError.of("table", place + 1, f"between 1 and {len(tables)}")
+        fits = [i for i, label in enumerate(labels) if label == word.lower()] if place is None else [place]
         named += fits
         rest += [] if fits else [word]
     found: list[RawSpectrum] = []
@@ -106,31 +101,30 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
     if not found:
         # The message that offers a choice is the most helpful.
         raise next((error for error in errors if "FILE[" in str(error)), errors[0])
-    if len(found) > 1 and not named:
+    if not named:
         # SDSS: the sum of all exposures, next to each of them.
         found = [one for one in found if one.table.label.strip().lower() == "coadd"] or found
         # A legend beside the spectrum has no column of fluxes.
-        found = [one for one in found if one.flux_role.kind == "flux"] or found
-    if len(found) > 1 and found[0].table.group is not None and len({one.table.group for one in found}) == 1:
-        parts = listed([one.table.label for one in found])
+        found = [one for one in found if one.light.kind == "flux"] or found
+    if len(found) == 1:
+        return found[0]
+    held = [one.table.label for one in found]
+    if found[0].table.group is not None and len({one.table.group for one in found}) == 1:
         segments = [segment for one in found for segment in one.segments]
-        return replace(found[0], segments=segments, messages=(*found[0].messages, f"its parts {parts} are joined"))
-    if len(found) > 1:
-        held = [one.table.label for one in found]
-        fault = f"{len(held)} tables hold a spectrum: {listed(held)}"
-        first = as_typed(held[0], "table", labels.index(held[0].strip().lower()), labels)
-        raise InputError(f"{fault}; give one as in {first}", key="table")
-    return found[0]
+        said = f"its parts {listed(held)} are joined"
+        return replace(found[0], segments=segments, messages=(*found[0].messages, said))
+    first = as_typed(held[0], "table", labels.index(held[0].strip().lower()), labels)
+    raise InputError(f"{len(held)} tables hold a spectrum: {listed(held)}; give one as in {first}", key="table")
 
 
 def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
-    names = [column.name for column in table.columns]
     roles = table.roles
+    names = [role.name for role in roles]
     known = {key_of(name) for name in names} | {key_of(f"column {place + 1}") for place in range(len(names))}
     # Words that do not name a column may name a row.
     rest = [word for word in asked if key_of(word) not in known]
     try:
-        axes, light = choose(names, roles, [word for word in asked if key_of(word) in known])
+        axes, light = choose(roles, [word for word in asked if key_of(word) in known])
     except InputError as error:
         raise (_no_such(rest[0], names) if rest else error) from error
     messages = []
@@ -139,8 +133,8 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
         if len({roles[i].unit for i in axes}) > 1:
             raise InputError.of("wavelength_unit", edges, "one unit")
         messages.append(f"its wavelengths are the middles of bins, from {edges}")
-    chosen = [table.columns[i] for i in (*axes, light)]
-    cells = [column.cells for column in chosen]
+    cells = [table.columns[i].cells for i in (*axes, light)]
+    rows = [cells]
     if np.ndim(cells[-1]) > 1 or any(np.ndim(cell) > 0 for cell in cells[-1][:1]):
         rows, identifier, said = _selected_rows(table, {*axes, light}, cells, rest)
         messages += said
@@ -148,23 +142,16 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
             table = replace(table, name=table.row_title.format(identifier[:30]))
     elif rest:
         raise _no_such(rest[0], names)
-    else:
-        rows = [cells]
-    segments = [_segment(row, [column.name.strip() for column in chosen]) for row in rows]
+    segments = []
+    for row in rows:
+        *waves, flux = (_numbers(cell, names[i].strip()) for cell, i in zip(row, (*axes, light), strict=True))
+        if flux.ndim != 1 or waves[0].shape != flux.shape:
+            fault = f"it needs one spectrum with as many wavelengths as fluxes, but has {waves[0].shape} for"
+            raise InputError(f"{fault} {flux.shape}", key="flux")
+        segments.append((sum(waves[1:], waves[0]) / len(waves), flux))
     if sum(flux.size for _, flux in segments) < 2:
         raise InputError("it must have at least two points to be a spectrum", key="flux")
-    return RawSpectrum(
-        segments, table, chosen[0].name, chosen[-1].name, roles[axes[0]], roles[light], (*table.messages, *messages)
-    )
-
-
-def _segment(cells: Sequence[Any], names: Sequence[str]) -> tuple[Float, Float]:
-    """Return the wavelengths, or the middles of bins, and the fluxes of one row or of whole columns."""
-    *axes, flux = (_numbers(cell, name) for cell, name in zip(cells, names, strict=True))
-    if flux.ndim != 1 or axes[0].shape != flux.shape:
-        fault = f"it needs one spectrum with as many wavelengths as fluxes, but has {axes[0].shape} for {flux.shape}"
-        raise InputError(fault, key="flux")
-    return sum(axes[1:], axes[0]) / len(axes), flux
+    return RawSpectrum(segments, table, roles[axes[0]], roles[light], (*table.messages, *messages))
 
 
 def _numbers(cells: Any, name: str) -> Float:
@@ -196,7 +183,8 @@ def _selected_rows(
     identifiers = _identifiers(table, chosen, n)
     identifier = ""
     messages: tuple[str, ...] = ()
-    if n > 1 and not asked and {*held} & {*SEGMENTS}:
+    if n > 1 and not asked and {*held} & {"segment", "sporder", "order", "stripe"}:
+        # The segments of a detector, or echelle orders.
         rows = list(range(n))
         labels = [(identifiers[row] or [str(row + 1)])[0] for row in rows]
         messages = (f"its {n} segments ({listed(labels)}) are joined",)
@@ -298,71 +286,61 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
 
     Given units override those of the file, and a unit of wavelength may end in "air" or "vacuum".
     """
-    messages = list(raw.messages)
+    table, messages = raw.table, list(raw.messages)
     medium: Medium | None = None
     if isinstance(wavelength_unit, str):
         wavelength_unit, medium = unit_and_medium(wavelength_unit)
-    stated, in_unit = unit_and_medium(raw.wavelength_role.unit or "")
-    role = replace(raw.wavelength_role, unit=stated) if in_unit else raw.wavelength_role
-    implied = raw.table.implied_units or (None, None)
-    axis = _scale("wavelength", raw.wavelength_name, role, wavelength_unit, implied[0])
-    flux = _scale("flux", raw.flux_name, raw.flux_role, flux_unit, implied[1])
-    messages += [*axis.messages, *flux.messages]
-    if axis.is_assumed:
-        check_assumed_unit(axis.linear_values(np.concatenate([values for values, _ in raw.segments])), str(axis.unit))
-    marks, said = marks_in(np.concatenate([fluxes for _, fluxes in raw.segments]), "fluxes")
+    stated, in_unit = unit_and_medium(raw.axis.unit or "")
+    implied = table.implied_units or (None, None)
+    axis, is_assumed = _scale("wavelength", replace(raw.axis, unit=stated), wavelength_unit, implied[0], messages)
+    light, is_assumed_flux = _scale("flux", raw.light, flux_unit, implied[1], messages)
+    waves, fluxes = (np.concatenate(parts) for parts in zip(*raw.segments, strict=True))
+    whole = axis(waves)
+    if is_assumed:
+        check_assumed_unit(whole.value, str(whole.unit))
+    marks, said = marks_in(fluxes, "fluxes")
     messages += said
     segments = []
-    for values, fluxes in raw.segments:
-        nm, kept = _in_nm(values, np.where(np.isin(fluxes, marks), np.nan, fluxes), axis)
+    for values, flux in raw.segments:
+        nm, kept = _in_nm(axis(values), np.where(np.isin(flux, marks), np.nan, flux))
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
-        flam = flux.to(FLAM, kept, u.spectral_density(u.Quantity(nm, u.nm)))
+        flam = np.asarray(light(kept).to_value(FLAM, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
         segments.append((nm[order], flam[order]))
     nm, flam = _joined(segments, messages)
-    if flux.is_assumed:
-        _check_assumed_flux(flam, raw)
-    remarks, unscaled, notes = raw.table.remarks, raw.table.unscaled, raw.table.notes
-    nm, added = vacuum_wavelengths(nm, raw.wavelength_name, remarks, medium or in_unit, raw.table.headers)
+    if is_assumed_flux:
+        _check_assumed_flux(flam, f"{table.remarks}\n{table.origin}")
+    nm, added = vacuum_wavelengths(nm, raw.axis.name, table.remarks, medium or in_unit, table.headers)
     messages += added
     nm, flam = _merged(nm, flam, messages)
-    if re.search(r"surface\s+flux", remarks, re.I):
+    unscaled, notes = table.unscaled, table.notes
+    if re.search(r"surface\s+flux", table.remarks, re.I):
         unscaled = unscaled or "its header says that it is the flux at the star's surface"
-    if re.search(r"dereddened", remarks, re.I) and not any("dereddened" in note for note in notes):
+    if re.search(r"dereddened", table.remarks, re.I) and not any("dereddened" in note for note in notes):
         notes += ("dereddened, as its header says: counts need it reddened again",)
-    return ReadSpectrum(nm, flam, raw.table.name, raw.table.origin, notes, tuple(messages), unscaled, str(axis.unit))
+    return ReadSpectrum(nm, flam, table.name, table.origin, notes, tuple(messages), unscaled, str(whole.unit))
 
 
-@dataclass(frozen=True)
-class _Scale:
-    """Scale of a column's numbers: linear, logarithmic or magnitudes."""
-
-    unit: Any
-    is_assumed: bool
-    messages: tuple[str, ...]
-    linear_values: Callable[[Float], Float]
-
-    def to(self, unit: Any, values: Float, equivalencies: Any) -> Float:
-        """Return the column's numbers in a unit."""
-        quantity = u.Quantity(self.linear_values(values), self.unit)
-        return np.asarray(quantity.to_value(unit, equivalencies), np.float64)
+#: Conversion of a column's numbers to quantities on a linear scale.
+Scale = Callable[[Float], u.Quantity]
 
 
-def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) -> _Scale:
-    """Return the scale of a column: as given by the user, stated by the file, or implied by its format."""
-    unit, messages = _stated(what, column, role.unit, asked)
+def _scale(what: str, role: Role, asked: Any, implied: str | None, messages: list[str]) -> tuple[Scale, bool]:
+    """Return the scale of a column, and whether its unit is assumed: neither the user's nor stated by the file."""
+    unit, said = _stated(what, role, asked)
+    messages += said
     is_bare_logarithm = unit is not None and str(unit) in ("dex", "dex(1)")
     is_assumed = unit is None or is_bare_logarithm
     if is_assumed:
         if implied is None:
             usual = "nm" if what == "wavelength" else "erg / (s cm2 Angstrom)"
-            fault = f"column {column} names no unit; use `{what}_unit` to give one such as {usual}"
+            fault = f"column {role.name} names no unit; use `{what}_unit` to give one such as {usual}"
             raise InputError(fault, key=f"{what}_unit")
         # Logarithms of wavelength are of Angstrom everywhere (SDSS, LAMOST, DESI).
         is_logarithm = is_bare_logarithm or role.logarithm
         per_frequency = what == "flux" and role.per_frequency
         unit = unit_of("Angstrom" if what == "wavelength" and is_logarithm else "fnu" if per_frequency else implied)
-        why = f", and {column} is one per frequency" if per_frequency else ""
-        named = divided_unit(column)[1]
+        why = f", and {role.name} is one per frequency" if per_frequency else ""
+        named = divided_unit(role.name)[1]
         why += f" ({named!r} in the name of its column is not one)" if named and not is_bare_logarithm else ""
         messages.append(f"ASSUMED: {what} in {unit}, because its file states no unit{why}; --{what}-unit names another")
     if what == "flux":
@@ -370,29 +348,30 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
     elif not is_spectral(unit):
         raise InputError.of("wavelength_unit", str(unit), "a length or a frequency")
     base = role.logarithm or ("10" if is_bare_logarithm or str(unit).startswith("dex") else "")
-    linear_values: Callable[[Float], Float] = np.asarray
+    to_linear: Callable[[Float], Float] = np.asarray
     if base:
         values, limits = ("wavelengths", LOG_WAVELENGTHS) if what == "wavelength" else ("fluxes", LOG_FLUXES)
-        messages.append(f"its {values} are logarithms ({column}), raised to powers of {'e' if base == 'e' else 'ten'}")
-        linear_values = partial(_power, base=base, limits=limits, column=column)
+        power = "e" if base == "e" else "ten"
+        messages.append(f"its {values} are logarithms ({role.name}), raised to powers of {power}")
+        to_linear = partial(_power, base=base, limits=limits, column=role.name)
     elif unit is not linear(unit):
         messages.append(f"its magnitudes ({unit}) are converted to fluxes")
-        linear_values = unit.to_physical
-    return _Scale(linear(unit), is_assumed, tuple(messages), linear_values)
+        to_linear = unit.to_physical
+    return (lambda numbers: u.Quantity(to_linear(numbers), linear(unit))), is_assumed
 
 
-def _stated(what: str, column: str, stated: str | None, asked: Any) -> tuple[Any, list[str]]:
+def _stated(what: str, role: Role, asked: Any) -> tuple[Any, list[str]]:
     """Return the user's unit, else that of the file, else None; and messages."""
     try:
         if asked is None:
-            return (unit_of(stated) if stated is not None and is_stated(stated) else None), []
+            return (unit_of(role.unit) if role.unit is not None and is_stated(role.unit) else None), []
         unit = unit_of(asked) if isinstance(asked, str) else asked
     except InputError as error:
-        raise error.within(f"{what} ({column})") from error
+        raise error.within(f"{what} ({role.name})") from error
     with contextlib.suppress(InputError):
-        if not is_stated(stated) or unit_of(str(stated)) == unit:
+        if not is_stated(role.unit) or unit_of(str(role.unit)) == unit:
             return unit, []
-    return unit, [f"the unit of its {what} is {unit} as asked, not {stated!s:.40} as its file says"]
+    return unit, [f"the unit of its {what} is {unit} as asked, not {role.unit!s:.40} as its file says"]
 
 
 def _power(values: Float, base: str, limits: tuple[float, float], column: str) -> Float:
@@ -423,9 +402,9 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
     raise InputError(fault, key="flux_unit")
 
 
-def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
+def _in_nm(wavelength: u.Quantity, flux: Float) -> tuple[Float, Float]:
     """Return wavelengths in nm, and the fluxes of points with a wavelength."""
-    nm = scale.to(u.nm, values, u.spectral())
+    nm = np.asarray(wavelength.to_value(u.nm, u.spectral()), np.float64)
     bad = np.flatnonzero(~np.isfinite(nm))
     if bad.size and (bad.size == nm.size or np.isfinite(flux[bad]).any()):
         raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
@@ -450,13 +429,13 @@ def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[F
     return nm, flux
 
 
-def _check_assumed_flux(flux: Float, raw: RawSpectrum) -> None:
-    """Raise InputError if numbers of an assumed unit are more likely magnitudes or a throughput."""
+def _check_assumed_flux(flux: Float, remarks: str) -> None:
+    """Raise InputError if numbers of an assumed unit are more likely magnitudes or, as remarks say, a throughput."""
     finite = flux[np.isfinite(flux)]
     if not finite.size:
         return
     low, high = float(finite.min()), float(finite.max())
-    said = _THROUGHPUT.search(f"{raw.table.remarks}\n{raw.table.origin}".replace("_", " "))
+    said = _THROUGHPUT.search(remarks.replace("_", " "))
     if low >= LIKELY_MAGNITUDES[0] and high <= LIKELY_MAGNITUDES[1]:
         fault = f"fluxes of {low:g} to {high:g} without a unit look like magnitudes, but must be a flux density"
     elif said and low >= 0.0 and 1e-3 <= high <= 1.0:

@@ -7,23 +7,32 @@ prose.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
 from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
 from mauvecl.host.spectra.units import stated_units
-from mauvecl.host.tables import fits_tables, text_tables
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
-from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, FitsTables, open_fits, text_at, unit_at
-from mauvecl.host.tables.opening import Content, open_content, text_in, votables
+from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, text_at, unit_at
+from mauvecl.host.tables.opening import Form, open_content, text_in, votables
 from mauvecl.host.tables.table import MemoryTable, Values, number_in
-from mauvecl.host.tables.text_tables import NumberLines, divided_names, keywords_of, text_table
+from mauvecl.host.tables.text_tables import (
+    PROSE,
+    NumberLines,
+    bracketed,
+    divided_names,
+    is_described,
+    keywords_of,
+    numbered_names,
+    text_table,
+)
 from mauvecl.host.tables.units import is_stated, time_in_name
 from mauvecl.schema.errors import InputError, shortened
 
@@ -45,15 +54,22 @@ def table_of_text(
     searched in the header if requested.
     """
     lines = NumberLines(text, "wavelength and flux")
-    if lines.holds_arrays:
+    if any(cell[:1] in ("(", "[") for cell in lines.cells[0]):
         return _table_of_arrays(MemoryTable(text_table(text, "it", commas=True), "it"), name, origin)
     names, units = _names(lines)
     titles = names or [str(k + 1) for k in range(max(lines.n, 2))]
     columns = [lines.column(k, title, units[k] if units else "") for k, title in enumerate(titles)]
     roles = [role_of(one.name, one.unit) for one in columns] if names else _roles_by_number(lines, asked)
-    if [one.name for one in columns[:2]] == ["wavelength", "flux"] and np.array_equal(columns[0].numbers(), GAIA_NM):
+    if titles[:2] == ["wavelength", "flux"] and np.array_equal(columns[0].numbers(), GAIA_NM):
         roles = [replace(roles[0], unit="nm"), replace(roles[1], unit=GAIA_FLUX), *roles[2:]]
-    roles = _with_units_of(lines.comments, roles, wavelength, flux, is_named=bool(names))
+    # The header may state the units that are not next to the names; an unknown column may be the flux.
+    lights = ("flux", "model") if any(role.kind in ("flux", "model") for role in roles) else ("unknown",)
+    has_axis, has_flux = (any(role.kind in kinds and role.unit for role in roles) for kinds in (AXES, lights))
+    axis_unit, flux_unit = stated_units(
+        lines.comments, wavelength=wavelength and not has_axis, flux=flux and not has_flux, is_named=bool(names)
+    )
+    said = dict.fromkeys(AXES, axis_unit) | dict.fromkeys(lights, flux_unit)
+    roles = [role if role.unit else replace(role, unit=said.get(role.kind)) for role in roles]
     keywords = keywords_of([f"# {line}" for line, _ in lines.header])
     return SpectrumTable(
         columns, name, origin, implied_units=TEXT_UNITS, remarks=lines.comments, messages=tuple(lines.messages),
@@ -70,26 +86,23 @@ def _roles_by_number(lines: NumberLines, asked: Sequence[str]) -> list[Role]:
     if not asked and n > 2:
         lines.messages.append(f"the first two of its {n} columns are used, which have no names")
     wave, value = indices if len(indices) == 2 else (0, *(indices or [1]))
-    roles = {wave: Role("wavelength", 1), value: Role("flux", 1)}
-    return [roles.get(k, Role("unknown")) for k in range(max(n, 2))]
-
-
-def _with_units_of(remarks: str, roles: Sequence[Role], wavelength: bool, flux: bool, is_named: bool) -> list[Role]:
-    """Return roles with units from remarks if the names and headers of columns state none."""
-    # A column with an unknown name may be the flux if none is recognised.
-    fluxes = ("flux", "model") if any(role.kind in ("flux", "model") for role in roles) else ("unknown",)
-    has_axis = any(role.kind in AXES and role.unit for role in roles)
-    has_flux = any(role.kind in fluxes and role.unit for role in roles)
-    axis_unit, flux_unit = stated_units(
-        remarks, wavelength=wavelength and not has_axis, flux=flux and not has_flux, is_named=is_named
-    )
-    units = [axis_unit if role.kind in AXES else flux_unit if role.kind in fluxes else None for role in roles]
-    return [role if role.unit else replace(role, unit=unit) for role, unit in zip(roles, units, strict=True)]
+    roles = [Role(str(k + 1), "unknown") for k in range(max(n, 2))]
+    roles[wave] = replace(roles[wave], kind="wavelength", score=1)
+    roles[value] = replace(roles[value], kind="flux", score=1)
+    return roles
 
 
 def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable:
-    """Return a table whose cells contain arrays, with a spectrum per row, as in Gaia's files."""
-    columns = [_with_arrays(file.find(one)) for one in file.names]
+    """Return a table whose cells contain arrays such as ``(1.0, 2.0)``, with a spectrum per row, as in Gaia's files."""
+    columns = [file.find(one) for one in file.names]
+    for k, column in enumerate(columns):
+        texts = column.cells.tolist()
+        if all(text[:1] in ("(", "[") for text in texts):
+            cells = [re.split(r"\s*,\s*|\s+", text.strip("()[] \t")) for text in texts]
+            rows = [np.array(list(map(number_in, row))) for row in cells]
+            is_image = len({row.size for row in rows}) == 1
+            arrays = np.array(rows) if is_image else np.array([*rows, None], object)[:-1]
+            columns[k] = Values.of(column.name, arrays, column.unit)
     known = {column.name.lower(): column for column in columns}
     if not {"source_id", "flux"} <= {*known} or "wavelength" in known or known["flux"].shape[1:] != GAIA_NM.shape:
         return SpectrumTable(columns, name, origin, implied_units=TEXT_UNITS)
@@ -100,20 +113,10 @@ def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable
     )  # fmt: skip
 
 
-def _with_arrays(column: Values) -> Values:
-    """Return a column of texts such as ``(1.0, 2.0)`` as arrays, and others unchanged."""
-    texts = column.cells.tolist()
-    if not all(text[:1] in ("(", "[") for text in texts):
-        return column
-    rows = [np.array([number_in(one) for one in re.split(r"\s*,\s*|\s+", text.strip("()[] \t"))]) for text in texts]
-    is_image = len({row.size for row in rows}) == 1
-    return Values.of(column.name, np.array(rows) if is_image else np.array([*rows, None], object)[:-1], column.unit)
-
-
 def _names(lines: NumberLines) -> tuple[list[str], list[str]]:
     """Return the names of columns and the units below them; empty if there are none."""
     # Lines such as "column 2: flux"; columns without such a line are named by number.
-    found = text_tables.numbered_names((line for line, _ in lines.header), lines.n)
+    found = numbered_names((line for line, _ in lines.header), lines.n)
     numbered = [found.get(k, str(k + 1)) for k in range(lines.n)]
     if len(found) > 1 and _recognised(numbered):
         return numbered, []
@@ -134,10 +137,8 @@ def _may_name(line: str, cells: Sequence[str]) -> bool:
     kinds = {role_of(cell).kind for cell in cells}
     if len(cells) == 2:
         # A light curve has no wavelengths.
-        is_time = any(
-            cell.lower() == "phase" or time_in_name(f"time {cell}") or "time" in words_of(cell) for cell in cells
-        )
-        return is_marked and (bool(kinds & set(AXES)) or is_time)
+        times = [one.lower() == "phase" or time_in_name(f"time {one}") or "time" in words_of(one) for one in cells]
+        return is_marked and (bool(kinds & set(AXES)) or any(times))
     return is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
 
 
@@ -166,14 +167,11 @@ def _units(lines: NumberLines, names_at: int) -> list[str]:
 
 
 def _of_another_length(lines: NumberLines) -> list[str]:
-    """Return the names of a line with fewer cells than the rows, for the columns from the left.
-
-    Raises InputError if a line that is no comment has another number of names than columns.
-    """
+    """Return the names of a comment with fewer cells than the rows; raise InputError for another number of names."""
     for line, is_comment in reversed(lines.header):
         cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
-        cells = cells if len(cells) > 1 else text_tables.bracketed(line)
-        if not all(cells) or text_tables.PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
+        cells = cells if len(cells) > 1 else bracketed(line)
+        if not all(cells) or PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
             continue
         kinds = [role_of(cell).kind if words_of(divided(cell)[0]) else "unknown" for cell in cells]
         if "flux" not in kinds or not any(kind in AXES for kind in kinds):
@@ -181,9 +179,8 @@ def _of_another_length(lines: NumberLines) -> list[str]:
         is_plain = set(kinds) <= {"wavelength", "flux", "unknown"} and not any(role_of(c).logarithm for c in cells)
         in_order = is_plain and kinds.index("flux") > kinds.index("wavelength")
         if is_comment and len(cells) < lines.n:
-            lines.messages.append(
-                f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
-            )
+            said = f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
+            lines.messages.append(said)
             return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
         if not is_comment or not in_order:
             fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
@@ -195,6 +192,10 @@ def _of_another_length(lines: NumberLines) -> list[str]:
 FITS_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
 #: Keywords whose text may mention air, vacuum, the star's surface or its dust.
 _REMARKS = ("COMMENT", "HISTORY", "DESCRIP")
+#: Names of extensions with images that are not fluxes.
+_NO_FLUX = re.compile(r"err|unc|std|wgt|weight|sig|var|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
+_AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", re.IGNORECASE)
+_FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
 
 
 class _Reader:
@@ -204,21 +205,27 @@ class _Reader:
         self.hdus, self.name, self.origin, self.asked = hdus, name, origin, asked
         self.file = FitsTables(hdus, "it")
         self.primary = hdus[0].header
+        self.telescope = text_at(self.primary, "TELESCOP").upper()
 
     def tables(self) -> list[SpectrumTable]:
         """Return the tables that may have the spectrum; raise InputError if there is none."""
-        pairs = fits_tables.paired_images(self.hdus)
-        if pairs:
-            rows = self._row_names()
-            return [self._of_pair(*pair, rows) for pair in pairs]
-        tables = [self._of_table(number, self.hdus[number]) for number in self.file.tables]
-        if fits_tables.is_survey_image(self.hdus[0], text_at(self.primary, "TELESCOP")):
+        if pairs := self._pairs():
+            return pairs
+        tables = [self._of_table(number) for number in self.file.tables]
+        if self._is_survey_image(self.primary):
             # SDSS keeps lines and redshifts of the spectrum in tables.
-            return [self._of_image(0, self.hdus[0])]
+            return [self._of_image(0)]
+        images: list[SpectrumTable] = []
+        errors: list[InputError] = []
+        for number in filter(self._may_hold_fluxes, range(len(self.hdus))):
+            try:
+                images.append(self._of_image(number))
+            except InputError as error:
+                errors.append(error)
+        if not self.asked:
+            images = [one for one in images if one.label.strip().lower() in ("flux", "sci", "spectrum")] or images
         kinds = [{role.kind for role in table.roles} for table in tables]
-        images, errors = self._images()
-        labels = {image.label.strip().lower() for image in images}
-        named = labels & {word.lower() for word in self.asked}
+        named = {image.label.strip().lower() for image in images} & {word.lower() for word in self.asked}
         if any("flux" in kind and kind & {"wavelength", "lower edge"} for kind in kinds) and not named:
             return tables
         is_bare = not any(kind & {"flux", "model", "magnitude"} for kind in kinds)
@@ -226,116 +233,159 @@ class _Reader:
             raise errors[0]
         if not tables and not images:
             raise InputError("it has no table and no image; give a table with WAVELENGTH and FLUX", key="table")
-        if images and not self.asked and is_bare:
-            # A table of wavelengths, of lines or of a log is no spectrum.
-            return images
-        return [*tables, *images]
+        # A table of wavelengths, of lines or of a log is no spectrum.
+        return images if images and not self.asked and is_bare else [*tables, *images]
 
-    def _label(self, number: int, hdu: Any) -> str:
-        """Return the name by which users select an extension: its number if requested, else its name."""
-        return str(number) if str(number) in self.asked else text_at(hdu.header, "EXTNAME") or str(number)
-
-    def _table(self, header: Any, columns: Sequence[Values], label: str, **more: Any) -> SpectrumTable:
-        is_relative = text_at(self.primary, "TELESCOP").upper().startswith("LAMOST")
-        return SpectrumTable(
-            columns,
-            next((t for key in ("TARGNAME", "TARGETID", "OBJECT") for one in (self.primary, header)
-                  if (t := text_at(one, key)[:80])), self.name),
-            self.origin,
-            label,
-            FITS_UNITS,
-            remarks=self._remarks(header) + more.pop("remarks", ""),
-            headers=(self.primary, header),
-            notes=(*self._notes(header), *more.pop("notes", ())),
-            # LAMOST DR5, "Data production description", section 1: fluxes are calibrated relatively.
-            unscaled="LAMOST calibrates fluxes relative to each other" if is_relative else "",
-            **more,
-        )  # fmt: skip
-
-    def _remarks(self, header: Any) -> str:
-        headers = [self.primary] if self.primary is header else [self.primary, header]
-        texts = [text_at(one, key) for one in headers for key in _REMARKS]
+    def _table(
+        self, number: int, columns: Sequence[Values], label: str = "", remarks: str = "",
+        notes: tuple[str, ...] = (), row_names: Sequence[str] = (), group: str | None = None,
+    ) -> SpectrumTable:  # fmt: skip
+        """Return the table of an extension, which users select by its number if they do so, else by its name."""
+        header, primary = self.hdus[number].header, self.primary
+        headers = [primary] if primary is header else [primary, header]
+        said = [text_at(one, key) for one in headers for key in _REMARKS]
         # Comments beside the names and units of columns and axes, as in "TTYPE1 = 'WAVE' / in air".
         cards = [key for key in header if re.fullmatch(r"T(?:TYPE|UNIT)\d+|C(?:TYPE|UNIT|RVAL)1", key)]
-        texts += [str(header.comments[key]) for key in cards] + [
-            text_at(header, key) for key in header if "TCOMM" in key
-        ]
-        return "\n".join(texts)[:100_000]
-
-    def _notes(self, header: Any) -> tuple[str, ...]:
-        stated = {key: text_at(self.primary, key) or text_at(header, key) for key in ("DATAQUAL", "OFFSETPX")}
-        notes = [f"{key} = {text[:60]}" for key, text in stated.items() if text]
+        said += [str(header.comments[key]) for key in cards]
+        said += [text_at(header, key) for key in header if "TCOMM" in key]
+        stated = {key: text_at(primary, key) or text_at(header, key) for key in ("DATAQUAL", "OFFSETPX")}
+        own = [f"{key} = {text[:60]}" for key, text in stated.items() if text]
         if "lowlib" in self.origin.lower():
-            notes.append("dereddened and at zero velocity: counts need it reddened again")
-        return tuple(notes)
+            own.append("dereddened and at zero velocity: counts need it reddened again")
+        titles = [text_at(one, key)[:80] for key in ("TARGNAME", "TARGETID", "OBJECT") for one in (primary, header)]
+        # LAMOST DR5, "Data production description", section 1: fluxes are calibrated relatively.
+        unscaled = "LAMOST calibrates fluxes relative to each other" if self.telescope.startswith("LAMOST") else ""
+        label = label or (str(number) if str(number) in self.asked else text_at(header, "EXTNAME") or str(number))
+        return SpectrumTable(
+            columns, next(filter(None, titles), self.name), self.origin, label, FITS_UNITS,
+            remarks="\n".join(said)[:100_000] + remarks, headers=(primary, header), notes=(*own, *notes), group=group,
+            unscaled=unscaled, row_names=row_names,
+        )  # fmt: skip
 
-    def _of_table(self, number: int, hdu: Any) -> SpectrumTable:
-        header = hdu.header
+    def _columns(self, number: int) -> list[Values]:
+        found = [self.file.column(number, str(title)) for title in self.hdus[number].columns.names]
+        return [one for one in found if one is not None]
+
+    def _of_table(self, number: int) -> SpectrumTable:
         # The units of the file apply to columns that state none (SDSS).
-        flux, wave = (unit_at(keys, self.primary, header) for keys in (FLUX_UNITS, WAVE_UNITS))
+        flux, wave = (unit_at(keys, self.primary, self.hdus[number].header) for keys in (FLUX_UNITS, WAVE_UNITS))
         whole = dict.fromkeys(("flux", "model"), flux) | dict.fromkeys(AXES, wave)
         columns = []
         for column in self._columns(number):
             role = role_of(column.name)
             own = column.unit or role.unit
             columns.append(column if own else replace(column, unit=whole.get(role.kind, "")))
-        ucds = " ".join(column.ucd for column in columns if column.ucd)
-        return self._table(header, columns, self._label(number, hdu), remarks=f"\n{ucds}")
+        return self._table(number, columns, remarks="\n" + " ".join(one.ucd for one in columns if one.ucd))
 
-    def _columns(self, number: int) -> list[Values]:
-        found = [self.file.column(number, str(title)) for title in self.hdus[number].columns.names]
-        return [one for one in found if one is not None]
+    def _may_hold_fluxes(self, number: int) -> bool:
+        """Return whether an extension is an image that may contain fluxes."""
+        hdu = self.hdus[number]
+        is_filled = getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0)
+        return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
 
-    def _images(self) -> tuple[list[SpectrumTable], list[InputError]]:
-        """Return the images with an axis of wavelengths, and the faults of others."""
-        images, errors = [], []
-        for number, hdu in enumerate(self.hdus):
-            if fits_tables.is_spectrum_image(hdu):
-                try:
-                    images.append(self._of_image(number, hdu))
-                except InputError as error:
-                    errors.append(error)
-        flux = [one for one in images if one.label.strip().lower() in ("flux", "sci", "spectrum")]
-        return (flux if flux and not self.asked else images), errors
+    def _is_survey_image(self, header: Any) -> bool:
+        """Return whether an image holds a flux in its first row, and its errors and masks in others.
 
-    def _axis_beside(self, n: int) -> Values | None:
-        """Return the only column of wavelengths in a table that has one for each of `n` pixels, or None."""
-        held = [one for number in self.file.tables for one in self._columns(number)]
-        axes = [one for one in held if role_of(one.name).kind == "wavelength" and np.prod(one.shape) == n]
-        return Values.of(axes[0].name, axes[0].numbers().ravel(), axes[0].unit) if len(axes) == 1 else None
+        LAMOST (https://dr5.lamost.org/v3/doc/data-production-description) and SDSS-I/II
+        (https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html) have such files.
+        """
+        is_plane = header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= 6
+        return self.telescope.startswith(("LAMOST", "SDSS")) and "COEFF0" in header and is_plane
 
-    def _of_image(self, number: int, hdu: Any) -> SpectrumTable:
+    def _pairs(self) -> list[SpectrumTable]:
+        """Return the tables of images of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE).
+
+        DESI's are B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
+        """
+        images = [k for k, hdu in enumerate(self.hdus) if getattr(hdu, "is_image", False)]
+        named = {text_at(self.hdus[k].header, "EXTNAME").upper(): k for k in images}
+        found: list[SpectrumTable] = []
+        for name, axis in named.items():
+            if (match := _AXIS_NAME.fullmatch(name)) is None:
+                continue
+            arm = match[1] or ""
+            fluxes = [named[one] for kind in _FLUX_NAMES if (one := f"{arm}_{kind}".lstrip("_")) in named]
+            if not arm and not fluxes and name != "LAMBDA":
+                # An image of as many pixels without wavelengths of its own, such as the first of the file.
+                n = self.hdus[axis].header.get("NAXIS1")
+                alike = [k for k, one in enumerate(self.hdus) if one.header.get("NAXIS1") == n]
+                fluxes = [k for k in alike if self._may_hold_fluxes(k) and "CRVAL1" not in self.hdus[k].header]
+            if len(fluxes) == 1:
+                title = text_at(self.hdus[axis].header, "EXTNAME").removeprefix(f"{arm}_")
+                columns = [replace(self.file.image(axis), name=title), replace(self.file.image(fluxes[0]), name="flux")]
+                # The targets of the rows are in a fibre map.
+                rows = self.file.named("FIBERMAP/TARGETID")
+                names = () if rows is None else tuple(map(str, rows.cells.tolist()))
+                group = "arms" if arm else None
+                found.append(self._table(fluxes[0], columns, arm or "flux", row_names=names, group=group))
+        return found
+
+    def _of_image(self, number: int) -> SpectrumTable:
+        hdu = self.hdus[number]
         header = hdu.header
-        if (found := fits_tables.spextool_spectra(header, hdu.data)) is not None:
-            wave, light, orders = found
-            columns = [Values.of("wavelength", wave if len(wave) > 1 else wave[0], text_at(header, "XUNITS")),
-                       Values.of("flux", light if len(light) > 1 else light[0], text_at(header, "YUNITS"))]  # fmt: skip
+        if (orders := _spextool_orders(header, hdu.data)) is not None:
+            cube = np.asarray(hdu.data).reshape(-1, *hdu.data.shape[-2:])
+            cube = cube if len(cube) > 1 else cube[0]
+            columns = [Values.of("wavelength", cube[..., 0, :], text_at(header, "XUNITS")),
+                       Values.of("flux", cube[..., 1, :], text_at(header, "YUNITS"))]  # fmt: skip
             if int(header["NAPS"]) == 1:
                 columns.append(Values.of("order", np.array(orders)))
-            return self._table(header, columns, self._label(number, hdu), row_names=orders)
-        flux, names, note = fits_tables.rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
-        is_bare = not {"CRVAL1", "COEFF0", "PS1_0", "WAT2_001"} & {*header, *self.primary}
-        axis, remarks = self._axis_beside(flux.shape[-1]) if is_bare else None, ""
-        if axis is None:
-            own, notes = self.file.wavelengths(number)
-            axis, note, remarks = replace(own, name="wavelength"), (*notes, *note), f"\n{own.name}"
+            return self._table(number, columns, row_names=orders)
+        flux, names, notes = self._rows(hdu)
         # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
-        flux_unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
-        columns = [axis, Values.of("flux", flux, flux_unit)]
-        return self._table(header, columns, self._label(number, hdu), remarks=remarks, notes=note, row_names=names)
+        unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
+        light = Values.of("flux", flux, unit)
+        if not {"CRVAL1", "COEFF0", "PS1_0", "WAT2_001"} & {*header, *self.primary}:
+            # The wavelengths may be the only column of a table that has one for each pixel.
+            held = [one for table in self.file.tables for one in self._columns(table)]
+            axes = [one for one in held if role_of(one.name).kind == "wavelength"]
+            if len(fit := [one for one in axes if np.prod(one.shape) == flux.shape[-1]]) == 1:
+                axis = Values.of(fit[0].name, fit[0].numbers().ravel(), fit[0].unit)
+                return self._table(number, [axis, light], notes=notes, row_names=names)
+        own, said = self.file.wavelengths(number)
+        columns = [replace(own, name="wavelength"), light]
+        return self._table(number, columns, remarks=f"\n{own.name}", notes=(*said, *notes), row_names=names)
 
-    def _of_pair(self, arm: str, axis: Any, flux: Any, rows: Sequence[str]) -> SpectrumTable:
-        """Return the table of an image of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE)."""
-        name = text_at(axis.header, "EXTNAME").removeprefix(f"{arm}_")
-        columns = [replace(self.file.image(self.hdus.index(hdu)), name=title)
-                   for hdu, title in ((axis, name), (flux, "flux"))]  # fmt: skip
-        group = "arms" if arm else None
-        return self._table(flux.header, columns, arm or "flux", row_names=rows, group=group)
+    def _rows(self, hdu: Any) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
+        """Return the fluxes of an image, the names of its rows if it has several, and a note.
 
-    def _row_names(self) -> tuple[str, ...]:
-        """Return the targets of the rows of images, from a fibre map (DESI data model, coadd: FIBERMAP)."""
-        found = self.file.named("FIBERMAP/TARGETID")
-        return () if found is None else tuple(map(str, found.cells.tolist()))
+        Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless the user asks for a
+        part.
+        """
+        header = hdu.header
+        shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
+        if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
+            fault = f"it holds an image of {' x '.join(map(str, shape))} pixels"
+            raise InputError(f"{fault}; use a spectrum of one dimension, rows of spectra, or a table", key="table")
+        flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
+        if len(flux) == 1:
+            return flux[0], (), ()
+        if self._is_survey_image(header):
+            return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
+        bands = shape[2] if len(shape) > 2 else shape[1]
+        if not self.asked and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
+            return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)
+        return flux, tuple(text_at(header, f"BANDID{k + 1}") for k in range(len(flux))), ()
+
+
+def _spextool_orders(header: Any, data: Any) -> list[str] | None:
+    """Return the names of the orders and apertures of Spextool's images, one for each; None for other images.
+
+    Rows are wavelength, flux, error and, since 2014, flags (Cushing et al. 2004, PASP 116, 362; `mc_mkspexhdr.pro`).
+    """
+    if not {"NAPS", "NORDERS", "XUNITS", "YUNITS"} <= {*header} or np.ndim(data) < 2 or data.shape[-2] not in (3, 4):
+        return None
+    n, n_apertures = math.prod(data.shape[:-2]), int(header["NAPS"])
+    orders = [word.strip() for word in text_at(header, "ORDERS").split(",")]
+    if int(header["NORDERS"]) * n_apertures == n != len(orders) * n_apertures:
+        # Merged orders are one, whatever their list says.
+        orders = [str(k + 1) for k in range(int(header["NORDERS"]))]
+    if len(orders) * n_apertures != n:
+        fault = f"it must have a spectrum for each of {len(orders)} orders and {n_apertures} apertures (NAPS)"
+        raise InputError(f"{fault}, but has {n}", key="NAPS")
+    if n_apertures > 1:
+        orders = [f"{order} aperture {k + 1}" for order in orders for k in range(n_apertures)]
+    return orders
 
 
 #: Largest number and length of messages in the table of a kept star, and length of the remarks on columns.
@@ -365,30 +415,30 @@ def read_spectrum(
         # Overflows become infinities, which the check of points rejects.
         with (
             parsing("it", "give a spectrum"),
-            open_content(place, "it", "spectrum file") as content,
+            open_content(place, "it", "spectrum file") as (form, content),
             np.errstate(all="ignore"),
         ):
             # The name without the extensions of compression and format.
             stem = re.sub(r"\.(gz|bz2|xz)$", "", place.name, flags=re.I).rsplit(".", 1)[0][:80]
-            tables = _tables(content, stem or place.name, f"file {shown}", asked, units, not ignore_checksum)
+            tables = _tables(form, content, stem or place.name, f"file {shown}", asked, units, not ignore_checksum)
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
         raise error.within(shown) from error
 
 
 def _tables(
-    content: Content, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
+    form: Form, file: IO[bytes], name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[SpectrumTable]:
-    if content.form == "FITS":
-        hdus = open_fits(content.file, check=check)
-        with reading("it", fits_tables.WHOLE):
+    if form == "FITS":
+        hdus = open_fits(file, check=check)
+        with reading("it", WHOLE):
             return _Reader(hdus, name, origin, asked).tables()
-    if content.form == "VOTable":
-        tables = enumerate(votables(content.bytes, "it"), 1)
+    if form == "VOTable":
+        tables = enumerate(votables(file.read(), "it"), 1)
         return [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
                 for number, one in tables]  # fmt: skip
-    text = text_in(content, "it")
-    if content.form == "ECSV" or text_tables.is_described(text):
+    text = text_in(form, file.read(), "it")
+    if form == "ECSV" or is_described(text):
         table = MemoryTable(text_table(text, "it", commas=False), "it")
         own = table.header.get("name")
         return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]

@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from mauvecl.host.tables.units import balanced, is_spectral, unit_of
 from mauvecl.schema.errors import InputError
 
-#: Length of the longest header that is searched.
-MAX_HEADER = 20_000
-
 _LENGTH = (
     r"Angstroe?ms?|ANGSTROMS?|angstroe?ms?|Å[Nn]gstr[öo]ms?|Angs?|ang|AA|Å|nm|NM|[Nn]anomet(?:er|re)s?|um|[µμ]m|[Mm]icrons?"
     r"|[Mm]icromet(?:er|re)s?|[GT]?Hz|k?eV|cm\s?\^?\s?[-−⁻][1¹]|1/cm"
@@ -60,15 +57,12 @@ _NO_FLUX = re.compile(
 )
 
 
-def stated_units(
-    header: str, *, wavelength: bool = True, flux: bool = True, is_named: bool = False
-) -> tuple[str | None, str | None]:
+def stated_units(header: str, *, wavelength: bool, flux: bool, is_named: bool) -> tuple[str | None, str | None]:
     """Return the requested units of wavelength and flux that a header states, as text.
 
     Without names of columns (`is_named`), a header that mentions counts or magnitudes implies that there is no flux.
-    Raises InputError if it states several units, an unknown unit, or implies that there is no flux.
     """
-    text = header[:MAX_HEADER]
+    text = header[:20_000]
     found = [_spelt(match[0].strip()) for match in _FLUX.finditer(text)]
     distinct = _distinct(found) if flux else []
     if len(distinct) > 1:
@@ -213,10 +207,7 @@ _VACUUM = re.compile(r"(?:\b|_)vac(?:uum)?(?:\b|_)|\bvacuum", re.IGNORECASE)
 
 
 def medium_of(headers: Sequence[Mapping[str, Any]]) -> Medium | None:
-    """Return the medium of wavelengths that keywords of headers state, or None.
-
-    Raises InputError if keywords contradict each other, or one that states the medium has another value.
-    """
+    """Return the medium of wavelengths that keywords of headers state, which must agree, or None."""
     from mauvecl.host.tables.fits_tables import text_at
 
     found: dict[str, Medium] = {}
@@ -262,8 +253,7 @@ def vacuum_wavelengths(
 ) -> tuple[Float, tuple[str, ...]]:
     """Return vacuum wavelengths, nm, and messages about them.
 
-    The medium is what the user or the unit gives, else what the name of the column says, else what the keywords of
-    headers say, else what the remarks of the file's header say.
+    The medium is the given one, else that in the name of the column, in keywords of headers, or in remarks.
     """
     messages: tuple[str, ...] = ()
     named, said = _words(column), _words(remarks)

@@ -85,10 +85,7 @@ PIECE = 1 << 20
 
 
 def limit_bytes(variable: str) -> int:
-    """Return a limit in bytes, from the environment or `LIMITS`.
-
-    Raises InputError if the environment variable is not an integer number of MiB from 1 to 2**20.
-    """
+    """Return a limit in bytes, from the environment or `LIMITS`."""
     text = os.environ.get(variable, str(LIMITS[variable]))
     if not (text.isascii() and text.isdigit() and len(text) <= 7 and 1 <= int(text) <= 2**20):
         raise InputError.of(variable, text[:40], "a whole number of MiB from 1 to 1048576")
@@ -100,10 +97,7 @@ LONGEST_LINE, MOST_JSON = 2**17, 16 << 20
 
 
 def open_regular(path: Path, what: str) -> io.BufferedReader:
-    """Open a regular file for reading; `what` is its kind, for messages: "spectrum file", "study".
-
-    Raises InputError if the file does not exist, is not a regular file, or cannot be opened.
-    """
+    """Open a regular file for reading; `what` is its kind, for messages: "spectrum file", "study"."""
     shown = shortened(str(path))
     try:
         # Non-blocking, because a pipe without a writer would never open.
@@ -123,10 +117,7 @@ def open_regular(path: Path, what: str) -> io.BufferedReader:
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Read a regular file of limited size, without unpacking it.
-
-    Raises InputError as `open_regular`, or if the file is too large or cannot be read.
-    """
+    """Read a regular file of limited size, without unpacking it."""
     check_size(path, what)
     most = limit_bytes("MAUVECL_LARGEST_FILE_MIB")
     with open_regular(path, what) as file:
@@ -141,10 +132,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def check_size(path: Path, what: str, most: int | None = None) -> int:
-    """Return the size of a regular file in bytes, without reading it.
-
-    Raises InputError if it exceeds `most` bytes, by default MAUVECL_LARGEST_FILE_MIB, or as `open_regular`.
-    """
+    """Return the size of a regular file; raise InputError above `most` bytes (by default MAUVECL_LARGEST_FILE_MIB)."""
     with open_regular(path, what) as file:
         return _limited(os.fstat(file.fileno()).st_size, path, what, most)
 
@@ -160,11 +148,7 @@ def _limited(size: int, path: Path, what: str, most: int | None = None) -> int:
 
 
 def check_folder(path: Path, what: str) -> None:
-    """Check the files of a folder before another library reads them.
-
-    Raises InputError for anything but regular files and folders, a file above MAUVECL_LARGEST_FILE_MIB, or JSON of more
-    than `MOST_JSON` bytes.
-    """
+    """Raise InputError for what another library should not read: devices, large files, JSON above `MOST_JSON`."""
     for folder, _, names in os.walk(path):
         for name in names:
             file = Path(folder) / name
@@ -172,10 +156,7 @@ def check_folder(path: Path, what: str) -> None:
 
 
 def lines_in(file: IO[str], what: str) -> Iterator[str]:
-    """Yield the lines of a text, with their ends.
-
-    Raises InputError for a line of more than `LONGEST_LINE` characters, of which no more is read, or not in UTF-8.
-    """
+    """Yield the lines of a text in UTF-8, with their ends; of a line of more than `LONGEST_LINE` no more is read."""
     try:
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 2), ""), 1):
             if len(line.rstrip("\r\n")) > LONGEST_LINE:
@@ -192,11 +173,7 @@ PACKED: dict[bytes, tuple[str, Callable[[Any], Any]]] = {
 
 
 def unpacked(content: bytes, what: str) -> bytes:
-    """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
-
-    It is unpacked in pieces, to detect decompression bombs early. Raises InputError if it unpacks to more than the
-    limit or is damaged; `what` names it in messages.
-    """
+    """Unpack content of gzip, bzip2 or xz, in pieces to detect decompression bombs; return other content unchanged."""
     form, opened = next((how for mark, how in PACKED.items() if content.startswith(mark)), ("", None))
     if opened is None:
         return content
@@ -234,9 +211,8 @@ MOST_PARTS = 512
 def parsing(what: str, remedy: str) -> Iterator[None]:
     """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
 
-    Parsers of TOML, YAML, FITS and tables raise many kinds of exceptions on damaged content: their own, those of Python
-    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims). The message begins with
-    `what`, the name of the content, and ends with the remedy.
+    Parsers raise many kinds of exceptions on damaged content: their own, those of Python (RecursionError,
+    OverflowError) and of NumPy (MemoryError for sizes that a header claims).
     """
     try:
         yield
@@ -254,10 +230,7 @@ def parsing(what: str, remedy: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reading(what: str, remedy: str) -> Iterator[None]:
-    """Convert any exception of a reader of astropy to InputError, and silence its warnings.
-
-    astropy warns of many headers that it can read.
-    """
+    """Convert any exception of a reader of astropy to InputError, and silence its warnings of what it can read."""
     with parsing(what, remedy), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -269,10 +242,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def as_text(content: bytes, what: str) -> str:
-    """Decode text in UTF-8 or, with a byte-order mark, UTF-16; raise InputError that begins with `what` if it is none.
-
-    Editors on Windows start a file with a byte-order mark.
-    """
+    """Decode text in UTF-8 or UTF-16, with or without the byte-order mark of editors on Windows."""
     try:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError as error:
@@ -311,19 +281,8 @@ def check_keys(text: str, what: str) -> None:
         raise InputError(f"{what} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
 
 
-def json_data(text: str, what: str) -> Any:
-    """Parse JSON; raise InputError if it is invalid or nested too deeply."""
-    with parsing(what, "give JSON"):
-        return json.loads(text)
-
-
 def possible(data: Any, what: str, key: str = "", depth: int = 0) -> None:
-    """Check nested data for values that are impossible in any study or instrument.
-
-    `key` and `depth` are those of the data in the whole. Raises InputError for a number beyond `SMALLEST` to `LARGEST`
-    (energies in erg: `LARGEST_ERG`), an integer beyond 64 bits, text that is too long or contains impossible
-    characters, or nesting that is too deep.
-    """
+    """Raise InputError for values that are impossible in any study or instrument; `key` is that of nested data."""
     is_energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
     fault = _fault(data, LARGEST_ERG if is_energy else LARGEST)
     if depth > DEEPEST:
@@ -362,10 +321,7 @@ def _fault(value: Any, largest: float = LARGEST) -> str | None:
 
 
 def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
-    """Divide ``grid.fits[g45]`` into the file and the words in brackets, which select a part of it.
-
-    If a file of this full name exists, it is returned.
-    """
+    """Divide ``grid.fits[g45]``, unless it is a file, into the file and the words in brackets, which select a part."""
     text = str(path)
     match = re.fullmatch(r"(?s)(.+?)\[([^\[\]]*)\]", text)
     if match is None or os.path.isfile(text):
@@ -382,12 +338,8 @@ _QUOTED, _OPEN = re.compile(r'(?:^|(?<=[,;|\t ]))"(?:[^"]|"")*"(?=[,;|\t ]|$)'),
 
 
 def read_ecsv(path: str | Path, what: str, remedy: str = "give an ECSV table") -> Table:
-    """Read an ECSV file.
-
-    Raises InputError, which ends with the remedy, if the file is missing, is not an ECSV table, or would expand far
-    beyond its size.
-    """
-    return parse_ecsv(*_text_and_name(path, what), remedy)
+    """Read an ECSV file; errors of its form end with the remedy."""
+    return parse_ecsv(*text_and_name(path, what), remedy)
 
 
 def parse_ecsv(text: str, what: str, remedy: str = "give an ECSV table") -> Table:
@@ -418,19 +370,14 @@ class Numbers:
         return self.columns[name]
 
 
-def read_numbers(path: str | Path, what: str) -> Numbers:
-    """Read an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
-    return parse_numbers(*_text_and_name(path, what))
-
-
-def _text_and_name(path: str | Path, what: str) -> tuple[str, str]:
+def text_and_name(path: str | Path, what: str) -> tuple[str, str]:
     """Read the text of a file, and return it with the file's name for messages."""
     named = f"{what} {shortened(str(path))}"
     return as_text(unpacked(read_bytes(Path(path), what), named), named), named
 
 
 def parse_numbers(text: str, what: str) -> Numbers:
-    """Parse a table of numbers from text, as `read_numbers`."""
+    """Parse an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
     import numpy as np
 
     lines = text.splitlines()
@@ -489,16 +436,12 @@ def check_header(lines: list[str], what: str) -> None:
 
 
 def check_cells(lines: list[str], what: str) -> None:
-    """Raise InputError for rows that would need far more memory as a table than as text.
-
-    All cells of a column have the width of the widest, so one long line among many raises InputError, as do cells that
-    extend over several lines.
-    """
-    most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
+    """Raise InputError for cells that extend over lines, and for one wide line of many, whose width all would take."""
+    limit = "MAUVECL_LARGEST_CONTENT_MIB"
+    most = limit_bytes(limit)
     widest = max(map(len, lines), default=0)
     if widest * len(lines) > most:
         fault = f"{what} has a line of {widest} characters among {len(lines)}, which must have at most {most >> 20} MiB"
-        limit = "MAUVECL_LARGEST_CONTENT_MIB"
         raise InputError(f"{fault} together if each were as long; {limit} sets the limit", key=limit)
     if widest > LONGEST_LINE:
         raise InputError(f"{what} has a line of {widest} characters, but may have at most {LONGEST_LINE}", key="file")

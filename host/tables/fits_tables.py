@@ -12,9 +12,10 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.tables import table
 from mauvecl.host.tables.files import limit_bytes, reading
 from mauvecl.host.tables.names import matched
-from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values, number_in
+from mauvecl.host.tables.table import TableFile, Values, number_in
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
 
@@ -28,8 +29,6 @@ MAX_CARDS, MAX_EXTENSIONS, MAX_FIELDS = 100_000, 1000, 999
 #: Largest number of bytes after the last extension.
 MAX_AFTER = 2**20
 WHOLE = "give a whole FITS file"
-#: astropy's classes of extensions whose headers it cannot interpret.
-DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
 #: Bytes that are summed at a time.
 PIECE = 2**12 * BLOCK
 
@@ -110,7 +109,9 @@ def check_extensions(hdus: Any) -> None:
     from astropy.io import fits
 
     for number, hdu in enumerate(hdus):
-        if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
+        # astropy's classes of extensions whose headers it cannot interpret.
+        is_damaged = type(hdu).__name__ in ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
+        if is_damaged or (number > 0 and "SIMPLE" in hdu.header):
             raise InputError(f"its extension {number} has a damaged header; {WHOLE}", key="file")
         if not isinstance(hdu, fits.BinTableHDU):
             continue
@@ -228,96 +229,8 @@ def column_values(data: Any, column: Any) -> Any:
     return np.ma.masked_array(values, same)
 
 
-#: Names of extensions with images that are not fluxes.
-_NO_FLUX = re.compile(r"err|unc|std|wgt|weight|sig|var|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
-_AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", re.IGNORECASE)
-_FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
 #: Names of axes by their type, which say the medium.
 _AXIS_NAMES = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}
-#: Largest number of rows of a single spectrum with its errors and masks, as in SDSS (spSpec) and LAMOST.
-MAX_PLANES = 6
-
-
-def is_spectrum_image(hdu: Any) -> bool:
-    """Return whether an extension is an image that may contain fluxes."""
-    is_filled = getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0)
-    return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
-
-
-def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
-    """Return pairs of images of wavelengths and fluxes, and the common prefix of their names.
-
-    DESI's B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
-    """
-    named = {text_at(hdu.header, "EXTNAME").upper(): hdu for hdu in hdus if getattr(hdu, "is_image", False)}
-    pairs = []
-    for name, hdu in named.items():
-        if (match := _AXIS_NAME.fullmatch(name)) is None:
-            continue
-        arm = match[1] or ""
-        fluxes = [named[one] for kind in _FLUX_NAMES if (one := f"{arm}_{kind}".lstrip("_")) in named]
-        if not arm and not fluxes and name != "LAMBDA":
-            # An image of as many pixels without wavelengths of its own, such as the first of the file.
-            alike = [one for one in hdus if one.header.get("NAXIS1") == hdu.header.get("NAXIS1")]
-            fluxes = [one for one in alike if is_spectrum_image(one) and "CRVAL1" not in one.header]
-        if len(fluxes) == 1:
-            pairs.append((arm, hdu, fluxes[0]))
-    return pairs
-
-
-def spextool_spectra(header: Any, data: Any) -> tuple[Any, Any, list[str]] | None:
-    """Return wavelengths and fluxes of Spextool's images, one row for each order and aperture, and names of these.
-
-    Rows are wavelength, flux, error and, since 2014, flags (Cushing et al. 2004, PASP 116, 362; `mc_mkspexhdr.pro`).
-    Returns None for other images.
-    """
-    if not {"NAPS", "NORDERS", "XUNITS", "YUNITS"} <= {*header} or np.ndim(data) < 2 or data.shape[-2] not in (3, 4):
-        return None
-    cube = np.asarray(data).reshape(-1, *data.shape[-2:])
-    orders = [word.strip() for word in text_at(header, "ORDERS").split(",")]
-    n_orders, n_apertures = int(header["NORDERS"]), int(header["NAPS"])
-    if n_orders * n_apertures == len(cube) and len(orders) != n_orders:
-        # Merged orders are one, whatever their list says.
-        orders = [str(k + 1) for k in range(n_orders)]
-    if len(orders) * n_apertures != len(cube):
-        fault = f"it must have a spectrum for each of {len(orders)} orders and {n_apertures} apertures (NAPS)"
-        raise InputError(f"{fault}, but has {len(cube)}", key="NAPS")
-    if n_apertures > 1:
-        orders = [f"{order} aperture {k + 1}" for order in orders for k in range(n_apertures)]
-    return cube[:, 0], cube[:, 1], orders
-
-
-def is_survey_image(hdu: Any, telescope: str) -> bool:
-    """Return whether an image holds one spectrum with its errors and masks, as files of LAMOST and SDSS-I/II do.
-
-    https://dr5.lamost.org/v3/doc/data-production-description and https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html:
-    the first row is the flux; the others are its inverse variance or error, wavelengths and masks.
-    """
-    header = hdu.header
-    known = re.match(r"LAMOST|SDSS", telescope, re.IGNORECASE) and "COEFF0" in header
-    return bool(known and header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= MAX_PLANES)
-
-
-def rows_of(hdu: Any, telescope: str, asked: bool) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
-    """Return the fluxes of an image, the names of its rows if it has several, and a note.
-
-    Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless the user asks for a part.
-    Raises InputError for an image of more dimensions than rows and wavelengths.
-    """
-    header = hdu.header
-    shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
-    if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
-        fault = f"it holds an image of {' x '.join(map(str, shape))} pixels"
-        raise InputError(f"{fault}; use a spectrum of one dimension, rows of spectra, or a table", key="table")
-    flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
-    if len(flux) == 1:
-        return flux[0], (), ()
-    if is_survey_image(hdu, telescope):
-        return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
-    bands = shape[2] if len(shape) > 2 else shape[1]
-    if not asked and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
-        return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)
-    return flux, tuple(text_at(header, f"BANDID{k + 1}") for k in range(len(flux))), ()
 
 
 def _number_at(headers: Sequence[Any], *keys: str) -> float | None:
@@ -427,8 +340,9 @@ class FitsTables(TableFile):
         self.hdus = hdus
         self.tables = [k for k, one in enumerate(hdus) if hasattr(one, "columns") and not one.is_image]
         self.images = [k for k, one in enumerate(hdus) if getattr(one, "is_image", False) and one.header.get("NAXIS")]
-        columns = {k: {str(name).lower() for name in hdus[k].columns.names} for k in self.tables}
-        fitting = [k for k in self.tables if all(columns[k] & {name.lower() for name in names} for names in wanted)]
+        titles = {k: [str(name) for name in hdus[k].columns.names] for k in self.tables}
+        lower = {k: {title.lower() for title in held} for k, held in titles.items()}
+        fitting = [k for k in self.tables if all(lower[k] & {name.lower() for name in names} for names in wanted)]
         at = None if hdu is None else self._number(hdu)
         if hdu is not None and at is None:
             held = ", ".join(self._label(k) for k in range(len(hdus)))
@@ -437,23 +351,13 @@ class FitsTables(TableFile):
         header: dict[str, Any] = {}
         for number in (0, at, self.chosen):
             header |= {} if number is None else dict(hdus[number].header)
-        super().__init__(what, header)
-        for k in range(1, 1 + len(self.columns)):
+        columns = [] if self.chosen is None else titles[self.chosen]
+        for k in range(1, 1 + len(columns)):
             if (scale := _time_scale(header, k)) and str(header.get(f"TFORM{k}", "")) == "2D":
-                self.header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
-                                "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of the columns of the chosen table."""
-        return [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the columns of the chosen table, of images, and of the columns of other tables."""
-        others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen
-                  for name in self.hdus[k].columns.names]  # fmt: skip
-        return [*self.columns, *(self._label(k) for k in self.images), *others]
+                header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
+                           "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
+        others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen for name in titles[k]]
+        super().__init__(what, header, [*columns, *map(self._label, self.images), *others], columns=columns)
 
     def named(self, name: str) -> Values | None:
         """Return a column of the chosen table, an image, ``EXTENSION/COLUMN``, or a column of one other table."""
@@ -463,8 +367,8 @@ class FitsTables(TableFile):
         if at in self.images:
             return self.image(at)
         extension, _, column = name.partition("/")
-        if column and (table := self._number(extension)) in self.tables:
-            return self.column(table, column)
+        if column and (number := self._number(extension)) in self.tables:
+            return self.column(number, column)
         others = [found for k in self.tables if (found := self.column(k, name)) is not None]
         if len(others) > 1:
             raise InputError(f"{self.what} has {len(others)} columns called {name!r}; give EXTENSION/COLUMN", key=name)
@@ -538,7 +442,7 @@ class FitsTables(TableFile):
         size = int(hdu.header["NAXIS1"]) * n_rows + heap
         # Tables of text, and columns of variable length, cannot be read in pieces.
         is_whole = heap > 0 or hdu.header.get("XTENSION") == "TABLE"
-        small = size <= PIECE_BYTES or is_whole
+        small = size <= table.PIECE_BYTES or is_whole
         if is_whole and size > limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
             fault = f"{self.what}: the table {self._label(number)} has text or columns of variable length"
             raise InputError(f"{fault} and {size >> 20} MiB; use columns of fixed length", key="hdu")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from mauvecl.schema.errors import InputError, shortened
@@ -26,6 +26,11 @@ def is_missing_position(text: str) -> bool:
     """Return whether a text is a pair of missing values, such as "nan nan" or "--, --"."""
     words = re.split(r"\s*[,;]\s*|\s+", text.strip().strip("()[]").strip())
     return len(words) == 2 and all(map(is_missing, words))
+
+
+def by_word(words: Mapping[str, str]) -> dict[str, str]:
+    """Return the meaning of each word, of lists of words by their meaning."""
+    return {word: meaning for meaning, text in words.items() for word in text.split()}
 
 
 #: Names of columns of stars: of the Gaia archive, SIMBAD, astroquery, VizieR, MAST and CDS X-Match, and plain ones.
@@ -97,10 +102,7 @@ def key_of(name: str) -> str:
 
 
 def matched(name: str, names: Iterable[str], what: str = "") -> str | None:
-    """Return the one of some names that is meant, or None.
-
-    Raises InputError if several differ in case only and none is exactly the name.
-    """
+    """Return the one of some names that is meant, or None; raise InputError if several differ from it in case only."""
     held = list(names)
     if name in held:
         return name
@@ -115,10 +117,7 @@ def matched(name: str, names: Iterable[str], what: str = "") -> str | None:
 
 
 def first_of(wanted: Sequence[str], names: Iterable[str], what: str = "") -> str | None:
-    """Return the name that is the first of some wanted ones, in any spelling and with or without a unit in brackets.
-
-    Raises InputError if several fit the same wanted name.
-    """
+    """Return the name that is the first of some wanted ones, in any spelling and with or without a unit in brackets."""
     held = [(name, key_of(name), key_of(divided_unit(name)[0])) for name in names]
     for one in wanted:
         key = key_of(one)
@@ -148,18 +147,14 @@ _TYPESET = str.maketrans("−–—‐‑‒﹣－＋º˚′’ʹ″”ʺ，；�
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
 _LABEL = re.compile(r"\b(?:ra|dec|de|icrs|j2000(?:\.0)?)\b\s*[=:]?", re.IGNORECASE)
 #: Units of angles by the words of tables and users; sexagesimal forms as VizieR names them.
-ANGLES = {
-    word: unit
-    for unit, words in {
-        "deg": "deg degs degree degrees d ° d:m:s dms",
-        "hourangle": "h hr hrs hour hours hourangle h:m:s hms",
-        "rad": "rad rads radian radians",
-        "arcmin": "arcmin arcmins arcminute arcminutes '",
-        "arcsec": 'arcsec arcsecs arcsecond arcseconds as "',
-        "mas": "mas milliarcsec milliarcsecond milliarcseconds",
-    }.items()
-    for word in words.split()
-}
+ANGLES = by_word({
+    "deg": "deg degs degree degrees d ° d:m:s dms",
+    "hourangle": "h hr hrs hour hours hourangle h:m:s hms",
+    "rad": "rad rads radian radians",
+    "arcmin": "arcmin arcmins arcminute arcminutes '",
+    "arcsec": 'arcsec arcsecs arcsecond arcseconds as "',
+    "mas": "mas milliarcsec milliarcsecond milliarcseconds",
+})  # fmt: skip
 EXPECTED_POSITION = "right ascension and declination such as '290.0 -11.2' (degrees) or '19h22m00s -11d12m00s'"
 
 
@@ -184,7 +179,6 @@ def position(text: str) -> tuple[float, float]:
     """Return right ascension and declination in degrees.
 
     Hours need an ``h``, colons, or three numbers for each coordinate; two plain numbers are degrees.
-    Raises InputError for any other text, and for angles out of range.
     """
     plain = " ".join(_LABEL.sub(" ", text.translate(_TYPESET)).strip().strip("()[]").split())
     if plain.count(",") + plain.count(";") == 1:

@@ -8,7 +8,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal
 
@@ -22,7 +22,6 @@ from mauvecl.host.tables.text_tables import Layout, rows_of_text, text_table
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
-    from astropy.io.votable.tree import VOTableFile
     from astropy.table import Table
 
 #: Size of a text from which it is read in pieces, and of a piece, bytes.
@@ -38,7 +37,7 @@ class LargeTable(TableFile):
         first = MemoryTable(next(pieces), what)
         # One row has the names and units.
         self.table, self.n_rows, self.file = MemoryTable(first.table[:1], what), 0, file
-        super().__init__(what, first.header, first.remarks)
+        super().__init__(what, first.header, first.names, first.remarks)
         self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
         tables = itertools.chain([first], (MemoryTable(piece, what) for piece in pieces))
         del first
@@ -60,11 +59,6 @@ class LargeTable(TableFile):
             fault = f"{self.what}: {column.name!r} must hold numbers or dates"
             raise InputError(f"{fault}, but a cell has more than {CELL} characters", key=column.name)
         return texts
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the columns."""
-        return self.table.names
 
     def _rows(self, start: int, stop: int) -> Any:
         self.file.seek(start * self.row.itemsize)
@@ -103,33 +97,32 @@ def _numbers(values: Values) -> bool:
 def _pieces(text: IO[str], what: str, commas: bool) -> Iterator[Any]:
     """Yield tables of consecutive rows, of which the first has the keywords of comments above them."""
     lines = files.lines_in(text, what)
-    line = next(lines, "")
+    # Each piece of ECSV begins with the header and the names.
     head: list[str] = []
-    size = 0
-    if line.startswith("# %ECSV"):
-        while line.startswith("#") or (line and not line.strip()):
-            head.append(line)
-            size += len(line)
+    kept, size = [next(lines, "")], 0
+    if kept[0].startswith("# %ECSV"):
+        head, kept = kept, []
+        while head[-1].startswith("#") or (head[-1] and not head[-1].strip()):
+            size += len(head[-1])
             _check_head(size, what)
-            line = next(lines, "")
+            head.append(next(lines, ""))
+        size = 0
     layout: Layout | None = None
-    first, size, kept = 0, 0, [line]
+    first = 0
     for line in itertools.chain(lines, [""]):
         kept.append(line)
         size += len(line)
         if line and size < PIECE:
             continue
         if head:
-            piece = text_table("".join([*head, *kept]), what, commas)
-            # Its first line has the names.
-            kept, head = [], head if first else [*head, kept[0]]
+            piece = text_table("".join(head + kept), what, commas)
         else:
             piece, found = rows_of_text("".join(kept), what, commas, layout, first)
             if not len(piece) and not first:
                 _check_head(size, what)
                 continue
-            kept, layout = [], found
-        size = 0
+            layout = found
+        kept, size = [], 0
         if len(piece):
             first += len(piece)
             yield piece
@@ -162,28 +155,9 @@ def form_of(start: bytes) -> Form:
     return "ECSV" if re.match(rb"#\s*%ECSV", text) else "text"
 
 
-@dataclass(frozen=True, eq=False)
-class Content:
-    """An open file, unpacked."""
-
-    form: Form
-    file: IO[bytes]
-
-    @property
-    def size(self) -> int:
-        """Size in bytes."""
-        return self.file.seek(0, io.SEEK_END)
-
-    @property
-    def bytes(self) -> bytes:
-        """All of the content."""
-        self.file.seek(0)
-        return self.file.read()
-
-
 @contextmanager
-def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> Iterator[Content]:
-    """Open a file within limits of size, and recognise its form by its first bytes; see `open_table`."""
+def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> Iterator[tuple[Form, IO[bytes]]]:
+    """Open a file within limits of size and unpack it, and recognise its form by its first bytes; see `open_table`."""
     if not large:
         files.check_size(path, kind)
     with files.open_regular(path, kind) as raw:
@@ -191,10 +165,10 @@ def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> It
         raw.seek(0)
         form = form_of(start)
         if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not start.startswith((*files.PACKED,))):
-            yield Content(form, raw)
+            yield form, raw
             return
         content = files.unpacked(files.read_bytes(path, kind), what)
-        yield Content(form_of(content[:4096]), io.BytesIO(content))
+        yield form_of(content[:4096]), io.BytesIO(content)
 
 
 @contextmanager
@@ -215,26 +189,27 @@ def open_table(
     the open file and of `what` make tables of FITS (`of_fits`, by default of the first table) and HDF5 (`of_hdf5`).
     """
     commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
-    with open_content(path, what, kind, large=large) as content:
-        if content.form == "FITS":
-            check &= content.size <= files.limit_bytes("MAUVECL_LARGEST_FILE_MIB")
-            with open_fits(content.file, what, check=check) as hdus:
+    with open_content(path, what, kind, large=large) as (form, content):
+        size = content.seek(0, io.SEEK_END)
+        content.seek(0)
+        if form == "FITS":
+            check &= size <= files.limit_bytes("MAUVECL_LARGEST_FILE_MIB")
+            with open_fits(content, what, check=check) as hdus:
                 with files.reading(what, WHOLE):
                     found = of_fits(hdus, what)
                 yield _filled(found)
-        elif content.form == "HDF5" and of_hdf5 is not None:
-            with of_hdf5(content.file, what) as stored:
+        elif form == "HDF5" and of_hdf5 is not None:
+            with of_hdf5(content, what) as stored:
                 yield stored
-        elif content.form in ("text", "ECSV") and content.size > LARGE:
-            content.file.seek(0)
-            with io.TextIOWrapper(content.file, "utf-8-sig") as text, tempfile.TemporaryFile() as rows:
+        elif form in ("text", "ECSV") and size > LARGE:
+            with io.TextIOWrapper(content, "utf-8-sig") as text, tempfile.TemporaryFile() as rows:
                 yield LargeTable(_pieces(text, what, commas), what, rows)
-        elif content.form == "VOTable":
-            if (first := next(votables(content.bytes, what), None)) is None:
+        elif form == "VOTable":
+            if (first := next(votables(content.read(), what), None)) is None:
                 raise InputError(f"{what} has no table, but needs one", key="file")
             yield _filled(first)
         else:
-            yield _filled(MemoryTable(text_table(text_in(content, what), what, commas), what))
+            yield _filled(MemoryTable(text_table(text_in(form, content.read(), what), what, commas), what))
 
 
 #: Forms of files that are not read, by their first bytes.
@@ -251,28 +226,24 @@ FOREIGN = {
 }  # fmt: skip
 
 
-def text_in(content: Content, what: str) -> str:
-    """Return the text of a file.
-
-    Raises InputError for forms that are not read, such as JSON, or a page that says that a file is missing.
-    """
-    whole = content.bytes
-    tar = "a TAR archive" if whole[257:262] == b"ustar" else ""
-    marks = b"".join(whole[:512].split())
-    if foreign := tar or next((form for mark, form in FOREIGN.items() if marks.startswith(mark)), ""):
+def text_in(form: Form, content: bytes, what: str) -> str:
+    """Return the text of a file; raise InputError for forms that are not read, such as JSON, or a page in its place."""
+    tar = "a TAR archive" if content[257:262] == b"ustar" else ""
+    marks = b"".join(content[:512].split())
+    if foreign := tar or next((kind for mark, kind in FOREIGN.items() if marks.startswith(mark)), ""):
         raise InputError(f"{what} is {foreign}, but {FORMATS}", key="file")
-    if content.form == "XML":
-        start = whole[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
+    if form == "XML":
+        start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
         fault = f"{what} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
         raise InputError(f"{fault}, but {FORMATS}", key="file")
-    text = files.as_text(whole, what)
+    text = files.as_text(content, what)
     if not text.strip():
         raise InputError(f"{what} is empty, but {FORMATS}", key="file")
     return text
 
 
 def votables(content: bytes, what: str) -> Iterator[MemoryTable]:
-    """Yield the tables of a VOTable, whose parameters and systems of times and coordinates are keywords."""
+    """Yield the tables of a VOTable; its parameters and systems (TIMESYS, COOSYS) become keywords as in FITS."""
     from astropy.io import votable
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
@@ -285,7 +256,14 @@ def votables(content: bytes, what: str) -> Iterator[MemoryTable]:
         fault = f"{what} is the answer to a query that failed: {said}"
         raise InputError(f"{fault}; give that of one that succeeds", key="file")
     shared = {str(one.name or one.ID): one.value for resource in file.resources for one in resource.params}
-    shared |= _systems(file)
+    for resource in file.resources:
+        for one in resource.time_systems:
+            # A number of days, or the words JD-origin and MJD-origin.
+            origin = {"JD-origin": 0.0, "MJD-origin": 2_400_000.5}.get(str(one.timeorigin), one.timeorigin)
+            shared |= {} if origin is None else {"JDREF": float(origin)}
+            shared |= {"TIMESYS": str(one.timescale or ""), "TREFPOS": str(one.refposition or "")}
+        for place in resource.coordinate_systems:
+            shared["COOSYS"] = str(place.system or "")
     for table in file.iter_tables():
         with files.parsing(what, "give a whole VOTable"):
             for field in table.fields:
@@ -299,20 +277,6 @@ def votables(content: bytes, what: str) -> Iterator[MemoryTable]:
         yield found
 
 
-def _systems(file: VOTableFile) -> dict[str, Any]:
-    """Return what a VOTable says of its times and coordinates (TIMESYS and COOSYS), as keywords of FITS."""
-    found: dict[str, Any] = {}
-    for resource in file.resources:
-        for one in resource.time_systems:
-            # A number of days, or the words JD-origin and MJD-origin.
-            origin = {"JD-origin": 0.0, "MJD-origin": 2_400_000.5}.get(str(one.timeorigin), one.timeorigin)
-            found |= {} if origin is None else {"JDREF": float(origin)}
-            found |= {"TIMESYS": str(one.timescale or ""), "TREFPOS": str(one.refposition or "")}
-        for place in resource.coordinate_systems:
-            found["COOSYS"] = str(place.system or "")
-    return found
-
-
 def _filled(file: TableFile) -> TableFile:
     """Return a file; raise InputError if it has nothing with rows."""
     if not file.names:
@@ -322,6 +286,13 @@ def _filled(file: TableFile) -> TableFile:
 
 def read_table(path: str | Path, what: str) -> Table:
     """Read a small table into memory; see `open_table`."""
+    from astropy.table import MaskedColumn, Table
+
     path = Path(path)
     with open_table(path, f"{what} {shortened(str(path))}", what) as file:
-        return file.table if isinstance(file, MemoryTable) else file.loaded()
+        if isinstance(file, MemoryTable):
+            return file.table
+        found = [file.find(name) for name in file.columns]
+        # Undefined cells are masked.
+        return Table([MaskedColumn(np.ma.array(one.cells, copy=True), name, unit=one.unit or None)
+                      for name, one in zip(file.columns, found, strict=True)], meta=file.header)  # fmt: skip

@@ -133,7 +133,12 @@ class Values:
         """Return rows as numbers; NaN where they are missing. `expected` says what a cell may be, for messages."""
         values: Any = np.ma.asarray(self.read(start, stop))
         if values.dtype.kind == "O":
-            values = self._stacked(values)
+            # Arrays of variable length.
+            try:
+                values = np.ma.asarray(np.stack([np.asarray(one) for one in values]))
+            except ValueError as error:
+                fault = f"{self.what}: the rows of {self.name!r} must have the same length"
+                raise InputError(fault, key=self.name) from error
         if values.dtype.kind in "US":
             return self._parsed(values, start, expected)
         if values.dtype.kind not in "iufb":
@@ -165,14 +170,6 @@ class Values:
         """Return the values after a function, in a unit."""
         return replace(self, read=lambda start, stop: function(self.rows(start, stop)), unit=unit)
 
-    def _stacked(self, values: Any) -> Any:
-        """Return arrays of variable length as rows, if all have the same length."""
-        try:
-            return np.ma.asarray(np.stack([np.asarray(one) for one in values]))
-        except ValueError as error:
-            fault = f"{self.what}: the rows of {self.name!r} must have the same length"
-            raise InputError(fault, key=self.name) from error
-
     def _parsed(self, values: Any, start: int, expected: str) -> Float:
         """Return texts as numbers; raises InputError that names the first text that is not a number."""
         texts = np.ma.filled(values, "").ravel().tolist()
@@ -196,11 +193,7 @@ def _plain(text: Any) -> str:
 
 
 def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
-    """Return values in a unit.
-
-    The unit that a mapping gives takes precedence over that of the file; `key` is that of the mapping. Raises
-    InputError if neither states a unit, or for one of another kind.
-    """
+    """Return values in a unit; the one `given` by a mapping under `key` takes precedence over that of the file."""
     import astropy.units as u
 
     stated = given or values.unit or unit_in_name(values.name)
@@ -246,29 +239,20 @@ def is_known(text: str) -> bool:
 class TableFile(ABC):
     """A file with frames: its named values, and the keywords of its header."""
 
-    def __init__(self, what: str, header: dict[str, Any], remarks: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        what: str,
+        header: dict[str, Any],
+        names: list[str],
+        remarks: tuple[str, ...] = (),
+        columns: list[str] | None = None,
+    ) -> None:
         self.what, self.header = what, header
+        #: Names of everything that has values, and of the columns of its table.
+        self.names = names
+        self.columns = names if columns is None else columns
         #: Statements on how the file is read, for answers.
         self.remarks = remarks
-
-    @property
-    @abstractmethod
-    def names(self) -> list[str]:
-        """Names of everything that has values."""
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of the columns of its table."""
-        return self.names
-
-    def loaded(self) -> Any:
-        """Return the columns as a table of astropy, masked where they are undefined."""
-        from astropy.table import MaskedColumn, Table
-
-        found = {name: self.find(name) for name in self.columns}
-        columns = [MaskedColumn(np.ma.array(one.cells, copy=True), name, unit=one.unit or None)
-                   for name, one in found.items()]  # fmt: skip
-        return Table(columns, meta=self.header)
 
     @abstractmethod
     def named(self, name: str) -> Values | None:
@@ -322,17 +306,12 @@ class MemoryTable(TableFile):
 
         meta = table.meta if isinstance(table.meta, dict) else {}
         header = {str(key): value for key, value in meta.items() if key != REMARKS}
-        super().__init__(what, header, meta.get(REMARKS, ()))
+        super().__init__(what, header, list(map(str, table.colnames)), meta.get(REMARKS, ()))
         self.table = table
         for name in table.colnames:
             if isinstance(table[name], Time):
                 # A column of dates with their scale.
                 self.header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": table[name].scale.upper()}
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the columns."""
-        return [str(name) for name in self.table.colnames]
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
@@ -351,10 +330,7 @@ class MemoryTable(TableFile):
 
 
 class Rows:
-    """Cells of a small table by the names of its columns, in any case.
-
-    For messages, `named` is the table, and `key` the key of errors, by default the column.
-    """
+    """Cells of a small table; for messages, `named` is the table and `key` the key of errors, by default the column."""
 
     def __init__(self, table: Table, named: str, key: str | None = None) -> None:
         self.table, self.named, self.key, self.n = _with_coordinates(table), named, key, len(table)
@@ -423,26 +399,22 @@ class Rows:
 
     def _unit_of_angles(self, name: str) -> str:
         """Return the unit of a column of angles; raise InputError for another, or for coordinates in FK4."""
-        if old := next(filter(_OLD_SYSTEM.search, self._system(name)), None):
-            raise self.error(f"its coordinates are in {old}; use those in ICRS or FK5 of J2000", name)
-        stated = getattr(self.table[name], "unit", None)
-        # A name may end in a unit, as in ``ra_hours`` and ``dec [rad]``.
-        words = [divided_unit(name)[1], *re.split(r"[\s_.]+", divided_unit(name)[0])[1:][-1:]]
-        named = next((found for word in words if word and (found := angle_unit(word))), "")
-        unit = named if stated is None else angle_unit(str(stated))
-        if unit is None:
-            raise self.error(f"the unit of {name} must be one of angles, not {shortened(str(stated))}", name)
-        return unit
-
-    def _system(self, name: str) -> list[str]:
-        """Return what keywords, columns, comments and a name say of the system of the coordinates."""
-        meta = self.table.meta
+        meta, (base, bracket) = self.table.meta, divided_unit(name)
+        # The system is stated by keywords, columns and comments, or in the name.
         told = [str(value) for key, value in meta.items() if key_of(str(key)) in SYSTEMS]
         told += [text for one in self.names if key_of(one) in SYSTEMS for text in {*self.texts(one)}]
         comments = f"{meta.get('comments', '')} {meta.get('COMMENT', '')}"
         if not re.search(r"J2000|ICRS|FK5", f"{name} {comments}", re.IGNORECASE):
             told += re.findall(r"FK4|B1950", comments, re.IGNORECASE)
-        return [*told, divided_unit(name)[1]]
+        if old := next(filter(_OLD_SYSTEM.search, [*told, bracket]), None):
+            raise self.error(f"its coordinates are in {old}; use those in ICRS or FK5 of J2000", name)
+        if (stated := getattr(self.table[name], "unit", None)) is None:
+            # A name may end in a unit, as in ``ra_hours`` and ``dec [rad]``.
+            words = [bracket, *re.split(r"[\s_.]+", base)[1:][-1:]]
+            return next((found for word in words if word and (found := angle_unit(word))), "")
+        if (unit := angle_unit(str(stated))) is None:
+            raise self.error(f"the unit of {name} must be one of angles, not {shortened(str(stated))}", name)
+        return unit
 
     def unused(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return the remarks on how the table is read, and on columns that are not used."""

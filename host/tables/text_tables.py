@@ -37,8 +37,6 @@ _RULE = re.compile(r"[\s,;|]*|\s*(?:={3,}(?:\s+|$))*|\s*(?=[-=:|]*\+)[-=+:|]+\s*
 _DAY, _CLOCK = re.compile(r"\d{4}-\d\d-\d\d"), re.compile(r"\d\d:\d\d(?::\d\d(?:\.\d*)?)?")
 #: Comments on times that are those of the start of frames.
 _AT_START = re.compile(r"\b(?:dates?|times?|H?JD)\b[^.]*\bat (?:the )?start of (?:the )?exposure", re.IGNORECASE)
-#: Types of the columns of an RDB table, below their names.
-_RDB = re.compile(r"\d*[NSM]")
 _QUOTED = re.compile(r'"[^"]*"')
 #: Words that occur in prose but not in names of columns.
 PROSE = re.compile(
@@ -51,10 +49,7 @@ SAMPLE = 50
 
 
 def read_columns(what: str, kind: str, path: Path, unit: str = "") -> NDArray[np.float64]:
-    """Read times and values from a file, shape (n, 2); see `columns`.
-
-    `what` names the content and `kind` the values in messages.
-    """
+    """Read times and values, of a `kind` for messages, from a file, shape (n, 2); see `columns`."""
     return columns(f"{what} {shortened(path.name)}", read_text(path, what), f"times and {kind}", unit)
 
 
@@ -95,17 +90,15 @@ def _in_unit(values: NDArray[np.float64], header: str, unit: str) -> NDArray[np.
 
 
 class NumberLines:
-    """Header and rows of a text with numbers; the columns of the rows are parsed when they are read.
-
-    `expected` is what a row should have, for messages.
-    """
+    """Header and rows of a text, which should have the `expected` numbers; columns are parsed when they are read."""
 
     def __init__(self, text: str, expected: str) -> None:
         self.expected = expected
         #: Lines above the rows without their marks, and all comments, and whether each is one.
         self.header: list[tuple[str, bool]] = []
-        #: Number and text of the line of each row.
+        #: Number and text of the line of each row, and messages on how these are read.
         self.lines: list[tuple[int, str]] = []
+        self.messages: list[str] = []
         numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if not _RULE.fullmatch(line)]
         comments = {number for number, line in numbered if _COMMENT.match(line) and not _BARRED.match(line)}
         start = _first_row([(number, line) for number, line in numbered if number not in comments])
@@ -118,29 +111,18 @@ class NumberLines:
                 self.lines.append((number, line.split("#", 1)[0].strip()))
         if not self.lines:
             raise InputError(f"it contains no numbers, but needs two columns: {expected}", key="columns")
-        self.cells = self._divided([line for _, line in self.lines])
-        #: Number of columns, and whether their cells contain arrays.
+        self.comments = "\n".join(line for line, _ in self.header)
+        rows = [line for _, line in self.lines]
+        mark = _mark(rows, commas=False)
+        self.cells = _split(rows, mark)
         self.n = len(self.cells[0])
-        self.holds_arrays = any(cell[:1] in ("(", "[") for cell in self.cells[0])
-
-    @property
-    def comments(self) -> str:
-        """Text of the header."""
-        return "\n".join(line for line, _ in self.header)
-
-    def _divided(self, lines: list[str]) -> list[list[str]]:
-        """Return the cells of the rows; raise InputError if commas may be decimal or divide columns."""
-        mark = _mark(lines, commas=False)
-        cells = _split(lines, mark)
-        if decimal := _has_decimal_commas(cells, "it"):
-            cells = _with_points(cells)
-        #: Messages on how the rows are read.
-        self.messages = [DECIMAL_COMMAS] if decimal else []
-        are_whole = all(len(row) > 1 and row[1].isdecimal() and "." not in "".join(row) for row in cells[:SAMPLE])
-        if mark == "," and len(cells) > 1 and are_whole:
-            fault = f"its line {shortened(lines[0], 60)} may hold decimal commas or columns; use decimal points"
+        if _has_decimal_commas(self.cells, "it"):
+            self.cells = _with_points(self.cells)
+            self.messages.append(DECIMAL_COMMAS)
+        are_whole = all(len(row) > 1 and row[1].isdecimal() and "." not in "".join(row) for row in self.cells[:SAMPLE])
+        if mark == "," and len(rows) > 1 and are_whole:
+            fault = f"its line {shortened(rows[0], 60)} may hold decimal commas or columns; use decimal points"
             raise InputError(fault, key="columns")
-        return cells
 
     def column(self, place: int, name: str, unit: str = "") -> Values:
         """Return a column of numbers."""
@@ -268,7 +250,10 @@ def _divided(
     """Find the names and units of columns, and return them with the rows."""
     if not cells:
         return Layout(mark, False, (), (), False), []
-    at = _first_of_width(cells, mark)
+    # The first line that has a cell for each column; a title has no mark.
+    widths = [len(row) for row in cells]
+    width = Counter(widths).most_common(1)[0][0]
+    at = next((k for k, n in enumerate(widths) if (n > 1 if mark else n == width)), 0)
     head, rows = cells[at], cells[at + 1 :]
     # The last mark ends the lines, unless it is that of an empty column which has a name.
     trailing = bool(mark and rows) and not any(row[-1] for row in rows)
@@ -277,15 +262,13 @@ def _divided(
         cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
     n = len(cells[at])
     is_row = all(map(_is_cell_of_row, cells[at]))
-    names: list[str] = []
-    units: list[str] = []
-    if is_row or any(map(_is_finite, cells[at])) or _are_dashes(cells[at]):
-        names, units = _names_above(n, [*above, *lines[:at]], mark)
-    if is_row and not names and at:
-        fault = f"{what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
-        raise InputError(fault, key="file")
-    if is_row:
-        names = names or [f"col{k + 1}" for k in range(n)]
+    is_headed = not is_row and not any(map(_is_finite, cells[at])) and not _are_dashes(cells[at])
+    names, units = ([], []) if is_headed else _names_above(n, [*above, *lines[:at]], mark)
+    if is_row and not names:
+        if at:
+            fault = f"{what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
+            raise InputError(fault, key="file")
+        names = [f"col{k + 1}" for k in range(n)]
     elif not names:
         names, at = cells[at], at + 1
     first, second = [*cells[at : at + 2], [], []][:2]
@@ -299,21 +282,13 @@ def _divided(
     if not mark and all(name.endswith(",") for name in names[:-1]):
         # Commas divide the names and blanks the rows.
         names = [name.rstrip(",") for name in names]
-    if all(map(_RDB.fullmatch, units)):
+    if all(re.fullmatch(r"\d*[NSM]", unit) for unit in units):
+        # Types of the columns of an RDB table.
         units = []
     plain = [in_brackets(unit.strip("\"'")) for unit in units]
     stated = tuple(unit if is_stated(unit) else "" for unit in plain)
     decimal = _has_decimal_commas(cells[at:], what)
     return Layout(mark, decimal, tuple(_distinct(names)), stated, trailing), cells[at:]
-
-
-def _first_of_width(cells: list[list[str]], mark: str) -> int:
-    """Return the place of the first line that has a cell for each column."""
-    if mark:
-        # A title has no mark.
-        return next((k for k, row in enumerate(cells) if len(row) > 1), 0)
-    widths = [len(row) for row in cells]
-    return widths.index(Counter(widths).most_common(1)[0][0])
 
 
 def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
@@ -330,33 +305,28 @@ def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[s
 
 def text_table(text: str, what: str, commas: bool) -> Table:
     """Parse a table from text: ECSV, those of IPAC and CDS, and rows that marks or blanks divide into texts."""
-    if re.match(r"\s*# %ECSV", text):
-        return parse_ecsv(text, what)
-    form = _known_form(text)
-    if form is None:
-        return rows_of_text(text, what, commas)[0]
     from astropy.table import Table
 
-    lines = text.splitlines()
-    check_cells(lines, what)
+    if re.match(r"\s*# %ECSV", text):
+        return parse_ecsv(text, what)
+    lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
+    rows = [line for line in lines if not line.startswith("|")]
+    if is_described(text):
+        form = "ascii.mrt" if re.match(r"\s*Title:", text) else "ascii.cds"
+    elif lines and lines[0][0] == "|" and rows and not any("|" in line for line in rows):
+        # The headings of IPAC's tables have marks, their rows blanks.
+        form = "ascii.ipac"
+    else:
+        return rows_of_text(text, what, commas)[0]
+    check_cells(text.splitlines(), what)
     with reading(what, "give a whole table"):
         # Of an empty line astropy makes a row without values.
-        return Table.read([line for line in lines if line.strip()], format=form)
+        return Table.read([line for line in text.splitlines() if line.strip()], format=form)
 
 
 def is_described(text: str) -> bool:
     """Return whether a text is a machine-readable table of the journals, or of CDS with its description."""
     return re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]) is not None
-
-
-def _known_form(text: str) -> str | None:
-    """Return the name in astropy of a form with units and types of its own, or None."""
-    if is_described(text):
-        return "ascii.mrt" if re.match(r"\s*Title:", text) else "ascii.cds"
-    lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
-    rows = [line for line in lines if not line.startswith("|")]
-    # The headings of IPAC's tables have marks, their rows blanks.
-    return "ascii.ipac" if lines and lines[0][0] == "|" and rows and not any("|" in line for line in rows) else None
 
 
 def _mark(lines: Sequence[str], commas: bool) -> str:
@@ -389,17 +359,15 @@ def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
     if mark == "|":
         # Marks around a line enclose it; one at its end alone may follow an empty cell.
         lines = [re.sub(r"^\s*\|(.*)\|\s*$", r"\1", line) for line in lines]
-    if any('"' in line for line in lines):
-        with parsing("it", "give text"):
-            quoted = csv.reader((line.strip(" ") for line in lines), delimiter=mark or " ", skipinitialspace=True)
-            return [list(map(unquoted, row)) for row in quoted]
-    if not mark:
-        rows = ((re.sub(r"\s#.*", "", line) if "#" in line else line).split() for line in lines)
+    is_quoted = any('"' in line for line in lines)
+    plain = unquoted if is_quoted or any("'" in line for line in lines) else str.strip
+    rows: Iterable[list[str]]
+    if mark or is_quoted:
+        rows = csv.reader((line.strip(" ") for line in lines), delimiter=mark or " ", skipinitialspace=True)
     else:
-        rows = (line.split(mark) for line in lines)
-    if any("'" in line for line in lines):
-        return [list(map(unquoted, row)) for row in rows]
-    return [list(map(str.strip, row)) for row in rows]
+        rows = ((re.sub(r"\s#.*", "", line) if "#" in line else line).split() for line in lines)
+    with parsing("it", "give text"):
+        return [list(map(plain, row)) for row in rows]
 
 
 def _with_dates(cells: list[list[str]]) -> list[list[str]]:

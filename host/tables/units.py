@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.tables.names import MISSING_WORDS, divided_unit, in_brackets, is_missing
+from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
     import astropy.units as u
 
-#: Longest text that is parsed as a unit.
-MAX_UNIT_LENGTH = 100
 #: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
 FluxKind = Literal["density", "total", "surface brightness", "other"]
 
@@ -34,7 +32,7 @@ _DENSITIES = {
     "wm-2um-1": "W / (m2 um)",
 } | {"jansky": "Jy", "janskys": "Jy", "jy": "Jy", "mjy": "mJy", "ujy": "uJy", "njy": "nJy"}
 # Lower-case spellings and astropy's names; astropy parses A as ampere.
-_SPELLINGS = {
+_WORDS = by_word({
     "Angstrom": "a aa ang angs angstrom angstroms angstroem angstroems ångström ångströms å",
     "nm": "nm nanometer nanometers nanometre nanometres",
     "um": "um micron microns micrometer micrometers micrometre micrometres",
@@ -43,8 +41,7 @@ _SPELLINGS = {
     "erg": "erg ergs", "J": "j joule joules", "W": "w watt watts",
     "s": "s sec secs second seconds", "photon": "photon photons ph phot",
     "sr": "sr ster sterad steradian steradians", "arcsec": "arcsec arcsecond arcseconds",
-}  # fmt: skip
-_WORDS = {spelling: name for name, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+})  # fmt: skip
 _TYPOGRAPHY = str.maketrans("µμ−–⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹·⋅×Å", "uu---+0123456789..*Å")
 #: Marks of LaTeX that say nothing of a unit.
 _LATEX = re.compile(r"\$|\\(?:mathrm|rm|text|,|;|:|!|(?=AA))")
@@ -108,8 +105,8 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     import astropy.units as u
 
     unknown = InputError.of("unit", text.strip(), f"a known unit: {expected}")
-    # astropy takes a comma for a structure of two units.
-    if not name or len(name) > MAX_UNIT_LENGTH or "," in name:
+    # astropy takes a comma for a structure of two units, and long for a long text.
+    if not name or len(name) > 100 or "," in name:
         raise unknown
     if match := _AMBIGUOUS.search(name):
         power = int(match[2] or match[3])
@@ -191,19 +188,12 @@ EPOCHS_MJD = {"mjd": 0.0, "rjd": -0.5, "jd": -2_400_000.5, "bjd": -2_400_000.5, 
 #: TJD is that of NASA (JD - 2440000.5) or of TESS.
 _DAYS = EPOCHS_MJD | {"hjd": -2_400_000.5, "gjd": -2_400_000.5, "bmjd": 0.0, "mbjd": 0.0, "hmjd": 0.0, "mhjd": 0.0,
                       "tbjd": 56_999.5, "kbjd": 54_832.5, "corot julian day": 51_544.5}  # fmt: skip
-#: Scale and position of the missions' own dates.
-_MISSION_DAYS = ("btjd", "tbjd", "bkjd", "kbjd")
 #: Units of time in words, by the names of astropy.
-_TIME_WORDS = {
-    word: name
-    for name, words in {
-        "d": "d day days", "h": "h hr hrs hour hours", "min": "min mins minute minutes",
-        "s": "s sec secs second seconds",
-        "ms": "ms msec msecs millisecond milliseconds", "us": "us usec microsecond microseconds",
-        "yr": "yr yrs year years",
-    }.items()
-    for word in words.split()
-}  # fmt: skip
+_TIME_WORDS = by_word({
+    "d": "d day days", "h": "h hr hrs hour hours", "min": "min mins minute minutes", "s": "s sec secs second seconds",
+    "ms": "ms msec msecs millisecond milliseconds", "us": "us usec microsecond microseconds",
+    "yr": "yr yrs year years",
+})  # fmt: skip
 _JULIAN = re.compile(
     rf"(?P<name>{'|'.join(sorted(set(_DAYS) - {'gps', 'unix'}, key=len, reverse=True))})"
     r"(?:[\s_(\[-]+(?P<scale>utc|tdb|tt|tai|tcb)[)\]]?)?"
@@ -253,8 +243,8 @@ def time_unit(text: str) -> TimeUnit | None:
         return TimeUnit(_TIME_WORDS[word])
     if match := _JULIAN.fullmatch(word):
         name = match["name"]
-        mission = name in _MISSION_DAYS
-        scale = match["scale"] or match["end"] or ("tdb" if mission else "")
+        is_mission = name in ("btjd", "tbjd", "bkjd", "kbjd")
+        scale = match["scale"] or match["end"] or ("tdb" if is_mission else "")
         place = "BARYCENTER" if "b" in name else "HELIOCENTER" if name.startswith("h") else ""
         return TimeUnit("d", _DAYS[name] + float(match["less"] or match["plus"] or 0.0), scale, place)
     if (match := _SINCE.fullmatch(word)) and match["unit"] in _TIME_WORDS:
@@ -405,8 +395,13 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
 
     found = np.full(len(texts), np.nan)
     filled = [k for k, text in enumerate(texts) if not is_missing(text)]
-    divided = [_without_zone(texts[k]) for k in filled]
-    cleaned, hours = [text for text, _ in divided], np.array([late for _, late in divided])
+    cleaned, hours = [], np.zeros(len(filled))
+    for place, text in enumerate(texts[k] for k in filled):
+        match = _ZONE.fullmatch(text)
+        cleaned.append(match[1] if match else text.removesuffix("Z"))
+        if match:
+            # The time zone is ahead of UTC.
+            hours[place] = float(f"{match[2]}1") * (int(match[3]) + int(match[4]) / 60)
 
     def parsed(dates: list[str]) -> Any:
         try:
@@ -422,14 +417,6 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
             raise InputError(fault, key=name)
     found[filled] = days - hours / 24
     return found
-
-
-def _without_zone(text: str) -> tuple[str, float]:
-    """Divide a date into that of its time zone, and the hours by which this is ahead of UTC."""
-    match = _ZONE.fullmatch(text)
-    if match is None:
-        return text.removesuffix("Z"), 0.0
-    return match[1], float(f"{match[2]}1") * (int(match[3]) + int(match[4]) / 60)
 
 
 def seconds_from_first(time: Float, unit: Any) -> tuple[Float, float]:

@@ -34,7 +34,7 @@ class FolderFile(TableFile):
     """Spectra in the files of a folder; quantities of frames are keywords of their headers or columns of a table."""
 
     def __init__(self, folder: Path, mapping: FrameMapping, what: str, open_file: Open) -> None:
-        super().__init__(what, {})
+        super().__init__(what, {}, [])
         self.open_file = open_file
         self.table: MemoryTable | None = None
         if mapping.table is not None:
@@ -51,12 +51,8 @@ class FolderFile(TableFile):
             fault = f"{what}: {mapping.files or '*'!r} must name 1 to {MAX_FILES} files, not {len(self.paths)}"
             raise InputError(fault, key="files")
         with open_file(self.paths[0]) as first:
-            self.header, self.names_of_first = first.header, first.names
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the columns of the table, of keywords, and of the columns of the first file."""
-        return [*(self.table.names if self.table else []), *map(str, self.header), *self.names_of_first]
+            self.header = first.header
+            self.names += [*(self.table.names if self.table else []), *map(str, self.header), *first.names]
 
     def named(self, name: str) -> Values | None:
         """Return a column of the table, a keyword of each header, or a column of each file."""
@@ -137,7 +133,7 @@ class StoredFile(TableFile):
         """
         if missing := [key for key in REQUIRED if key not in of]:
             raise InputError(f"{what} lacks {missing[0]} of {path}; give a file of this version of mauvecl", key="file")
-        super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]})
+        super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]}, [])
         self.raw, self.calibration, self.attributes = raw, calibration, of
         self.stacked = int(of["frames"]) if numbers is None else 1
         self.per_row = 1 if numbers is None else numbers.size
@@ -164,11 +160,7 @@ class StoredFile(TableFile):
         if "temperature_c" in of:
             parts.append(Values.of("temperature", np.full(n, float(of["temperature_c"])), "deg_C", what))
         self.parts = {one.name: one for one in parts}
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the quantities."""
-        return list(self.parts)
+        self.names += self.parts
 
     def named(self, name: str) -> Values | None:
         """Return a quantity."""

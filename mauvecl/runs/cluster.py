@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import pickle
@@ -22,7 +23,7 @@ from mauvecl.detection.snr import Arrays
 from mauvecl.device.build import DeviceRecord
 from mauvecl.device.drivers import THREADS, DeviceError
 from mauvecl.host import VERSION
-from mauvecl.host.tables.files import is_file, json_data, read_text
+from mauvecl.host.tables.files import is_file, parsing, read_text
 from mauvecl.runs.checkpoint import Task, code_identity
 from mauvecl.runs.pool import ShardLost, Stopped
 from mauvecl.schema.calls import validated
@@ -280,7 +281,8 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         elif "://" in where and _is_address(where):
             how = {"address": where}
         elif "://" not in where and is_file(Path(where)):
-            scheduler = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
+            with parsing(f"scheduler file {shortened(where)}", "give JSON"):
+                scheduler = json.loads(read_text(Path(where), "scheduler file"))
             address = scheduler.get("address") if isinstance(scheduler, dict) else None
             if not (isinstance(address, str) and _is_address(address)):
                 raise InputError(

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from commands import ended, run
 from refusals import refused
 
@@ -41,14 +42,8 @@ def text_file(path: Path, scale: float = 1.0) -> Path:
 
 
 def archive_file(**header: Any) -> bytes:
-    columns = [
-        fits.Column("WAVELENGTH", "D", unit="Angstrom", array=10 * WAVELENGTH_NM),
-        fits.Column("FLUX", "E", unit="erg/s/cm2/A", array=FLUX),
-    ]
-    primary = fits.PrimaryHDU()
-    primary.header.update(header)
-    out = io.BytesIO()
-    fits.HDUList([primary, fits.BinTableHDU.from_columns(columns)]).writeto(out)
+    out, units = io.BytesIO(), ["Angstrom", "erg / (s cm2 Angstrom)"]
+    Table({"WAVELENGTH": 10 * WAVELENGTH_NM, "FLUX": FLUX}, units=units, meta=header).write(out, format="fits")
     return out.getvalue()
 
 
@@ -77,10 +72,7 @@ def test_kept_star_is_part_of_the_library(tmp_path: Path, own_folder: Path) -> N
     files = [text_file(tmp_path / name) for name in ("mine.txt", "two.txt")]
     assert "Kept mine: --star mine" in library(tmp_path, "add", *files)
     assert {path.parent for path in own_folder.rglob("*.ecsv")} == {own_folder}
-    star, direct = Source.from_library("MINE"), Source.read(files[0])
-    np.testing.assert_array_equal(star.wavelength_nm, direct.wavelength_nm)
-    np.testing.assert_array_equal(star.flux_flam, direct.flux_flam)
-    assert star.digest == direct.digest
+    assert Source.from_library("MINE").digest == Source.read(files[0]).digest
     assert kept(tmp_path) == ["mine", "two"]
     assert "Your own" in library(tmp_path)
     assert answered("mine", magnitude=7.0).name == "mine"
@@ -130,7 +122,7 @@ def test_changed_file_raises(tmp_path: Path, own_folder: Path) -> None:
 
 
 class Archive(http.server.BaseHTTPRequestHandler):
-    """Serves `files`; addresses in `broken` break off, hang or fail."""
+    """Serves `files`; addresses with "cut", "hang", "endless", "slow" and "busy" break off, hang or fail."""
 
     files: ClassVar[dict[str, bytes]] = {}
     over: ClassVar[threading.Event]
@@ -140,23 +132,19 @@ class Archive(http.server.BaseHTTPRequestHandler):
         path = self.path.lstrip("/")
         if "hang" in path:
             self.over.wait(3)
-        if "endless" in path or "slow" in path:
-            self.send_response(200)
-            self.end_headers()
-            with contextlib.suppress(OSError):
-                while not self.over.wait(0.02 if "slow" in path else 0.0):
-                    self.wfile.write(bytes(1 << 6 if "slow" in path else 1 << 16))
-            self.close_connection = True
-            return
-        if path not in self.files:
+        is_slow = "slow" in path
+        if "endless" not in path and not is_slow and path not in self.files:
             self.send_error(503 if "busy" in path else 404)
             return
-        content = self.files[path]
         self.send_response(200)
-        self.send_header("Content-Length", str(len(content) * (2 if "cut" in path else 1)))
+        self.close_connection = path not in self.files or "cut" in path
+        if path in self.files:
+            self.send_header("Content-Length", str(len(self.files[path]) * (2 if "cut" in path else 1)))
         self.end_headers()
-        self.wfile.write(content)
-        self.close_connection = "cut" in path
+        self.wfile.write(self.files.get(path, b""))
+        with contextlib.suppress(OSError):
+            while path not in self.files and not self.over.wait(0.02 * is_slow):
+                self.wfile.write(bytes(1 << (6 if is_slow else 16)))
 
     def log_message(self, *_: Any) -> None:
         pass
@@ -182,12 +170,11 @@ def archive() -> Iterator[str]:
         f"lowlib/{lowlib.format('hd146233')}": archive_file(),
     }
     Archive.over = threading.Event()
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Archive)
-    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    Archive.over.set()
-    server.shutdown()
-    server.server_close()
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Archive) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        Archive.over.set()
+        server.shutdown()
 
 
 def fetch(folder: Path, name: str, base: str = "", *more: str) -> str:
@@ -196,14 +183,11 @@ def fetch(folder: Path, name: str, base: str = "", *more: str) -> str:
 
 def test_calspec_star_is_its_newest_file(archive: str, tmp_path: Path) -> None:
     fetch(tmp_path, "calspec:18 Sco", f"{archive}/calspec/")
-    star = Source.from_library("18 sco")
+    star, data = Source.from_library("18 sco"), fits.getdata(WHOLE)
     assert star.name == "18 Sco"
-    assert "18sco_stis_006.fits" in star.origin
-    assert "doi 10.1086/677655" in star.origin
-    with fits.open(WHOLE) as hdus:
-        np.testing.assert_allclose(star.flux_flam, hdus[1].data["FLUX"].astype(float), rtol=1e-12)
-        np.testing.assert_allclose(star.wavelength_nm, hdus[1].data["WAVELENGTH"] / 10, rtol=1e-12)
-    assert star.magnitude("V") == pytest.approx(5.50, abs=0.06)
+    assert all(words in star.origin for words in ("18sco_stis_006.fits", "doi 10.1086/677655"))
+    np.testing.assert_allclose(star.flux_flam, data["FLUX"].astype(float), rtol=1e-12)
+    np.testing.assert_allclose(star.wavelength_nm, data["WAVELENGTH"] / 10, rtol=1e-12)
 
 
 def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path) -> None:
@@ -211,13 +195,11 @@ def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path)
     reported = not_done(tmp_path, "fetch", "calspec:VB 8", "--from", base)
     assert all(fact in reported for fact in ("VB8", "290.033-2497.72", "200-700", "--extend"))
     fetch(tmp_path, "calspec:VB 8", base, "--extend", "M3V")
-    star = Source.from_library("VB 8")
     direct = Source.read(WHOLE.parent / "vb8_stiswfcnic_004.fits", extend="M3V")
-    np.testing.assert_array_equal(star.flux_flam, direct.flux_flam)
+    np.testing.assert_array_equal(Source.from_library("VB 8").flux_flam, direct.flux_flam)
     # Its messages are reported wherever it is used.
     said = " ".join(answered("VB 8", magnitude=9.0).messages)
-    assert "113 of its 1349 points" in said
-    assert "continued by M3V" in said
+    assert all(words in said for words in ("113 of its 1349 points", "continued by M3V"))
     library(tmp_path, "add", f"{WHOLE.parent / 'ckp00_5750.fits'}[g45]", "--name", "model")
     assert "at the star's surface" in Source.from_library("model").unscaled
     with refused("magnitude"):
@@ -246,8 +228,7 @@ def test_any_collection_is_searched(archive: str, tmp_path: Path, monkeypatch: p
     fetch(tmp_path, "HD 37202")
     assert "Spectral Library" in Source.from_library("HD 37202").origin
     reported = not_done(tmp_path, "fetch", "HD 99999")
-    assert "'HD 99999'" in reported
-    assert "CALSPEC" in reported
+    assert all(words in reported for words in ("'HD 99999'", "CALSPEC"))
 
 
 @pytest.mark.parametrize(("name", "below", "facts"), DOWNLOADS)
@@ -263,14 +244,8 @@ def test_failed_downloads_raise(
     assert kept(tmp_path) == []
 
 
-def test_download_without_a_network_raises(tmp_path: Path) -> None:
-    reported = not_done(tmp_path, "fetch", "ngsl:HD 37202", "--from", "http://127.0.0.1:9/")
-    assert "mauvecl library add h_stis_ngsl_hd037202_v2.fits" in reported
-
-
 def test_documentation_and_help_list_all_collections(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/my-star.md").read_text(encoding="utf-8")
     named = {*re.findall(r'fetch "(\w+):', page), *re.findall(r"\b(\w+):\.\.\.", page)}
     assert named == {one.name for one in additions.COLLECTIONS}
-    reported = library(tmp_path, "fetch", "--help")
-    assert all(name in reported for name in named)
+    assert all(name in library(tmp_path, "fetch", "--help") for name in named)

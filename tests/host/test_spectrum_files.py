@@ -1,20 +1,31 @@
-"""Spectra of arrays and of tables at random; named cases are in tests/data/corpus.
+"""Spectra of arrays, of tables at random, of archives, and of files that are packed, cut, damaged, or no files at all.
 
-A file is read right or refused in one sentence.
+Named cases are in tests/data/corpus. A file is read right or refused in one sentence; unmodified files of the archives
+are read as by hand.
 """
 
+import bz2
+import csv
+import gzip
+import lzma
+import os
 import tomllib
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import astropy.units as u
 import numpy as np
 import pytest
-from corpus import CORPUS, FLUX, NM, cases, per, value, written
+from astropy.io import fits
+from corpus import CORPUS, FLUX, NM, cases, value, written
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
-from mauvecl import InputError, Source
+from mauvecl import InputError, Instrument, Source, expect
 
 CASES = dict(cases(CORPUS / "spectrum_files.toml"))
 
@@ -48,7 +59,8 @@ def test_units_may_be_those_of_astropy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
 def test_frequencies_of_arrays_may_rise_or_fall(order: slice) -> None:
-    assert is_right(Source.from_arrays((NM * u.nm).to(u.Hz, u.spectral())[order], (per("Jy") * u.Jy)[order]))
+    frequency, flux = (NM * u.nm).to(u.Hz, u.spectral()), value('per("Jy")') * u.Jy
+    assert is_right(Source.from_arrays(frequency[order], flux[order]))
 
 
 RANDOM = tomllib.loads((CORPUS / "spectrum_files.toml").read_text(encoding="utf-8"))["random"]
@@ -97,3 +109,183 @@ def test_prose_in_a_header_changes_nothing(
 ) -> None:
     """Add prose with words for wavelength, flux, errors and units; the first two columns are read, or it raises."""
     is_right_or_raises(tmp_path, "\n".join(remark + line for line in lines), mark, columns, True)
+
+
+PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
+
+
+@PACKERS
+def test_packed_files_are_whole_or_refused(pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    # Text that compresses badly.
+    flux = np.random.default_rng(7).uniform(1e-13, 2e-13, 4000)
+    rows = zip(np.linspace(180.0, 1100.0, 4000), flux, strict=True)
+    content, path, digests = "\n".join(f"{a:.9g} {b:.9e}" for a, b in rows).encode(), tmp_path / "star", set()
+    for whole in (content, pack(content), pack(content[:9000]) + pack(content[9000:])):
+        path.write_bytes(whole)
+        digests.add(Source.read(path).digest)
+    assert len(digests) == 1
+    for size in (8, len(pack(content)) // 2, len(pack(content)) - 1):
+        path.write_bytes(pack(content)[:size])
+        with refused("file"):
+            Source.read(path)
+
+
+@pytest.mark.long
+@PACKERS
+def test_decompression_bomb_raises_early(
+    pack: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bomb").write_bytes(pack(bytes(64 << 20)))
+    monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "16")
+    # Python reserves the memory of the largest file.
+    monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
+    tracemalloc.start()
+    with refused("MAUVECL_LARGEST_CONTENT_MIB", "16"):
+        Source.read(tmp_path / "bomb")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 40 << 20
+
+
+def test_only_regular_files_of_limited_size_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fifo, large = tmp_path / "fifo", tmp_path / "large"
+    os.mkfifo(fifo)
+    names = ("/dev/zero", fifo, tmp_path, tmp_path / "none", "a\0b", "x\ny" * 5000, tmp_path / ("y" * 300), "\ud800")
+    for path in names:
+        with refused("file") as caught:
+            Source.read(path)
+        assert len(str(caught.value)) < 600
+    with large.open("wb") as file:
+        file.truncate((1 << 20) + 1)
+    monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
+    with refused("MAUVECL_LARGEST_FILE_MIB", "1"):
+        Source.read(large)
+    # A file that grows is not cut silently, nor is one whose size the system does not know.
+    size, known = os.fstat, os.stat_result
+    with monkeypatch.context() as patch, refused("MAUVECL_LARGEST_FILE_MIB", "1"):
+        patch.setattr(os, "fstat", lambda handle: known([*size(handle)[:6], 0, *size(handle)[7:]]))
+        Source.read(large)
+    os.truncate(large, 1 << 20)
+    # It is read, and holds no text.
+    with refused("file", "null bytes"):
+        Source.read(large)
+    for limit in ("", "-1", "0", "1e3", "99999999", "٣"):
+        monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", limit)
+        with refused("MAUVECL_LARGEST_FILE_MIB"):
+            Source.read(large)
+
+
+@pytest.mark.parametrize(
+    "name", ["FITS table plain fits", "FITS image linear fits", "FITS table start and step fits",
+             "content instead of a name text txt", "content instead of a name fits.gz"]
+)  # fmt: skip
+def test_damaged_files_raise_or_are_read(name: str, tmp_path: Path) -> None:
+    """Change random bytes of whole files with a fixed seed; only InputError may be raised."""
+    rng = np.random.default_rng(14)
+    path = written(CASES[f"spectrum_files {name}"], tmp_path)
+    content = np.fromfile(path, np.uint8)
+    for _ in range(60):
+        damaged = content.copy()
+        # Headers stand at the front.
+        damaged[rng.integers(0, min(content.size, 6000), 6)] = rng.integers(32, 127, 6)
+        damaged.tofile(path)
+        try:
+            Source.read(path)
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017
+
+
+HERE = Path(__file__).parents[1] / "data" / "spectra"
+ENTRIES = tomllib.loads((CORPUS / "archive_files.toml").read_text(encoding="utf-8"))
+RIGHT, SHORT = ([pytest.param(one, id=one["file"]) for one in ENTRIES[key]] for key in ("right", "short"))
+ANGSTROM = {"wavelength_unit": "Angstrom"}
+
+
+def by_hand(name: str, flux: str = "FLUX", skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Read a file's wavelengths and fluxes, Angstrom and erg s-1 cm-2 A-1, by astropy, or as text."""
+    if ".fits" in name:
+        data = fits.getdata(HERE / name)
+        return data["WAVELENGTH"].astype(float), data[flux].astype(float)
+    text = (HERE / name).read_text()
+    if name.endswith(".csv"):
+        # Gaia's fluxes at 336 + 2 i nm, W m-2 nm-1, which are 100 erg s-1 cm-2 A-1.
+        row = next(row for row in csv.DictReader(text.splitlines()) if row["source_id"] == "4")
+        return 3360.0 + 20.0 * np.arange(343), 100.0 * np.array(row["flux"].strip("()").split(","), float)
+    values = np.array([line.split()[:2] for line in text.splitlines()[skip:]], float)
+    return values[:, 0], values[:, 1]
+
+
+def test_every_file_is_tried() -> None:
+    held = [case for _, case in cases(CORPUS / "archive_files.toml")] + ENTRIES["right"] + ENTRIES["short"]
+    tried = {case["file"].split("[")[0] for case in held}
+    assert tried == {path.name for path in HERE.iterdir() if path.suffix != ".md"}
+
+
+# Astropy, by which files are read by hand, warns of a header with null values of real columns.
+@pytest.mark.filterwarnings("ignore:Invalid keyword for column.*TNULLn")
+@pytest.mark.parametrize("entry", RIGHT)
+def test_archive_files_are_read(entry: dict[str, Any]) -> None:
+    options = entry.get("options", {})
+    star = Source.read(HERE / entry["file"], **options)
+    angstrom, flux = by_hand(entry["file"].split("[")[0], **entry.get("how", {}))
+    assert np.isfinite(star.flux_flam).all()
+    assert all(any(words in text for text in star.messages) for words in entry.get("messages", ())), star.messages
+    assert len(star.messages) == entry.get("n_messages", len(star.messages))
+    # Points that stand once and have a flux are there as they stand, to the rounding of the unit.
+    once = np.isfinite(flux) & np.isin(angstrom, np.unique(angstrom)[np.unique(angstrom, return_counts=True)[1] == 1])
+    inside = once & (angstrom > 2000.0) & (angstrom < 7000.0)
+    assert inside.sum() > 100
+    place = np.searchsorted(star.wavelength_nm, angstrom[inside] / 10.0 * (1 - 1e-12))
+    np.testing.assert_allclose(star.wavelength_nm[place], angstrom[inside] / 10.0, rtol=1e-12)
+    np.testing.assert_allclose(star.flux_flam[place], flux[inside], rtol=1e-12)
+    if "v" in entry:
+        # Zero points of V differ by 0.03 mag; the M7 dwarf varies, and catalogues with it.
+        assert star.magnitude("V") == pytest.approx(entry["v"], abs=0.15 if "extend" in options else 0.06)
+    messages = expect(star.at_magnitude(8.0), Instrument.load("mauvesim"), exposure=50.0).messages
+    assert all(any(text in message for message in messages) for text in star.messages)
+
+
+@pytest.mark.parametrize("entry", SHORT)
+def test_short_spectra_need_an_extension(entry: dict[str, Any]) -> None:
+    star = Source.read(HERE / entry["file"], **entry.get("options", {}))
+    assert any(text.startswith("its own points cover") for text in star.messages)
+    with refused(*entry["refused"]):
+        expect(replace(star, unscaled=""), Instrument.load("mauvesim"), exposure=5.0)
+
+
+def test_messages_of_the_star_that_continues_a_spectrum() -> None:
+    """What the library says of its star's ultraviolet is said of a spectrum that it continues to the blue."""
+    (noisy,) = Source.from_library("M4V").messages
+    assert "noise rules" in noisy
+    wavelength = np.arange(90.0, 1100.0)
+    # The zeros at the start stand for missing data.
+    dark = Source.from_arrays(wavelength, np.where(wavelength < 300.0, 0.0, 1e-12), extend="M4V")
+    for star in (Source.read(HERE / "vb8_stiswfcnic_004.fits", extend="M4V"), dark):
+        assert f"in M4V, {noisy}" in star.messages
+
+
+def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
+    mauve = Instrument.load("mauvesim")
+    lamost = written(dict(cases(CORPUS / "surveys.toml"))["surveys LAMOST table of DR8 fits"], tmp_path)
+    model, ngsl = HERE / "ckp00_5750.fits[g45]", HERE / "h_stis_ngsl_hd095735_v2.txtA"
+    for star in (Source.read(model), Source.read(ngsl, **ANGSTROM), Source.read(lamost, extend="K5V")):
+        with refused("magnitude"):
+            expect(star, mauve, exposure=5.0)
+        assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0
+
+
+def test_calspec_files_that_start_within_the_line_function_are_continued() -> None:
+    """Cut a whole file where three of CALSPEC's begin (180.02-180.10 nm) and P330E does (199.95 nm)."""
+    star = Source.read(HERE / "18sco_stis_004.fits")
+    assert star.name == "18SCO"
+    mauve = Instrument.load("mauvesim")
+    whole = expect(star, mauve, exposure=50.0)
+    for start in (180.02, 180.10, 199.95):
+        kept = star.wavelength_nm >= start
+        short = Source.from_arrays(star.wavelength_nm[kept], star.flux_flam[kept], name="short")
+        found = expect(short, mauve, exposure=50.0)
+        # A tenth of the noise at most, and a tenth of the light.
+        error = np.abs(found.signal_dn - whole.signal_dn)
+        assert (error < 0.1 * np.sqrt(whole.variance_dn2)).all()
+        said = f"starts at {short.wavelength_nm[1]:g} nm and is continued to 180 nm"
+        assert any(said in message for message in found.messages)

@@ -17,8 +17,8 @@ FRAMES, PIXELS = 65_536, 1024
 MARGIN_MIB = 96
 #: Light of a frame above that of its pixel.
 PATTERN = np.arange(FRAMES) * 7919 % 101
-#: Begin of a process, and its limit.
-PREPARED = """
+#: A process that reads `path`, whose address space is limited after its imports and a first, small file.
+CHILD = """
 import resource, sys
 import astropy.io.fits, astropy.table, astropy.time, scipy.special
 import numpy as np
@@ -26,53 +26,56 @@ from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.frame_files import read_frames, reduce_frames
 # OpenBLAS reserves address space at the first large product; reading does not need it.
 np.ones((300, 300)) @ np.ones((300, 300))
-"""
-LIMITED = """
+path, out = sys.argv[1:]
+{first}
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + {margin} * 2**20
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-"""
-CHILD = f"""{PREPARED}{LIMITED}
-mapping = FrameMapping(time="TIME", time_unit="s", flux="FLUX", wavelength="WAVES", wavelength_unit="nm", exposure_s=5)
-frames = read_frames({{path!r}}, mapping)
-weights = np.zeros((2, {PIXELS})); weights[0, 3] = 1.0; weights[1, :2] = 1.0
-reduced = reduce_frames({{path!r}}, weights, mapping)
+{then}
 print(*frames.remarks, sep=chr(10), file=sys.stderr)
-np.savez({{out!r}}, white=frames.flux, one=reduced.light_curves[0].flux, two=reduced.light_curves[1].flux,
-         mean=reduced.pixels.mean, scatter=reduced.pixels.scatter)
+np.savez(out, white=frames.flux, **found)
+"""
+#: Reads all that an image or a table has.
+REDUCE = """
+mapping = FrameMapping(time="TIME", time_unit="s", flux="FLUX", wavelength="WAVES", wavelength_unit="nm", exposure_s=5)
+frames = read_frames(path, mapping)
+weights = np.zeros((2, 1024)); weights[0, 3] = 1.0; weights[1, :2] = 1.0
+reduced = reduce_frames(path, weights, mapping)
+one, two = (curve.flux for curve in reduced.light_curves)
+found = dict(one=one, two=two, mean=reduced.pixels.mean, scatter=reduced.pixels.scatter)
 """
 
 
-def _light() -> np.ndarray:
-    return (PATTERN[:, None] + np.arange(PIXELS)).astype(np.float32)
-
-
-def _image(path: Path) -> None:
-    """Write an image of 256 MiB, with its times and wavelengths."""
-    images = {"FLUX": _light(), "WAVES": np.arange(PIXELS) + 200.0, "TIME": np.arange(FRAMES) * 5.0}
-    fits.HDUList([fits.PrimaryHDU(), *(fits.ImageHDU(one, name=name) for name, one in images.items())]).writeto(path)
-
-
-def _table(path: Path) -> None:
-    """Write a table of 256 MiB, a spectrum in each row, with its wavelengths in another extension."""
-    times = fits.Column("TIME", "D", array=np.arange(FRAMES) * 5.0)
-    table = fits.BinTableHDU.from_columns([times, fits.Column("FLUX", f"{PIXELS}E", array=_light())])
-    fits.HDUList([fits.PrimaryHDU(), table, fits.ImageHDU(np.arange(PIXELS) + 200.0, name="WAVES")]).writeto(path)
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
-@pytest.mark.parametrize("write", [_image, _table])
-def test_a_file_larger_than_memory_is_reduced_in_pieces(write, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    path, out = tmp_path / "large.fits", tmp_path / "out.npz"
-    write(path)
-    assert path.stat().st_size > 2.5 * MARGIN_MIB * 2**20
-    code = CHILD.format(margin=MARGIN_MIB, path=str(path), out=str(out))
-    limits = {"MAUVECL_LARGEST_CONTENT_MIB": "32", "OPENBLAS_NUM_THREADS": "1"}
-    done = python(code, **limits)
+def _in_pieces(path: Path, margin: int, content_mib: int, then: str, first: str = "") -> tuple[Any, str]:
+    """Read a large file in a process with little memory, remove it, and return what is found and said."""
+    assert path.stat().st_size > margin * 2**20
+    out = path.with_suffix(".npz")
+    limits = {"MAUVECL_LARGEST_CONTENT_MIB": str(content_mib), "OPENBLAS_NUM_THREADS": "1"}
+    done = python(CHILD.format(margin=margin, first=first, then=then), path, out, **limits)
     path.unlink()
-    assert "they were summed over wavelength while they were read" in done.stderr
-    found, pixel = np.load(out), np.arange(PIXELS)
+    return np.load(out), done.stderr
+
+
+LINUX = pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it"
+)
+
+
+@LINUX
+@pytest.mark.long
+@pytest.mark.parametrize("in_table", [False, True])
+def test_a_file_larger_than_memory_is_reduced_in_pieces(in_table: bool, tmp_path: Path) -> None:
+    """Read light of 256 MiB, an image or a spectrum in each row of a table, with its times and wavelengths."""
+    path, pixel, times = tmp_path / "large.fits", np.arange(PIXELS), np.arange(FRAMES) * 5.0
+    light = (PATTERN[:, None] + pixel).astype(np.float32)
+    hdus = [fits.ImageHDU(light, name="FLUX"), fits.ImageHDU(times, name="TIME")]
+    if in_table:
+        columns = [fits.Column("TIME", "D", array=times), fits.Column("FLUX", f"{PIXELS}E", array=light)]
+        hdus = [fits.BinTableHDU.from_columns(columns)]
+    fits.HDUList([fits.PrimaryHDU(), *hdus, fits.ImageHDU(pixel + 200.0, name="WAVES")]).writeto(path)
+    assert path.stat().st_size > 2.5 * MARGIN_MIB * 2**20
+    found, said = _in_pieces(path, MARGIN_MIB, 32, REDUCE)
+    assert "they were summed over wavelength while they were read" in said
     np.testing.assert_allclose(found["white"], PIXELS * PATTERN + pixel.sum())
     np.testing.assert_allclose(found["one"], PATTERN + 3)
     np.testing.assert_allclose(found["two"], 2 * PATTERN + 1)
@@ -93,7 +96,6 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     mapping = frame_files.FrameMapping(time="T", **how)
     whole = read_frames(path, mapping)
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 8 * 50 * 400)
-    monkeypatch.setattr("mauvecl.host.tables.fits_tables.PIECE_BYTES", 0)
     monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "1")
     pieces = read_frames(path, mapping)
     for found, wanted in zip((pieces.flux, pieces.error), whole.white_light, strict=True):
@@ -109,31 +111,21 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(pixels.stated[6:], np.sqrt((np.delete(error, 7, axis=0)[:, 6:] ** 2).mean(axis=0)))
 
 
-CSV_CHILD = f"""{PREPARED}
-how = dict(time="time", flux="flux_*", wavelength="names", wavelength_unit="nm")
-read_frames({{small!r}}, FrameMapping(time_unit="s", **how))
-{LIMITED}
-frames = read_frames({{path!r}}, FrameMapping(**how))
-np.savez({{out!r}}, white=frames.flux, time=frames.time_s)
-"""
-
-
+@LINUX
 @pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
 def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
-    """A table with a date and 512 columns of light in each row."""
-    n, margin, start = 44_000, 80, np.datetime64("2026-03-01T00:00:00")
-    path, small, out = tmp_path / "large.csv", tmp_path / "small.csv", tmp_path / "out.npz"
+    """Read a table with a date and 512 columns of light in each row."""
+    n, path, small = 44_000, tmp_path / "large.csv", tmp_path / "small.csv"
+    start, pixel = np.datetime64("2026-03-01T00:00:00"), np.arange(512)
     with path.open("w") as file:
-        file.write(",".join(["time", *(f"flux_{200 + k}" for k in range(512))]) + "\n")
+        file.write(",".join(["time", *(f"flux_{200 + k}" for k in pixel)]) + "\n")
         for row in range(n):
-            light = ",".join(map(str, (PATTERN[row] + np.arange(512)).tolist()))
+            light = ",".join(map(str, (PATTERN[row] + pixel).tolist()))
             file.write(f"{start + np.timedelta64(5 * row, 's')},{light}\n")
     small.write_text("time,flux_200\n" + "\n".join(f"{k},1" for k in range(30)) + "\n")
-    assert path.stat().st_size > margin * 2**20
-    code = CSV_CHILD.format(margin=margin, path=str(path), small=str(small), out=str(out))
-    limits = {"MAUVECL_LARGEST_CONTENT_MIB": "16", "OPENBLAS_NUM_THREADS": "1"}
-    python(code, **limits)
-    found = np.load(out)
-    np.testing.assert_allclose(found["white"], 512 * PATTERN[:n] + np.arange(512).sum())
+    how = 'how = dict(time="time", flux="flux_*", wavelength="names", wavelength_unit="nm")\n'
+    first = f'{how}read_frames({str(small)!r}, FrameMapping(time_unit="s", **how))'
+    then = "frames = read_frames(path, FrameMapping(**how))\nfound = dict(time=frames.time_s)"
+    found, _ = _in_pieces(path, 80, 16, then, first)
+    np.testing.assert_allclose(found["white"], 512 * PATTERN[:n] + pixel.sum())
     np.testing.assert_allclose(found["time"], np.arange(n) * 5.0, atol=1e-3)
