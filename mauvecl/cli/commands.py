@@ -278,21 +278,15 @@ def verify(
         columns, left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
         source = "with what was written" if not redraw else "with what the engine draws"
         outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
-    _show_faults(f"Not as it was written: {store}", faults, columns, outcome, as_json=as_json)
+    found = [asdict(fault) for fault in faults]
+    if as_json:
+        print(json.dumps(found, indent=2))
+    else:
+        if found:
+            show_view(View(f"Not as it was written: {store}", columns, found))
+        show([outcome] if outcome else [])
     if left:
         raise typer.Exit(1)
-
-
-def _show_faults(title: str, faults: Sequence[Any], columns: Sequence[Column], outcome: str, *, as_json: bool) -> None:
-    """Print faults as JSON, or as a table with what came of them."""
-    rows = [asdict(fault) for fault in faults]
-    if as_json:
-        print(json.dumps(rows, indent=2))
-        return
-    if faults:
-        show_view(View(title, columns, rows))
-    if outcome:
-        show([outcome])
 
 
 def export(

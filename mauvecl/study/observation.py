@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, create_model, field_validator, model_validator
+from pydantic import AfterValidator, Field, create_model, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
@@ -51,6 +51,7 @@ class Observation(Section):
     ] = 50.0
     instrument: Annotated[
         str,
+        AfterValidator(current_name),
         Help(
             "Instrument", choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file"
         ),
@@ -93,11 +94,6 @@ class Observation(Section):
         dict[str, Annotated[float | int | str, Accepted("a number or text")]],
         Help("Changed values of the instrument, by name"),
     ] = Field(default_factory=dict)
-
-    @field_validator("instrument")
-    @classmethod
-    def _current_name(cls, given: str) -> str:
-        return current_name(given)
 
     def load_instrument(self) -> Instrument:
         """Load the instrument and apply `changes` and the detector temperature."""
@@ -158,6 +154,12 @@ class SkyLight(Section):
         """Return the sky of one value, which replaces all others."""
         return type(self)(**{path[0]: value})
 
+    def describe(self) -> str:
+        """Return the sky in words."""
+        if self.target is not None:
+            return f"sky at {self.target}, {self.time} UTC"
+        return "no sky" if self.none else f"sky of V = {self.surface_brightness:g} mag/arcsec2"
+
     def sky(self) -> Sky:
         """Return the sky for the host."""
         from mauvecl.host.exposure.sky import Sky
@@ -177,6 +179,7 @@ class Run(Section):
     statistics: Annotated[
         tuple[str, ...],
         Field(min_length=1),
+        AfterValidator(lambda given: STATISTIC_NAMES if "all" in given else given),
         Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
         Flag("--statistic", read=read_words),
         Flag(
@@ -224,11 +227,6 @@ class Run(Section):
         default_factory=dict
     )
 
-    @field_validator("statistics")
-    @classmethod
-    def _expand_all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
-        return STATISTIC_NAMES if "all" in given else given
-
     def _check_values(self) -> None:
         self.comparison()
 
@@ -255,16 +253,6 @@ class OwnNuisance(Section):
 
     def _check_values(self) -> None:
         check_one(self, "a nuisance spectrum", "points", "file", needed=True)
-
-    def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
-        import numpy as np
-
-        from mauvecl.detection.nuisances import at_pixels, read_spectrum
-
-        if self.file is not None:
-            return read_spectrum(name, self.file, wavelength_nm)
-        return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
 
 
 Usual = Annotated[
@@ -308,7 +296,9 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
     def marginalised(self, quiet: Expectation) -> Nuisances | None:
         """Return the nuisance parameters for the engine, or None if there are none."""
-        from mauvecl.detection.nuisances import Nuisances, spectrum_of
+        import numpy as np
+
+        from mauvecl.detection.nuisances import Nuisances, at_pixels, read_spectrum, spectrum_of
 
         documented = DOCUMENTED_NUISANCES if self.usual else ()
         # Parameters without effect, such as the brightness of no sky, are left out.
@@ -318,7 +308,12 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
         sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
         for name, nuisance in self.own.items():
-            own[name] = nuisance.spectrum(name, quiet.wavelength_nm)
+            # DN per exposure at unit amplitude, shape (n_pixel,).
+            if nuisance.file is not None:
+                own[name] = read_spectrum(name, nuisance.file, quiet.wavelength_nm)
+            else:
+                points = f"points of {shortened(name)}"
+                own[name] = at_pixels(points, "DN", np.array(nuisance.points), quiet.wavelength_nm)
             sd[name] = sd_of(nuisance.sd)
         return Nuisances.of(quiet, sd, own) if sd else None
 

@@ -34,7 +34,7 @@ from mauvecl.schema.physical import (
     RateExponent,
     Share,
 )
-from mauvecl.schema.section import Section, built, check_all, check_different, check_one, given_keys, number_or_text
+from mauvecl.schema.section import Section, built, check_all, check_different, check_one, number_or_text
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -166,11 +166,6 @@ class PlanTarget(Section):
         check_all(self, self.name, "alpha", "rate_per_day", "at_erg")
         check_one(self, self.name, *RATES)
 
-    @property
-    def given_rates(self) -> list[str]:
-        """Keys of the given flare rates, of which a target has at most one; the mass has an age."""
-        return given_keys(self, RATES)
-
     def target(self, simbad: bool) -> Target:
         """Look up the target; given coordinates replace those of its name."""
         from mauvecl.host.orbit.orbit import Target
@@ -222,7 +217,7 @@ class PlanQuestion(Section):
         Flag(
             "--targets",
             kind=Path,
-            read=lambda path, _: read_targets(Path(path)),
+            read=lambda path, _: read_targets(path),
             help=Help("Table of targets (CSV, ECSV, FITS, VOTable)", "name, and what is known of each"),
         ),
     ] = ()
@@ -282,9 +277,8 @@ def read_targets(path: str | Path) -> list[dict[str, Any]]:
     """Read targets from a table of any format; see `targets_in`. Paths in it are relative to its folder."""
     from mauvecl.host.tables.opening import read_table
 
-    path = Path(path)
-    named = f"table of targets {shortened(path.name)}"
-    return targets_in(read_table(path, "table of targets"), named, path.parent)
+    named = f"table of targets {shortened(Path(path).name)}"
+    return targets_in(read_table(Path(path), "table of targets"), named, Path(path).parent)
 
 
 #: Names of columns of targets, in any case, by the keys of `PlanTarget`; keys themselves are names as well.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -22,15 +21,14 @@ from mauvecl.flares.settings import (
     ShapeName,
 )
 from mauvecl.noise.disturbances import PointingDrifts
-from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceName
-from mauvecl.schema.errors import InputError, shortened
+from mauvecl.noise.unknowns import Changing, NuisanceName
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
 from mauvecl.schema.section import Section, check_one, given_keys, read_ranges
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
-    from mauvecl.flares.shapes import Shape
     from mauvecl.flares.stare import Stare
     from mauvecl.search.templates import Bank, Baseline
 
@@ -114,19 +112,6 @@ class StareQuestion(Section):
             if not 0 < low < high:
                 raise InputError.of("stare.bands_nm", (low, high), "ascending wavelengths", unit="nm")
 
-    @property
-    def has_unknowns(self) -> bool:
-        """True if the stare has unknown changes."""
-        return any(getattr(self, name) for name in (*COURSES, *STARE_PROCESSES))
-
-    def all_gaps(self) -> list[tuple[float, float]]:
-        """Return the given gaps and the gap at the end of every orbit."""
-        every = [*self.gaps]
-        if self.orbit_gap_s:
-            orbits = math.ceil(self.duration_s / self.orbit_s)
-            every += [((n + 1) * self.orbit_s - self.orbit_gap_s, (n + 1) * self.orbit_s) for n in range(orbits)]
-        return every
-
 
 #: Keys of the size of an event.
 SIZES = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
@@ -159,16 +144,6 @@ class EventChoice(Section):
     def sizes(self) -> list[str]:
         """Keys of the given sizes, at most one."""
         return given_keys(self, SIZES)
-
-    def load_shape(self, default: str) -> Shape:
-        """Return the shape, or the published shape named `default` if none is given."""
-        from mauvecl.flares.shapes import TableShape, shape_of
-        from mauvecl.host.tables.text_tables import read_columns
-
-        if self.shape_file is None:
-            return shape_of(self.shape or default)
-        columns = read_columns("flare shape", "values", self.shape_file)
-        return TableShape(columns[:, 0], columns[:, 1], self.shape_file.stem, shortened(self.shape_file.name))
 
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.

@@ -118,10 +118,14 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
     Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
     Raises InputError if no file with the name and digest is found.
     """
+    study = table.parent / "study.toml"
     for section in tables_in(data):
         for key in [key for key, name in section.items() if f"{key}_sha256" in section and isinstance(name, str)]:
             name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
-            places = [table.parent / name, table.parent.parent / name, Path(name), *_beside(table, name)]
+            beside = toml(read_text(study, "study file"), "study file 'study.toml'") if study.is_file() else {}
+            texts = (text for keys in tables_in(beside) for text in keys.values() if isinstance(text, str))
+            named = (table.parent / text for text in texts if Path(text).name == name)
+            places = [table.parent / name, table.parent.parent / name, Path(name), *named]
             files = ((place, without_columns(place)[0]) for place in places)
             found = next((place for place, file in files if file.is_file() and _digest(file) == digest), None)
             if found is None:
@@ -131,16 +135,6 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
                     key=key,
                 )
             section[key] = str(found.resolve())
-
-
-def _beside(table: Path, name: str) -> list[Path]:
-    """Return the files of this name in the ``study.toml`` next to a table."""
-    study = table.parent / "study.toml"
-    if not study.is_file():
-        return []
-    data = toml(read_text(study, "study file"), "study file 'study.toml'")
-    texts = [value for section in tables_in(data) for value in section.values() if isinstance(value, str)]
-    return [table.parent / file for file in texts if Path(file).name == name]
 
 
 def _digest(file: Path) -> str:
@@ -246,7 +240,7 @@ class Study(Section):
         path = Path(path)
         text = read_embedded_study(path) if path.suffix == ".ecsv" else read_text(path, "study file")
         data = toml(text, f"study file {shortened(path.name)}")
-        if not _has_values(data):
+        if not _without_empty(data):
             raise InputError(
                 f"study file {shortened(path.name)} must set at least one key, such as magnitude in [[star]], but "
                 "sets nothing; a verb without a study file answers the paper's question",
@@ -436,11 +430,6 @@ def _without_empty(data: Any) -> Any:
     if not isinstance(data, dict):
         return data
     return {key: inner for key, value in data.items() if (inner := _without_empty(value)) != {}}
-
-
-def _has_values(data: Any) -> bool:
-    """Return whether nested tables contain any key."""
-    return any(map(_has_values, data.values())) if isinstance(data, dict) else True
 
 
 #: The paper's noise budgets (its section "Noise"): the Be star HD 37202 and both flare stars, 50 s and 600 s.
