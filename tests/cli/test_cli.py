@@ -177,16 +177,6 @@ def test_numbers_of_tables_below_a_million_have_no_power_of_ten(tmp_path: Path) 
     assert not re.search(r"\de\+0[0-5]|nan", shown)
 
 
-def test_flags_of_a_flare_set_its_spectrum(tmp_path: Path) -> None:
-    star = ("--star", "M3V", "-m", "9", "--amplitude", "0.05", "--no-pictures", "-n", "20000", "--fap", "0.01")
-    lines = ("--line", "Mg II=0.03", "--line", "280.5 = 0.01", "--line-flux", "H beta=1e-13")
-    run("detect", *star, "--balmer-jump", "2.5", *lines, "--output", "out", folder=tmp_path)
-    light = Study.read(tmp_path / "out" / "study.toml").flare.spectrum
-    assert light.balmer_jump == 2.5
-    assert light.lines == {"Mg II": 0.03, "280.5": 0.01}
-    assert light.line_fluxes == {"H beta": 1e-13}
-
-
 def test_assumptions_about_a_spectrum_are_the_first_message(tmp_path: Path) -> None:
     words = ("--wavelength-unit", "Angstrom", "-m", "8", "--exposure", "5", "--no-pictures", "-o", "out")
     done = run("simulate", "--star", DATA / "spectra" / "10lac_stis_001.txt", *words, folder=tmp_path).stdout
