@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,13 +27,12 @@ from mauvecl.cli.flags import (
     QuietFlag,
     ReplaceFlag,
     SetFlag,
+    complete_study,
     is_star,
     numbers_of,
     option,
     output_option,
-    study_argument,
     study_option,
-    warn_of_percent,
     whole_number,
 )
 from mauvecl.schema.columns import Column, View
@@ -69,9 +69,15 @@ class Command:
         keywords = {keyword.name: keyword for keyword in keys_of(verb.keys)}
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
+        other = next((f", or {what}" for flag, (what, *_) in PLACES.items() if flag in keywords and what), "")
+        argument = typer.Argument(
+            help=f"Study (TOML), the ECSV table of an answer{other}; flags override it.",
+            show_default=False,
+            autocompletion=complete_study,
+        )
         # Annotations and defaults by parameter.
         options: dict[str, tuple[Any, Any]] = {
-            "study_file": (study_argument(keywords), None),
+            "study_file": (Annotated[Path | None, argument], None),
             **{name: (study_option(keyword, verb.defaults or {}), None) for name, keyword in keywords.items()},
             "setting": (SetFlag, None),
             **({"paper": (PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
@@ -99,9 +105,19 @@ class Command:
         from mauvecl.study.study import Study
 
         given = {name: numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
-        warn_of_percent(given.get("amplitude") or ())
+        for value in given.get("amplitude") or ():
+            if not isinstance(value, str) and value >= 1:
+                rise = f"--amplitude {value} is a rise of {100 * value:g} %"
+                warnings.warn(f"{rise}; --amplitude {value}% is one of {value} %", stacklevel=2)
         given |= {name: values.pop(name, None) for name in ("setting", "paper")}
-        study_file = _placed(study_file, given)
+        for key, (_, plural, applies) in PLACES.items():
+            # A file that is no study is for the flag that takes such files.
+            if study_file is not None and key in given and applies(study_file):
+                if given[key]:
+                    fault = f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given"
+                    raise InputError(fault, key=key)
+                given[key] = [str(study_file)] if applies is is_star else study_file
+                study_file = None
         how = {name: values.pop(name, usual) for name, (_, usual) in self._options().items()}
         if "given" in inspect.signature(self.run).parameters:
             values["given"] = given
@@ -138,21 +154,6 @@ def command_of(
         return run
 
     return decorate
-
-
-def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
-    """Give a file that is no study to the flag that takes such files, and return None in its place."""
-    if study_file is None:
-        return None
-    for key, (_, plural, applies) in PLACES.items():
-        if key in given and applies(study_file):
-            if given[key]:
-                raise InputError(
-                    f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given", key=key
-                )
-            given[key] = [str(study_file)] if applies is is_star else study_file
-            return None
-    return study_file
 
 
 RowsFlag = Annotated[str | None, option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")]

@@ -141,18 +141,6 @@ def _digest(file: Path) -> str:
     return hashlib.sha256(read_bytes(file, "spectrum file")).hexdigest()
 
 
-def parse_toml_value(text: str) -> Any:
-    """Parse a TOML value; a bare word is text."""
-    check_keys(text, f"value {shortened(text)}")
-    with parsing(f"value {shortened(text)}", "give a TOML value"):
-        try:
-            parsed = tomllib.loads(f"value = {text}")
-        except tomllib.TOMLDecodeError:
-            return text
-    # Text of several lines would define several keys.
-    return parsed["value"] if len(parsed) == 1 else text
-
-
 def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
     """Set a nested key in place; `text` is the setting, for messages."""
     *parents, last = path
@@ -318,7 +306,12 @@ class Study(Section):
             path, equals, value = (part.strip() for part in text.partition("="))
             if not (path and equals):
                 raise InputError.of("setting", text, "key=value, such as run.fap=0.01")
-            set_key(data, path.split("."), parse_toml_value(value), text)
+            named, parsed = f"value {shortened(value)}", dict[str, Any]()
+            check_keys(value, named)
+            # A bare word is text, as is one of several lines, which would define several keys.
+            with parsing(named, "give a TOML value"), contextlib.suppress(tomllib.TOMLDecodeError):
+                parsed = tomllib.loads(f"value = {value}")
+            set_key(data, path.split("."), parsed["value"] if len(parsed) == 1 else value, text)
         return self.build(data, where)
 
     def with_enough_tails(self, *, sampled: bool = True, raised: bool = False) -> tuple[Self, list[str]]:
