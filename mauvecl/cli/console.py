@@ -78,10 +78,7 @@ def guarded(app: typer.Typer) -> int:
         if (change := getattr(stream, "reconfigure", None)) is not None:
             change(errors="backslashreplace")
     with warnings.catch_warnings():
-        # With its kind, unless it is one of mauvecl's own.
-        warnings.showwarning = lambda message, kind, *_, **__: _say(
-            f"note: {message}" + ("" if kind is UserWarning else f" ({kind.__name__})"), 0
-        )
+        warnings.showwarning = _warn
         try:
             code = app(standalone_mode=False)
             if code == INTERRUPTED:
@@ -154,6 +151,11 @@ def _say(text: str, code: int, *, whole: bool = False) -> int:
     with contextlib.suppress(OSError, ValueError):
         print(f"mauvecl: {text}", file=sys.stderr, flush=True)
     return code
+
+
+def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Print a warning on one line, with its kind unless it is one of mauvecl's own."""
+    _say(f"note: {message}" + ("" if category is UserWarning else f" ({category.__name__})"), 0)
 
 
 def _flushed(code: int) -> int:

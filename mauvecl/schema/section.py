@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Field,
     ValidationError,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
@@ -23,7 +24,20 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from mauvecl.schema.errors import InputError, shortened, shown, together
-from mauvecl.schema.fields import Unit, first, is_quantity, is_truth, says_none, with_unit, without_unit, word_of
+from mauvecl.schema.fields import (
+    Flag,
+    Help,
+    Quantity,
+    Unit,
+    Widget,
+    first,
+    is_quantity,
+    is_truth,
+    says_none,
+    with_unit,
+    without_unit,
+    word_of,
+)
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -231,6 +245,34 @@ class Section(Record):
 @cache
 def _unit_of(section: type[Section], key: str) -> Unit | None:
     return first(section.model_fields[key], Unit)
+
+
+def setting(
+    default: Any,
+    text: str | Help,
+    *,
+    flag: str | Flag | tuple[Flag, ...] = (),
+    usual: str = "",
+    choices: str | tuple[str, ...] = "",
+    quantity: Quantity | None = None,
+    min_length: int | None = None,
+    **page: Any,
+) -> Any:
+    """Return the field of a key with its default (``dict`` for an empty table), and what is stated besides its type.
+
+    `text` is that of `Help`, with its explanation after a semicolon; `usual` and `choices` are its words for the
+    default and for the accepted values. `flag` holds the names of a flag with blanks between them, or flags that
+    convert values, and `page` the values of a `Widget`; its choices are `options`, or those of a tuple of `choices`.
+    """
+    flags = flag if isinstance(flag, tuple) else (Flag(*flag.split()) if isinstance(flag, str) else flag,)
+    if isinstance(text, str):
+        text, _, more = text.partition("; ")
+        text = Help(text, more, usual, choices if isinstance(choices, str) else ", ".join(choices))
+    if page:
+        page["choices"] = page.pop("options", () if isinstance(choices, str) else choices)
+    field: FieldInfo = Field(default_factory=dict) if default is dict else Field(default=default, min_length=min_length)
+    field.metadata += [text, *flags, *([Widget(**page)] if page else []), *([quantity] if quantity else [])]
+    return field
 
 
 def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], FieldInfo]]:

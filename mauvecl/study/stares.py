@@ -79,8 +79,8 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
         n_orbits = math.ceil(q.duration_s / q.orbit_s) if q.orbit_gap_s else 0
         ends = [(n + 1) * q.orbit_s for n in range(n_orbits)]
         gaps = [*q.gaps, *((end - q.orbit_gap_s, end) for end in ends)]
-        how = {"frame_s": instrument.frame_s, "temperature_c": instrument.temperature_c, "gaps": gaps}
-        stare = Stare.of(q.duration_s, **how, **changes)
+        changes |= {"frame_s": instrument.frame_s, "temperature_c": instrument.temperature_c, "gaps": gaps}
+        stare = Stare.of(q.duration_s, **changes)
     for _, changed, _, mean in priors:
         name = "temperature_c" if changed == "temperature" else changed
         value: Any = getattr(stare, name)

@@ -31,8 +31,8 @@ from mauvecl.host.tables.files import (
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, found
-from mauvecl.schema.section import Section, built, fields_of
+from mauvecl.schema.fields import AnyUnit, Flag, found, number
+from mauvecl.schema.section import Section, built, fields_of, setting
 from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.keywords import Keyword, changes_of, stars_of, values_of
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -186,9 +186,7 @@ class Study(Section):
     True
     """
 
-    version: Annotated[Literal[2], Help("Version of the study's keys and defaults; none in files of version 1")] = (
-        VERSION
-    )
+    version: Literal[2] = setting(VERSION, "Version of the study's keys and defaults; none in files of version 1")
     star: Annotated[tuple[Star, ...], Field(min_length=1)] = PAPER_STARS
     flare: Flare = Flare()
     observation: Observation = Observation()
@@ -409,7 +407,9 @@ class Study(Section):
         if quantity not in QUANTITIES:
             raise InputError.of("quantity", quantity, f"one of {', '.join(QUANTITIES)}")
         swept = QUANTITIES[quantity]
-        return self.with_value(swept.path, swept.checked(value))
+        if swept.range is not None:
+            value = number(quantity.replace("_", " "), value, swept.unit, swept.range)
+        return self.with_value(swept.path, value)
 
     @property
     def has_neighbours(self) -> bool:
