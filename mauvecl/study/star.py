@@ -11,22 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import model_validator
 
 from mauvecl.host.stars.library import ALIASES, listed_values
+from mauvecl.schema import physical
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit
-from mauvecl.schema.physical import (
-    Amplitude,
-    AreaRatio,
-    BalmerJump,
-    BinWidth,
-    Distance,
-    LineFraction,
-    LineScale,
-    Magnitude,
-    Radius,
-    Reddening,
-    Share,
-    Temperature,
-)
 from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
 
 if TYPE_CHECKING:
@@ -52,7 +39,7 @@ class Star(Section):
         quantity=Quantity("star", "library name or file, with its magnitude", "star"),
     )
     file: Path | None = setting(None, "Spectrum file, instead of a name of the library")
-    magnitude: Magnitude | None = setting(
+    magnitude: physical.Magnitude | None = setting(
         None,
         "Magnitude; one for all stars or one each, as in 7,8",
         flag=Flag("--magnitude", "-m", kind=list[float]),
@@ -76,7 +63,7 @@ class Star(Section):
         flag="--magnitude-system",
         choices="catalogue, vega (Vega is 0 in every band) or ab",
     )
-    ebv: Reddening | None = setting(
+    ebv: physical.Reddening | None = setting(
         None,
         "Dust in front of the star, E(B-V); needs mauvecl[extinction]",
         flag="--ebv",
@@ -115,8 +102,10 @@ class Star(Section):
     ignore_checksum: bool | None = setting(
         None, "Read FITS files although their CHECKSUM or DATASUM differs", flag="--ignore-checksum"
     )
-    bin_nm: BinWidth | None = setting(None, "Width of bins over which the spectrum is averaged", flag="--bin-nm")
-    distance_pc: Distance | None = setting(
+    bin_nm: physical.BinWidth | None = setting(
+        None, "Width of bins over which the spectrum is averaged", flag="--bin-nm"
+    )
+    distance_pc: physical.Distance | None = setting(
         None,
         "Distance of the star; for energies",
         flag="--distance",
@@ -124,8 +113,8 @@ class Star(Section):
         hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
         group="Measurement",
     )
-    radius_rsun: Radius | None = setting(None, "Radius of the star; for energies", flag="--radius")
-    effective_temperature_k: Temperature | None = setting(
+    radius_rsun: physical.Radius | None = setting(None, "Radius of the star; for energies", flag="--radius")
+    effective_temperature_k: physical.Temperature | None = setting(
         None, "Effective temperature of the star; for energies", flag="--star-temperature"
     )
     neighbours: Path | None = setting(
@@ -148,7 +137,7 @@ class Star(Section):
         "has positions but no separations.",
         group="Neighbours",
     )
-    neighbour_share: Share = setting(
+    neighbour_share: physical.Share = setting(
         1.0,
         "Share of the light of neighbours within the fibre's radius that enters it; an assumption",
         flag="--neighbour-share",
@@ -232,7 +221,7 @@ FLARE_FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k",
 class FlareLight(Section):
     """Spectrum of a flare; by default a blackbody of `flare.temperature_k`."""
 
-    balmer_jump: BalmerJump | None = setting(
+    balmer_jump: physical.BalmerJump | None = setting(
         None,
         "Ratio of the flare's flux just below the Balmer edge to that just above",
         flag="--balmer-jump",
@@ -244,8 +233,8 @@ class FlareLight(Section):
             "balmer_jump", "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio"
         ),
     )
-    electron_temperature_k: Temperature = setting(10_000.0, "Electron temperature of the Balmer continuum")
-    second_temperature_k: Temperature | None = setting(
+    electron_temperature_k: physical.Temperature = setting(10_000.0, "Electron temperature of the Balmer continuum")
+    second_temperature_k: physical.Temperature | None = setting(
         None,
         "Temperature of a second blackbody of the flare; needs its area",
         flag="--second-temperature",
@@ -255,7 +244,7 @@ class FlareLight(Section):
             "second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"
         ),
     )
-    second_area: AreaRatio | None = setting(
+    second_area: physical.AreaRatio | None = setting(
         None,
         "Area of the second blackbody over that of the first",
         flag="--second-area",
@@ -264,7 +253,7 @@ class FlareLight(Section):
         first="0.05",
         quantity=Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
     )
-    lines: dict[str, LineFraction] = setting(
+    lines: dict[str, physical.LineFraction] = setting(
         dict,
         "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm; as in 'Mg II=0.05'",
         flag=Flag("--line", kind=list[str], read=read_line_fluxes),
@@ -274,7 +263,7 @@ class FlareLight(Section):
         "Emission line at the telescope, by name or wavelength in nm; as in '280=1e-12'",
         flag=Flag("--line-flux", kind=list[str], read=read_line_fluxes),
     )
-    line_scale: LineScale = setting(
+    line_scale: physical.LineScale = setting(
         1.0,
         "Factor on all line fluxes",
         quantity=Quantity("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
@@ -322,7 +311,7 @@ class FlareLight(Section):
         name="flare_flux_unit",
         suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
     )
-    continue_at_k: Temperature | None = setting(
+    continue_at_k: physical.Temperature | None = setting(
         None,
         "Temperature of a blackbody that continues the flare's file beyond its ends",
         flag="--continue-at",
@@ -394,7 +383,7 @@ def amplitudes_in(path: Path, _: str) -> list[float]:
 class Flare(Section):
     """Amplitudes, spectrum and geometry of flares."""
 
-    amplitudes: tuple[Amplitude, ...] = setting(
+    amplitudes: tuple[physical.Amplitude, ...] = setting(
         (0.0076, 0.02, 0.081, 0.24),
         "Flare amplitude; 0.24 is a rise of 24 % in the flare's band",
         min_length=1,
@@ -418,7 +407,7 @@ class Flare(Section):
             "amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"
         ),
     )
-    temperature_k: Temperature = setting(
+    temperature_k: physical.Temperature = setting(
         10_000.0,
         "Flare temperature",
         flag="--flare-temperature",
@@ -432,7 +421,7 @@ class Flare(Section):
     geometry: Literal["added", "replaces"] = setting(
         "added", "Whether a flare is added to the star or replaces part of its photosphere", flag="--geometry"
     )
-    photosphere_temperature_k: Temperature | None = setting(
+    photosphere_temperature_k: physical.Temperature | None = setting(
         None,
         "Temperature of the photosphere that a flare replaces",
         flag="--photosphere-temperature",
