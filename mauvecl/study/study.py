@@ -31,7 +31,7 @@ from mauvecl.host.tables.files import (
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, found, number
+from mauvecl.schema.fields import AnyUnit, Flag, Help, found, number
 from mauvecl.schema.section import Section, built, fields_of, setting
 from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.keywords import Keyword, changes_of, stars_of, values_of
@@ -186,7 +186,7 @@ class Study(Section):
     True
     """
 
-    version: Literal[2] = setting(VERSION, "Version of the study's keys and defaults; none in files of version 1")
+    version: Literal[2] = setting(VERSION, Help("Version of the study's keys and defaults; none in files of version 1"))
     star: Annotated[tuple[Star, ...], Field(min_length=1)] = PAPER_STARS
     flare: Flare = Flare()
     observation: Observation = Observation()
