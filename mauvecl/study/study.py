@@ -18,16 +18,7 @@ from pydantic import BaseModel, Field
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit import Limits
-from mauvecl.host.tables.files import (
-    check_keys,
-    parsing,
-    possible,
-    read_bytes,
-    read_ecsv,
-    read_text,
-    toml,
-    without_columns,
-)
+from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
@@ -56,7 +47,7 @@ if TYPE_CHECKING:
 
 def read_embedded_study(path: Path) -> str:
     """Return the text of the study in an answer's metadata."""
-    study = read_ecsv(path, "study", "give an answer's ECSV table").meta.get("study")
+    study = files.read_ecsv(path, "study", "give an answer's ECSV table").meta.get("study")
     if not isinstance(study, str):
         raise InputError(f"{path.name} contains no study; give an answer's ECSV table", key="study")
     return study
@@ -122,12 +113,13 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
     for section in tables_in(data):
         for key in [key for key, name in section.items() if f"{key}_sha256" in section and isinstance(name, str)]:
             name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
-            beside = toml(read_text(study, "study file"), "study file 'study.toml'") if study.is_file() else {}
-            texts = (text for keys in tables_in(beside) for text in keys.values() if isinstance(text, str))
+            text = files.read_text(study, "study file") if study.is_file() else ""
+            tables = tables_in(files.toml(text, "study file 'study.toml'"))
+            texts = (text for keys in tables for text in keys.values() if isinstance(text, str))
             named = (table.parent / text for text in texts if Path(text).name == name)
             places = [table.parent / name, table.parent.parent / name, Path(name), *named]
-            files = ((place, without_columns(place)[0]) for place in places)
-            found = next((place for place, file in files if file.is_file() and _digest(file) == digest), None)
+            there = (place for place in places if files.without_columns(place)[0].is_file())
+            found = next((place for place in there if _digest(place) == digest), None)
             if found is None:
                 raise InputError(
                     f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is "
@@ -137,8 +129,8 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
             section[key] = str(found.resolve())
 
 
-def _digest(file: Path) -> str:
-    return hashlib.sha256(read_bytes(file, "spectrum file")).hexdigest()
+def _digest(path: Path) -> str:
+    return hashlib.sha256(files.read_bytes(files.without_columns(path)[0], "spectrum file")).hexdigest()
 
 
 def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
@@ -224,8 +216,8 @@ class Study(Section):
     def read(cls, path: str | Path) -> Self:
         """Read a study file, or the study in an answer's ECSV table."""
         path = Path(path)
-        text = read_embedded_study(path) if path.suffix == ".ecsv" else read_text(path, "study file")
-        data = toml(text, f"study file {shortened(path.name)}")
+        text = read_embedded_study(path) if path.suffix == ".ecsv" else files.read_text(path, "study file")
+        data = files.toml(text, f"study file {shortened(path.name)}")
         if not _without_empty(data):
             raise InputError(
                 f"study file {shortened(path.name)} must set at least one key, such as magnitude in [[star]], but "
@@ -242,7 +234,7 @@ class Study(Section):
     @classmethod
     def build(cls, data: dict[str, Any], where: str) -> Self:
         """Validate nested data; raises InputError for the first invalid value."""
-        possible(data, where)
+        files.possible(data, where)
         return built(cls, data, where)
 
     @classmethod
@@ -305,9 +297,9 @@ class Study(Section):
             if not (path and equals):
                 raise InputError.of("setting", text, "key=value, such as run.fap=0.01")
             named, parsed = f"value {shortened(value)}", dict[str, Any]()
-            check_keys(value, named)
+            files.check_keys(value, named)
             # A bare word is text, as is one of several lines, which would define several keys.
-            with parsing(named, "give a TOML value"), contextlib.suppress(tomllib.TOMLDecodeError):
+            with files.parsing(named, "give a TOML value"), contextlib.suppress(tomllib.TOMLDecodeError):
                 parsed = tomllib.loads(f"value = {value}")
             set_key(data, path.split("."), parsed["value"] if len(parsed) == 1 else value, text)
         return self.build(data, where)
@@ -383,7 +375,7 @@ class Study(Section):
                     section[key] = value.name
                     # Keep the answer even if the file no longer exists.
                     with contextlib.suppress(InputError):
-                        section[f"{key}_sha256"] = _digest(without_columns(value)[0])
+                        section[f"{key}_sha256"] = _digest(value)
         return tomli_w.dumps(data)
 
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
