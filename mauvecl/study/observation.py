@@ -16,7 +16,7 @@ from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
 from mauvecl.schema import physical
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, says_none
+from mauvecl.schema.fields import Accepted, Flag, Help, Range, Slider, says_none
 from mauvecl.schema.section import Section, check_all, check_one, read_words, setting
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Observation(Section):
         label="Exposure",
         hint="Time on the star; whole frames of 5 s are added up.",
         slider=Slider(5, 3600, 5),
-        quantity=Quantity("exposure", "length of the exposure", "exposure (s)"),
+        quantity=("exposure", "length of the exposure", "exposure (s)"),
     )
     instrument: Annotated[str, AfterValidator(current_name)] = setting(
         DEFAULT_INSTRUMENT,
@@ -60,7 +60,7 @@ class Observation(Section):
         group="Detector",
         placeholder="21, or along the orbit in plans",
         slider=Slider(-10, 40, 1),
-        quantity=Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
+        quantity=("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
     )
     order: Literal["paper", "physical"] = setting("paper", "Order of efficiency and line spread function")
     signal: Literal["net", "paper"] = setting(
@@ -106,7 +106,7 @@ class SkyLight(Section):
         first=f"{DEFAULT_SKY:g}",
         unit="mag/arcsec²",
         slider=Slider(20, 24, 0.1),
-        quantity=Quantity("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
+        quantity=("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
     )
     target: str | None = setting(
         None,

@@ -13,7 +13,7 @@ from pydantic import model_validator
 from mauvecl.host.stars.library import ALIASES, listed_values
 from mauvecl.schema import physical
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit
+from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
 from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class Star(Section):
         None,
         "Library name or spectrum file; as in G2V,M3V",
         flag=Flag("--star", "-s", kind=list[str]),
-        quantity=Quantity("star", "library name or file, with its magnitude", "star"),
+        quantity=("star", "library name or file, with its magnitude", "star"),
     )
     file: Path | None = setting(None, "Spectrum file, instead of a name of the library")
     magnitude: physical.Magnitude | None = setting(
@@ -47,7 +47,7 @@ class Star(Section):
         first="8.5",
         unit="",
         slider=Slider(0, 15, 0.1),
-        quantity=Quantity("magnitude", "magnitude of the star in its band", "magnitude"),
+        quantity=("magnitude", "magnitude of the star in its band", "magnitude"),
     )
     band: str = setting(
         "V",
@@ -229,8 +229,10 @@ class FlareLight(Section):
         label="Balmer jump",
         hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
         "Nothing: a plain blackbody.",
-        quantity=Quantity(
-            "balmer_jump", "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio"
+        quantity=(
+            "balmer_jump",
+            "flux of the flare just below the Balmer edge over that just above",
+            "Balmer jump ratio",
         ),
     )
     electron_temperature_k: physical.Temperature = setting(10_000.0, "Electron temperature of the Balmer continuum")
@@ -240,9 +242,7 @@ class FlareLight(Section):
         flag="--second-temperature",
         label="Second temperature",
         hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
-        quantity=Quantity(
-            "second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"
-        ),
+        quantity=("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     )
     second_area: physical.AreaRatio | None = setting(
         None,
@@ -251,7 +251,7 @@ class FlareLight(Section):
         label="Second area",
         hint="Area at the second temperature over that at the first, if there is one.",
         first="0.05",
-        quantity=Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
+        quantity=("second_area", "area of the flare's second blackbody over that of the first", "second area"),
     )
     lines: dict[str, physical.LineFraction] = setting(
         dict,
@@ -266,7 +266,7 @@ class FlareLight(Section):
     line_scale: physical.LineScale = setting(
         1.0,
         "Factor on all line fluxes",
-        quantity=Quantity("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
+        quantity=("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
     )
     file: Path | None = setting(
         None,
@@ -403,9 +403,7 @@ class Flare(Section):
         first="2",
         unit="%",
         slider=Slider(0.01, 1000, 10**0.1, log=True),
-        quantity=Quantity(
-            "amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"
-        ),
+        quantity=("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),
     )
     temperature_k: physical.Temperature = setting(
         10_000.0,
@@ -415,7 +413,7 @@ class Flare(Section):
         group="Flare's spectrum",
         name="flare_temperature_k",
         slider=Slider(5000, 30_000, 500),
-        quantity=Quantity("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
+        quantity=("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
     )
     band: str = setting("Kepler", "Band of the amplitude", flag="--flare-band", choices=", ".join(ALIASES))
     geometry: Literal["added", "replaces"] = setting(
