@@ -1,4 +1,4 @@
-"""What is around the package: one version and date, licences of what is embedded, and the paper."""
+"""What is around the package: version and date, licences, the paper, and recipes that name what the package needs."""
 
 import re
 import tomllib
@@ -20,17 +20,23 @@ def text_of(path: str) -> str:
     return (ROOT / path).read_text(encoding="utf-8")
 
 
+def loaded(path: str) -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load(text_of(path))
+    return data
+
+
 #: Headings of the changelog, newest first.
 HEADINGS = re.findall(r"^## (.+)$", text_of("CHANGELOG.md"), re.MULTILINE)
-CITATION: dict[str, Any] = yaml.safe_load(text_of("CITATION.cff"))
-PROJECT: dict[str, Any] = tomllib.loads(text_of("pyproject.toml"))["project"]
+CITATION = loaded("CITATION.cff")
+PYPROJECT: dict[str, Any] = tomllib.loads(text_of("pyproject.toml"))
+PROJECT: dict[str, Any] = PYPROJECT["project"]
 
 
 def test_version_is_semantic_and_the_same_everywhere() -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+", __version__)
     assert CITATION["version"] == __version__
     assert run("--version", folder=Path()).stdout == f"mauvecl {__version__}\n"
-    assert yaml.safe_load(text_of("recipe/recipe.yaml"))["context"]["version"] == __version__
+    assert loaded("recipe/recipe.yaml")["context"]["version"] == __version__
 
 
 def test_changelog_begins_with_what_is_unreleased_and_this_version() -> None:
@@ -79,27 +85,20 @@ def test_all_data_have_a_licence() -> None:
 
 
 def test_references_of_the_paper_are_cited_and_identified() -> None:
-    paper = (ROOT / "paper" / "paper.md").read_text(encoding="utf-8")
-    entries = (ROOT / "paper" / "paper.bib").read_text(encoding="utf-8").split("\n@")[1:]
+    entries = text_of("paper/paper.bib").split("\n@")[1:]
     names = {re.match(r"\w+\{(\w+),", one)[1] for one in entries}  # type: ignore[index]
-    assert names == set(re.findall(r"@(\w+)", paper))
+    assert names == set(re.findall(r"@(\w+)", text_of("paper/paper.md")))
     assert all("doi = {" in one or "eprint = {" in one for one in entries)
 
 
 def test_paper_has_the_sections_and_the_length_that_the_journal_asks_for() -> None:
     """The form of 2026: https://joss.readthedocs.io/en/latest/paper.html."""
-    body = (ROOT / "paper" / "paper.md").read_text(encoding="utf-8").split("---", 2)[2]
+    body = text_of("paper/paper.md").split("---", 2)[2]
     assert 750 <= len(body.split()) <= 1750
     assert re.findall(r"^# (.+)$", body, re.MULTILINE) == [
-        "Summary",
-        "Statement of need",
-        "State of the field",
-        "Software design",
-        "Research impact statement",
-        "AI usage disclosure",
-        "Acknowledgements",
-        "References",
-    ]
+        "Summary", "Statement of need", "State of the field", "Software design", "Research impact statement",
+        "AI usage disclosure", "Acknowledgements", "References",
+    ]  # fmt: skip
 
 
 def test_page_lists_every_dependency_and_its_purpose() -> None:
@@ -107,3 +106,69 @@ def test_page_lists_every_dependency_and_its_purpose() -> None:
     assert [one.requirement.name for one in tool("audit_dependencies").dependencies()] == [
         name for name in listed if name != "package"
     ]
+
+
+#: Packages whose names on conda-forge differ from those on PyPI; these bring no more than what is imported.
+ON_CONDA = {"astropy": "astropy-base", "matplotlib": "matplotlib-base"}
+#: The driver, which on PyPI is an extra of pyopencl.
+DRIVER = "pocl"
+
+
+def bounds(requirements: list[str]) -> dict[str, str]:
+    """Return names with their lower bounds."""
+    found = [re.match(r"([\w-]+)(?:\[\w+\])?\s*(?:>=\s*([\d.]+))?", one) for one in requirements]
+    return {one[1]: one[2] or "" for one in found if one}
+
+
+def expected() -> dict[str, str]:
+    """Return what mauvecl and its pictures need, by names of conda-forge."""
+    needed = bounds([*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["plot"]])
+    return {ON_CONDA.get(name, name): bound for name, bound in needed.items()} | {DRIVER: ""}
+
+
+def test_recipe_needs_what_the_package_needs() -> None:
+    recipe = loaded("recipe/recipe.yaml")
+    run = [one for one in recipe["requirements"]["run"] if not one.startswith("python ")]
+    assert bounds(run) == expected()
+    backend = bounds(PYPROJECT["build-system"]["requires"])
+    assert backend.items() <= bounds(recipe["requirements"]["host"]).items()
+    scripts = [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]
+    assert recipe["build"]["python"]["entry_points"] == scripts
+    licences = {str(path.relative_to(ROOT)) for one in PROJECT["license-files"] for path in ROOT.glob(one)}
+    assert set(recipe["about"]["license_file"]) == licences
+
+
+def test_environment_needs_what_the_package_needs() -> None:
+    listed = [one for one in loaded("environment.yml")["dependencies"] if isinstance(one, str)]
+    versions = bounds(listed)
+    assert versions.pop("python") == PROJECT["requires-python"].removeprefix(">=")
+    assert versions.pop("pip") == ""
+    assert versions == expected()
+
+
+def test_container_ends_with_the_self_test() -> None:
+    lines = text_of("Dockerfile").splitlines()
+    assert lines[-2:] == ["RUN mauvecl selftest", 'ENTRYPOINT ["mauvecl"]']
+
+
+@pytest.mark.parametrize("job", ["pythons", "wheel"])
+def test_workflow_tests_every_python_that_is_declared(job: str) -> None:
+    declared = {one.rsplit(" ", 1)[1] for one in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", one)}
+    jobs = loaded(".github/workflows/ci.yml")["jobs"]
+    run = set(jobs[job]["strategy"]["matrix"]["python"])
+    assert run | {jobs["all"]["steps"][1]["with"]["python-version"]} == declared
+
+
+def test_workflow_runs_targets_that_exist() -> None:
+    targets = set(re.findall(r"^([\w-]+):", text_of("Makefile"), re.MULTILINE))
+    called = set(re.findall(r"run: (?:sudo )?make ([\w-]+)", text_of(".github/workflows/ci.yml")))
+    assert called >= {"quick", "lowest", "coverage", "dist", "try-wheel", "docs"}
+    assert called <= targets
+
+
+def test_workflow_pins_actions_by_commit() -> None:
+    """A tag can be moved to other code."""
+    jobs = loaded(".github/workflows/ci.yml")["jobs"].values()
+    used = [step["uses"] for job in jobs for step in job["steps"] if "uses" in step]
+    assert len(used) > 15
+    assert not [one for one in used if not re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", one)]

@@ -20,7 +20,7 @@ import mauvecl
 from mauvecl import InputError, bulk
 
 #: Modules below the validation, and the inner interface of statistics, whose methods public classes inherit.
-INNER = ("mauvecl.schema.columns", "mauvecl.schema.section", "mauvecl.detection.statistics")
+INNER = ("mauvecl.schema", "mauvecl.detection.statistics")
 #: Other units in which a parameter of each unit is given.
 EQUIVALENT = {"nm": ("um", "THz"), "K": ("kK", "deg_C"), "deg_C": ("K",), "s": ("min",), "mag": ("mmag",)}
 
@@ -38,7 +38,7 @@ def public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
                 found = inspect.getattr_static(thing, method)
                 found = found.__func__ if isinstance(found, classmethod | staticmethod) else found
                 inside = inspect.isfunction(found) and found.__module__.startswith("mauvecl")
-                if inside and not method.startswith("_") and found.__module__ not in INNER:
+                if inside and not method.startswith("_") and not found.__module__.startswith(INNER):
                     yield f"{name}.{method}", found
     for name, thing in vars(bulk).items():
         if inspect.isfunction(thing) and thing.__module__ == bulk.__name__ and not name.startswith("_"):

@@ -62,8 +62,8 @@ MUTATIONS: dict[str, Mutation] = {
     "pairs of values without their units": (
         "test_studies_are_built_from_the_same_keywords",
         (
-            '((part, with_unit(part, unit)) for part in text.split(":"))',
-            '((part, with_unit(part, "s")) for part in text.split(":"))',
+            '((part, fields.with_unit(part, unit)) for part in text.split(":"))',
+            '((part, fields.with_unit(part, "s")) for part in text.split(":"))',
         ),
     ),
     "unknowns fitted with the wrong sign": (

@@ -17,6 +17,7 @@ from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
+from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.columns import Column, interval_columns, number, percent, records
 from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
@@ -252,7 +253,8 @@ class PlanAnswer(Answer):
             if case.neighbours is not None:
                 lines += case.neighbours.messages(case.label, case.instrument)
         lines += self._messages_on_rates
-        if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
+        slow = any(getattr(study.stare, name) for name in (*COURSES, *STARE_PROCESSES))
+        if study.plan.completeness == "closed form" and (slow or study.nuisances.usual):
             text = (
                 "FALSE ALARMS may be more than stated: the closed form marginalises over what is unknown in each "
                 "frame, and takes slower changes for known; `plan.completeness='injections'` allows for them."

@@ -22,11 +22,12 @@ from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.section import given_keys
 from mauvecl.search.completeness import PER_DECADE, SMALL, Completeness, frame_signal, recovered_per_day
 from mauvecl.search.templates import frame_nuisances
 from mauvecl.study.cases import Case
 from mauvecl.study.observation import SkyLight
-from mauvecl.study.plan import PlanTarget
+from mauvecl.study.plan import RATES, PlanTarget
 from mauvecl.study.star import Star
 from mauvecl.study.stare import InjectionQuestion
 from mauvecl.study.stares import energy_scale
@@ -186,7 +187,7 @@ def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | 
     try:
         rates = text.distribution(observation.target.spectral_type or "")
     except InputError as error:
-        if text.given_rates:
+        if given_keys(text, RATES):
             raise
         return None, str(error)
     if rates.definition == "light":

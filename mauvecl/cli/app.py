@@ -22,19 +22,9 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from mauvecl.answers.verbs import COMMON, GROUPS, VERBS
+from mauvecl.cli import flags
 from mauvecl.cli.commands import COMMANDS, export, verify
 from mauvecl.cli.console import EXIT_CODES, Meter, guarded, show, show_view
-from mauvecl.cli.flags import (
-    SHOWS_ALL,
-    DeviceFlag,
-    JsonFlag,
-    QuietFlag,
-    ReplaceFlag,
-    option,
-    option_of,
-    output_option,
-    whole_number,
-)
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import View, records
 from mauvecl.schema.errors import InputError, missing_package, shortened
@@ -46,7 +36,7 @@ if TYPE_CHECKING:
 
 def devices(
     rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
-    as_json: JsonFlag = False,
+    as_json: flags.JsonFlag = False,
 ) -> None:
     """List the OpenCL devices that can run the kernels, and rates.
 
@@ -66,10 +56,10 @@ def devices(
 
 
 def selftest(
-    device: DeviceFlag = None,
-    output: Annotated[Path | None, output_option("nowhere")] = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
+    device: flags.DeviceFlag = None,
+    output: Annotated[Path | None, flags.output_option("nowhere")] = None,
+    as_json: flags.JsonFlag = False,
+    quiet: flags.QuietFlag = False,
 ) -> None:
     """Check that your device computes what it should.
 
@@ -123,7 +113,7 @@ library_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, ad
 
 
 @library_app.callback()
-def library(context: typer.Context, as_json: JsonFlag = False) -> None:
+def library(context: typer.Context, as_json: flags.JsonFlag = False) -> None:
     """List the embedded spectra and your own.
 
     `add`, `fetch` and `remove` change yours.
@@ -154,12 +144,12 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
 @library_app.command()
 def add(
     files: Annotated[list[Path], typer.Argument(help="Text, ECSV, VOTable or FITS; FILE[COLUMN] names a column.")],
-    name: Annotated[str | None, option(metavar="TEXT", text="Name of the star, for a single file.")] = None,
-    replace: ReplaceFlag = False,
-    wavelength_unit: Annotated[str | None, option_of("star.wavelength_unit")] = None,
-    flux_unit: Annotated[str | None, option_of("star.flux_unit")] = None,
-    extend: Annotated[str | None, option_of("star.extend")] = None,
-    quiet: QuietFlag = False,
+    name: Annotated[str | None, flags.option(metavar="TEXT", text="Name of the star, for a single file.")] = None,
+    replace: flags.ReplaceFlag = False,
+    wavelength_unit: Annotated[str | None, flags.option_of("star.wavelength_unit")] = None,
+    flux_unit: Annotated[str | None, flags.option_of("star.flux_unit")] = None,
+    extend: Annotated[str | None, flags.option_of("star.extend")] = None,
+    quiet: flags.QuietFlag = False,
 ) -> None:
     """Keep spectra of your own under a name, for --star.
 
@@ -179,10 +169,12 @@ def fetch(
     names: Annotated[
         list[str], typer.Argument(help="Stars, such as ngsl:HD 37202; in calspec, ngsl or lowlib, or in any of them.")
     ],
-    base: Annotated[str | None, option("--from", metavar="TEXT", text="Address of a mirror of the collection.")] = None,
-    replace: ReplaceFlag = False,
-    extend: Annotated[str | None, option_of("star.extend")] = None,
-    quiet: QuietFlag = False,
+    base: Annotated[
+        str | None, flags.option("--from", metavar="TEXT", text="Address of a mirror of the collection.")
+    ] = None,
+    replace: flags.ReplaceFlag = False,
+    extend: Annotated[str | None, flags.option_of("star.extend")] = None,
+    quiet: flags.QuietFlag = False,
 ) -> None:
     """Fetch stars of public collections of HST spectra and keep them.
 
@@ -196,7 +188,9 @@ def fetch(
 
 
 @library_app.command()
-def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.")], quiet: QuietFlag = False) -> None:
+def remove(
+    names: Annotated[list[str], typer.Argument(help="Names of kept stars.")], quiet: flags.QuietFlag = False
+) -> None:
     """Remove spectra of your own.
 
     Example: mauvecl library remove "HD 1234"
@@ -228,7 +222,7 @@ def serve(
     port: Annotated[str, typer.Option(metavar="INTEGER", help="Port to listen on.")] = "5006",
     allow_origin: Annotated[
         list[str] | None,
-        option(
+        flags.option(
             metavar="TEXT",
             text="Public address of the page, such as https://mauve.example.org; required if --address "
             "accepts other machines. May be repeated.",
@@ -241,7 +235,7 @@ def serve(
     Example: mauvecl serve --show
     """
 
-    number = whole_number(port, "--port", Range(1, 65535))
+    number = flags.whole_number(port, "--port", Range(1, 65535))
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve
@@ -265,7 +259,7 @@ class CommandWithHelp(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, and the flags under their headings."""
-        shows_all = ctx.meta.get(SHOWS_ALL, False)
+        shows_all = ctx.meta.get(flags.SHOWS_ALL, False)
         shown = self.common | {"help", "help_all"}
         groups: dict[str, list[tuple[str, str]]] = {}
         for one in self.get_params(ctx):

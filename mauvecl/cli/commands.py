@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,28 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from mauvecl.answers.verbs import DRAWS, FEWER, VERBS, Verb
+from mauvecl.cli import flags
 from mauvecl.cli.console import Meter, show, show_view
-from mauvecl.cli.flags import (
-    HELP_ALL,
-    PLACES,
-    RESUMING,
-    WORKERS,
-    DeviceFlag,
-    JsonFlag,
-    Options,
-    PaperFlag,
-    QuietFlag,
-    ReplaceFlag,
-    SetFlag,
-    is_star,
-    numbers_of,
-    option,
-    output_option,
-    study_argument,
-    study_option,
-    warn_of_percent,
-    whole_number,
-)
 from mauvecl.schema.columns import Column, View
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
@@ -69,15 +50,21 @@ class Command:
         keywords = {keyword.name: keyword for keyword in keys_of(verb.keys)}
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
         _, *own = inspect.signature(self.run).parameters.values()
+        other = next((f", or {what}" for flag, (what, *_) in flags.PLACES.items() if flag in keywords and what), "")
+        argument = typer.Argument(
+            help=f"Study (TOML), the ECSV table of an answer{other}; flags override it.",
+            show_default=False,
+            autocompletion=flags.complete_study,
+        )
         # Annotations and defaults by parameter.
         options: dict[str, tuple[Any, Any]] = {
-            "study_file": (study_argument(keywords), None),
-            **{name: (study_option(keyword, verb.defaults or {}), None) for name, keyword in keywords.items()},
-            "setting": (SetFlag, None),
-            **({"paper": (PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
+            "study_file": (Annotated[Path | None, argument], None),
+            **{name: (flags.study_option(keyword, verb.defaults or {}), None) for name, keyword in keywords.items()},
+            "setting": (flags.SetFlag, None),
+            **({"paper": (flags.PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
             **{p.name: (kinds[p.name], p.default) for p in own if p.name != "given"},
             **self._options(),
-            "help_all": (Annotated[bool, HELP_ALL], False),
+            "help_all": (Annotated[bool, flags.HELP_ALL], False),
         }
 
         def command(study_file: Path | None = None, **values: Any) -> None:
@@ -98,10 +85,20 @@ class Command:
         from mauvecl.cli.invocation import Session, question_time, question_values
         from mauvecl.study.study import Study
 
-        given = {name: numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
-        warn_of_percent(given.get("amplitude") or ())
+        given = {name: flags.numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
+        for value in given.get("amplitude") or ():
+            if not isinstance(value, str) and value >= 1:
+                rise = f"--amplitude {value} is a rise of {100 * value:g} %"
+                warnings.warn(f"{rise}; --amplitude {value}% is one of {value} %", stacklevel=2)
         given |= {name: values.pop(name, None) for name in ("setting", "paper")}
-        study_file = _placed(study_file, given)
+        for key, (_, plural, applies) in flags.PLACES.items():
+            # A file that is no study is for the flag that takes such files.
+            if study_file is not None and key in given and applies(study_file):
+                if given[key]:
+                    fault = f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given"
+                    raise InputError(fault, key=key)
+                given[key] = [str(study_file)] if applies is flags.is_star else study_file
+                study_file = None
         how = {name: values.pop(name, usual) for name, (_, usual) in self._options().items()}
         if "given" in inspect.signature(self.run).parameters:
             values["given"] = given
@@ -115,12 +112,12 @@ class Command:
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
         """Return the options of the session, with their defaults."""
-        output = output_option(self.writes or f"the folder mauvecl-{self.verb.name}")
-        workers = WORKERS if self.draws else RESUMING if self.resumes else ()
+        output = flags.output_option(self.writes or f"the folder mauvecl-{self.verb.name}")
+        workers = flags.WORKERS if self.draws else flags.RESUMING if self.resumes else ()
         names = ("as_json", "quiet", "wide", *(["pictures"] if self.pictures else []), *workers)
-        kinds = get_type_hints(Options, include_extras=True)
+        kinds = get_type_hints(flags.Options, include_extras=True)
         return {"output": (Annotated[Path | None, output], None)} | {
-            name: (kinds[name], getattr(Options, name)) for name in names
+            name: (kinds[name], getattr(flags.Options, name)) for name in names
         }
 
 
@@ -140,22 +137,9 @@ def command_of(
     return decorate
 
 
-def _placed(study_file: Path | None, given: dict[str, Any]) -> Path | None:
-    """Give a file that is no study to the flag that takes such files, and return None in its place."""
-    if study_file is None:
-        return None
-    for key, (_, plural, applies) in PLACES.items():
-        if key in given and applies(study_file):
-            if given[key]:
-                raise InputError(
-                    f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given", key=key
-                )
-            given[key] = [str(study_file)] if applies is is_star else study_file
-            return None
-    return study_file
-
-
-RowsFlag = Annotated[str | None, option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")]
+RowsFlag = Annotated[
+    str | None, flags.option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")
+]
 
 
 @command_of(
@@ -242,9 +226,9 @@ def verify(
         bool, typer.Option("--redraw", help="Redraw and compare every spectrum, not only the digests.")
     ] = False,
     rows: RowsFlag = None,
-    device: DeviceFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
+    device: flags.DeviceFlag = None,
+    as_json: flags.JsonFlag = False,
+    quiet: flags.QuietFlag = False,
 ) -> None:
     """Check that a store or an answer's folder is as it was written.
 
@@ -278,32 +262,26 @@ def verify(
         columns, left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
         source = "with what was written" if not redraw else "with what the engine draws"
         outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
-    _show_faults(f"Not as it was written: {store}", faults, columns, outcome, as_json=as_json)
+    found = [asdict(fault) for fault in faults]
+    if as_json:
+        print(json.dumps(found, indent=2))
+    else:
+        if found:
+            show_view(View(f"Not as it was written: {store}", columns, found))
+        show([outcome] if outcome else [])
     if left:
         raise typer.Exit(1)
-
-
-def _show_faults(title: str, faults: Sequence[Any], columns: Sequence[Column], outcome: str, *, as_json: bool) -> None:
-    """Print faults as JSON, or as a table with what came of them."""
-    rows = [asdict(fault) for fault in faults]
-    if as_json:
-        print(json.dumps(rows, indent=2))
-        return
-    if faults:
-        show_view(View(title, columns, rows))
-    if outcome:
-        show([outcome])
 
 
 def export(
     store: Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")],
     file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
     array: Annotated[
-        list[str] | None, option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all].")
+        list[str] | None, flags.option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all].")
     ] = None,
     rows: RowsFlag = None,
-    replace: ReplaceFlag = False,
-    quiet: QuietFlag = False,
+    replace: flags.ReplaceFlag = False,
+    quiet: flags.QuietFlag = False,
 ) -> None:
     """Write a part of a store as one FITS or HDF5 file.
 
@@ -352,7 +330,7 @@ def simulate(
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
 
-    number = whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
+    number = flags.whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
     session.answer(compute(session.study, realisation=number, flaring=bool(given["amplitude"])))
 
 
@@ -369,7 +347,7 @@ def plan(session: Session) -> None:
 
 
 @command_of(VERBS["stare"], draws=False, resumes=True)
-def stare(session: Session, given: dict[str, Any], device: DeviceFlag = None) -> None:
+def stare(session: Session, given: dict[str, Any], device: flags.DeviceFlag = None) -> None:
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares

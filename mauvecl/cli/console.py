@@ -208,6 +208,8 @@ PATIENCE_S = 2.0
 WIDEST = 100_000
 #: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
 TOLD_FROM = 0.01
+#: Units of the remaining time, s; smaller times than three of them are in the next one.
+UNITS = (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0))
 #: Clears the line of a terminal.
 CLEARED = "\r\x1b[K"
 
@@ -260,16 +262,13 @@ class Meter:
         # Parts from a checkpoint took no time.
         resumed = standing.resumed if standing is not None and self._unit == "realisations" else 0
         rate = (done - resumed) / max(time.monotonic() - self._started, 1e-9)
-        left = _time_left((total - done) / rate) if done - resumed >= TOLD_FROM * total else "time left unknown"
+        left = "time left unknown"
+        if done - resumed >= TOLD_FROM * total:
+            seconds = (total - done) / rate
+            unit, size = next((row for row in UNITS if seconds > 3 * row[1]), ("s", 1.0))
+            left = f"{seconds / size:.0f} {unit} left"
         again = f", {standing.retries} parts counted again" if standing is not None and standing.retries else ""
         return f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{again}"
-
-
-def _time_left(seconds: float) -> str:
-    for unit, size in (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0)):
-        if seconds > 3 * size:
-            return f"{seconds / size:.0f} {unit} left"
-    return f"{seconds:.0f} s left"
 
 
 def _console(**how: Any) -> Console:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from glob import escape, glob
 from pathlib import Path
@@ -17,17 +16,6 @@ from mauvecl.schema.fields import Help, Range, Unit, as_typed, first, whole
 
 if TYPE_CHECKING:
     from mauvecl.study.keywords import Keyword
-
-
-def study_argument(flags: Collection[str]) -> Any:
-    """Return the annotation of the argument that is a study, or in its place what a flag takes."""
-    other = next((f", or {what}" for flag, (what, *_) in PLACES.items() if flag in flags and what), "")
-    argument = typer.Argument(
-        help=f"Study (TOML), the ECSV table of an answer{other}; flags override it.",
-        show_default=False,
-        autocompletion=lambda incomplete: complete_star(incomplete) if incomplete else _files(incomplete),
-    )
-    return Annotated[Path | None, argument]
 
 
 def option(*names: str, text: str, **how: Any) -> Any:
@@ -160,6 +148,7 @@ def _words(annotation: Any) -> str:
 def is_star(given: Path) -> bool:
     """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
     from mauvecl.host.stars.library import resolve
+    from mauvecl.host.tables.files import as_text, read_bytes, toml
     from mauvecl.study.keywords import is_there
 
     text = str(given)
@@ -171,19 +160,15 @@ def is_star(given: Path) -> bool:
         return bool(first) and resolve(first) is not None
     if given.suffix.lower() == ".ecsv":
         return not holds_study(given)
-    return not given.is_file() or not _is_toml(given)
-
-
-def _is_toml(file: Path) -> bool:
-    """Return whether a file contains TOML, that is a study, regardless of its name."""
-    from mauvecl.host.tables.files import as_text, read_bytes, toml
-
+    if not given.is_file():
+        return True
     try:
-        toml(as_text(read_bytes(file, "file")[:1_000_000], "file"), "file")
+        # TOML is a study, whatever the name of its file.
+        toml(as_text(read_bytes(given, "file")[:1_000_000], "file"), "file")
     except InputError as error:
         # A key that has a value which no study may have is for the study to report.
-        return error.key not in ("file", None)
-    return True
+        return error.key in ("file", None)
+    return False
 
 
 def holds_study(file: Path) -> bool:
@@ -217,16 +202,6 @@ def numbers_of(keyword: Keyword, given: Any) -> Any:
     return [number_or_text(word.strip()) for text in given for word in text.split(",")]
 
 
-def warn_of_percent(amplitudes: Iterable[float | str]) -> None:
-    """Warn of amplitudes that look like a percentage without its sign."""
-    for value in amplitudes:
-        if not isinstance(value, str) and value >= 1:
-            warnings.warn(
-                f"--amplitude {value} is a rise of {100 * value:g} %; --amplitude {value}% is one of {value} %",
-                stacklevel=2,
-            )
-
-
 def whole_number(text: str, flag: str, reach: Range) -> int:
     """Read a whole number of a range."""
     from mauvecl.schema.section import number_or_text, refusal
@@ -249,6 +224,11 @@ def complete_star(incomplete: str) -> list[str]:
     names = [name.replace(" ", "") for name in all_names() if name not in EXAMPLES]
     names += [star.name for star in kept() if " " not in star.name]
     return [f"{before}{comma}{word}" for word in (*_continued(last, names), *_files(last))]
+
+
+def complete_study(incomplete: str) -> list[str]:
+    """Return files, and once something is typed names of stars, which may stand in place of a study."""
+    return complete_star(incomplete) if incomplete else _files(incomplete)
 
 
 def complete_instrument(incomplete: str) -> list[str]:

@@ -223,25 +223,23 @@ class Session(Options):
         """Print an answer and write its files."""
         with report_interrupts(self._written):
             self._leave_all(answer)
+        # A note on sampled thresholds is left out where the answer has its own.
+        told = of_kind(self.notes, "sampled") if of_kind(answer.messages, "sampled") else []
+        notes = [note for note in self.notes if note not in told]
         if self.as_json:
             content = answer.as_json()
-            said = [with_flags(line) for line in (*self._notes_on(answer), *content.pop("messages"))]
+            said = [with_flags(line) for line in (*notes, *content.pop("messages"))]
             self.print_json({"headline": answer.headline, "assumed": answer.assumed, "messages": said} | content)
             return
         self.say([answer.headline])
         left_out = [show_view(view, wide=self.wide) for view in answer.all_views]
         self.say(["Assumed:", *(f"  {clause}" for clause in answer.premises)])
-        self.say([*self._notes_on(answer), *answer.messages, *answer.remarks])
+        self.say([*notes, *answer.messages, *answer.remarks])
         if any(left_out):
             self.say(["Tables are shown without details: `--wide` shows all columns, and the files hold them."])
         if self.files and not self.quiet:
             names = ", ".join(path.name for path in self.files)
             self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
-
-    def _notes_on(self, answer: Answer) -> list[str]:
-        """Return the notes of the session, without that on sampled thresholds where the answer has its own."""
-        told = of_kind(self.notes, "sampled") if of_kind(answer.messages, "sampled") else []
-        return [note for note in self.notes if note not in told]
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""

@@ -12,7 +12,7 @@ import os
 import sys
 from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import cache, cached_property, partial, wraps
+from functools import cached_property, partial, wraps
 from itertools import chain, repeat
 from pathlib import Path
 from pkgutil import resolve_name
@@ -28,12 +28,6 @@ from mauvecl.schema.fields import is_quantity, is_truth, or_error, whole, withou
 ALTERNATIVE = "|"
 #: Annotations of containers whose items are validated one by one; functions receive a tuple.
 SEQUENCES = (tuple, Sequence, Collection, Iterable)
-
-
-@cache
-def validator(hint: Any) -> SchemaValidator:
-    """Return the validator of an annotation."""
-    return SchemaValidator(schema_of(hint))
 
 
 def schema_of(hint: Any) -> CoreSchema:
@@ -66,7 +60,11 @@ def schema_of(hint: Any) -> CoreSchema:
     if origin in (Any, object):
         return core_schema.any_schema()
     if inspect.isclass(origin):
-        return _instance(origin)
+        if getattr(origin, "_is_protocol", False):
+            # Methods of a protocol are checked when they are called.
+            return core_schema.any_schema()
+        article = "an" if origin.__name__[0] in "AEIOU" else "a"
+        return or_error(core_schema.is_instance_schema(origin), f"{article} {origin.__name__}")
     raise TypeError(f"arguments of the type {hint} cannot be validated")
 
 
@@ -133,14 +131,6 @@ def _sequence(origin: Any, args: tuple[Any, ...]) -> CoreSchema:
         return core_schema.no_info_before_validator_function(partial(_items, size=len(items)), schema)
     some = core_schema.list_schema(items[0]) if origin is list else core_schema.tuple_variable_schema(items[0])
     return core_schema.no_info_before_validator_function(_items, some)
-
-
-def _instance(kind: type) -> CoreSchema:
-    if getattr(kind, "_is_protocol", False):
-        # Methods of a protocol are checked when they are called.
-        return core_schema.any_schema()
-    article = "an" if kind.__name__[0] in "AEIOU" else "a"
-    return or_error(core_schema.is_instance_schema(kind), f"{article} {kind.__name__}")
 
 
 def _origin(hint: Any) -> Any:
@@ -218,7 +208,7 @@ class _Parameter:
     @cached_property
     def validate(self) -> Callable[[Any], Any]:
         """Validate a value."""
-        return validator(self.annotation()).validate_python
+        return SchemaValidator(schema_of(self.annotation())).validate_python
 
     def __call__(self, value: Any) -> Any:
         if value is self.default or self.text is inspect.Parameter.empty:

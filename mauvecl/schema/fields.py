@@ -4,9 +4,9 @@ Flags, the page and the reference are generated from metadata. Plain numbers are
 ones are reported immediately.
 
 `Annotated[float, Unit("s"), Range(0, 60)]` means the same in a section of a study, which pydantic validates, and in the
-signature of a validated function. A field of a section states everything about its key in one place:
+signature of a validated function. A field of a section states everything about its key in one place, with `setting`:
 
-    exposure_s: Annotated[Exposure, Help("Exposure time"), Flag("--exposure", "-t")] = 50.0
+    exposure_s: Exposure = setting(50.0, "Exposure time", flag="--exposure -t")
 """
 
 from __future__ import annotations
@@ -357,20 +357,6 @@ class Quantity:
     path: tuple[str, ...] = ()  # sections and key of the study
     unit: str = ""  # in astropy's notation; empty if dimensionless
     range: Range | None = None  # None for names instead of numbers
-
-    @property
-    def is_name(self) -> bool:
-        """True if it has names instead of numbers."""
-        return self.range is None
-
-    @property
-    def accepted(self) -> str:
-        """The values in words."""
-        return (self.range or Range()).words(self.unit)
-
-    def checked(self, value: Any) -> float | str:
-        """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
-        return value if self.range is None else number(self.name.replace("_", " "), value, self.unit, self.range)
 
     @property
     def suffix(self) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Field,
     ValidationError,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
@@ -22,8 +23,8 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
+from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown, together
-from mauvecl.schema.fields import Unit, first, is_quantity, is_truth, says_none, with_unit, without_unit, word_of
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -73,7 +74,7 @@ def holds_truth(given: Any) -> bool:
     """Return whether a value is true or false, or a list that has one; nested records check their own."""
     if isinstance(given, list | tuple):
         return any(map(holds_truth, given))
-    return is_truth(given)
+    return fields.is_truth(given)
 
 
 def _takes_truth(annotation: Any) -> bool:
@@ -114,9 +115,9 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
     value, message = first.get("input"), first["msg"]
     match first["type"]:
         case "extra_forbidden":
-            fields = list(_fields(model, path[:-1]))
-            near = difflib.get_close_matches(path[-1], fields, n=1)
-            remedy = f", did you mean {near[0]!r}?" if near else f": use one of {', '.join(fields)}"
+            known = list(_fields(model, path[:-1]))
+            near = difflib.get_close_matches(path[-1], known, n=1)
+            remedy = f", did you mean {near[0]!r}?" if near else f": use one of {', '.join(known)}"
             return InputError(f"unknown key {shortened(key)}{remedy}", key=key)
         case "missing":
             return InputError(f"{key!r} is missing, but needs a value", key=key)
@@ -125,7 +126,7 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
         case "too_long" | "too_short":
             expected = message.partition("should have ")[2].partition(" after")[0]
         case "truth":
-            expected = "a number or text" if is_truth(value) else "free of true and false"
+            expected = "a number or text" if fields.is_truth(value) else "free of true and false"
         case "path_type":
             expected = "a path"
         case _:
@@ -174,12 +175,12 @@ def plain(key: str, given: Any, unit: str) -> Any:
         given = given.astimezone(datetime.UTC).replace(tzinfo=None)
     if isinstance(given, datetime.date):
         return given.isoformat()
-    if is_quantity(given):
+    if fields.is_quantity(given):
         try:
-            given = without_unit(given, unit)
+            given = fields.without_unit(given, unit)
         except ValueError:
-            raise InputError.of(key, given, word_of(unit)) from None
-    if isinstance(given, list | tuple) and any(map(is_quantity, given)):
+            raise InputError.of(key, given, fields.word_of(unit)) from None
+    if isinstance(given, list | tuple) and any(map(fields.is_quantity, given)):
         return [plain(key, item, unit) for item in given]
     if hasattr(given, "tolist"):
         return given.tolist()
@@ -229,8 +230,39 @@ class Section(Record):
 
 
 @cache
-def _unit_of(section: type[Section], key: str) -> Unit | None:
-    return first(section.model_fields[key], Unit)
+def _unit_of(section: type[Section], key: str) -> fields.Unit | None:
+    return fields.first(section.model_fields[key], fields.Unit)
+
+
+def setting(
+    default: Any,
+    text: str | fields.Help,
+    *,
+    flag: str | fields.Flag | tuple[fields.Flag, ...] = (),
+    usual: str = "",
+    choices: str | tuple[str, ...] = "",
+    quantity: tuple[str, str, str] | None = None,
+    min_length: int | None = None,
+    **page: Any,
+) -> Any:
+    """Return the field of a key with its default (``dict`` for an empty table), and what is stated besides its type.
+
+    `text` is that of `Help`, with its explanation after a semicolon; `usual` and `choices` are its words for the
+    default and for the accepted values. `flag` holds the names of a flag with blanks between them, or flags that
+    convert values, `quantity` name, description and label of a `Quantity`, and `page` the values of a `Widget`; its
+    choices are `options`, or those of a tuple of `choices`.
+    """
+    flags = flag if isinstance(flag, tuple) else (fields.Flag(*flag.split()) if isinstance(flag, str) else flag,)
+    if isinstance(text, str):
+        text, _, more = text.partition("; ")
+        text = fields.Help(text, more, usual, choices if isinstance(choices, str) else ", ".join(choices))
+    if page:
+        page["choices"] = page.pop("options", () if isinstance(choices, str) else choices)
+    field: FieldInfo = Field(default_factory=dict) if default is dict else Field(default=default, min_length=min_length)
+    field.metadata += [text, *flags]
+    field.metadata += [fields.Widget(**page)] if page else []
+    field.metadata += [fields.Quantity(*quantity)] if quantity else []
+    return field
 
 
 def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], FieldInfo]]:
@@ -343,7 +375,7 @@ def read_ranges(texts: Sequence[str], name: str, *, expected: str, unit: str) ->
 
 def read_declinations(text: str, name: str) -> tuple[float, float] | str:
     """Read a range of declinations such as -46.4:31.8, or none."""
-    if says_none(text):
+    if fields.says_none(text):
         return "none"
     return _pair(text, name, "low:high in degrees, or none", "deg")
 
@@ -351,7 +383,7 @@ def read_declinations(text: str, name: str) -> tuple[float, float] | str:
 def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]:
     """Read two numbers, each of which may have a unit of its own."""
     try:
-        measures = ((part, with_unit(part, unit)) for part in text.split(":"))
+        measures = ((part, fields.with_unit(part, unit)) for part in text.split(":"))
         low, high = (float(part) if value is None else value for part, value in measures)
     except ValueError as error:
         raise refusal(name, text, expected) from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -48,7 +48,7 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
     words: dict[str, Callable[[], str]] = {
         "instrument": lambda: _instrument(study, swept, along_orbit="orbit" in uses and study.plan.along_orbit),
-        "sky": lambda: _sky(study, swept),
+        "sky": lambda: "sky as swept" if "sky" in swept else study.sky.describe(),
         "flare": lambda: _flare(study, swept),
         "orbit": lambda: _orbit(study),
         "unknowns": lambda: _unknowns(study, uses),
@@ -74,17 +74,6 @@ def _instrument(study: Study, swept: set[str], *, along_orbit: bool) -> str:
     if along_orbit and o.temperature_c is None:
         return f"{text}, detector temperature along the orbit"
     return f"{text}, detector at {study.observation.load_instrument().temperature_c:g} deg C"
-
-
-def _sky(study: Study, swept: set[str]) -> str:
-    sky = study.sky
-    if "sky" in swept:
-        return "sky as swept"
-    if sky.none:
-        return "no sky"
-    if sky.target is not None:
-        return f"sky at {sky.target}, {sky.time} UTC"
-    return f"sky of V = {sky.surface_brightness:g} mag/arcsec2"
 
 
 def _flare(study: Study, swept: set[str]) -> str:
@@ -194,12 +183,8 @@ class Loader:
     def __init__(self, source: Callable[[Star], Source] | None = None) -> None:
         self.source: Callable[[Star], Source] = lru_cache(MAX_SOURCES)(source or (lambda star: star.source()))
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
-        self._near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
+        self.near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
         self._instruments: dict[str, Instrument] = {}
-
-    def neighbours(self, star: Star) -> Neighbours | None:
-        """Return the neighbours of a star, which do not depend on its magnitude."""
-        return None if star.neighbours is None else self._near(star.model_copy(update={"magnitude": None}))
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
@@ -256,7 +241,8 @@ class Case:
     @property
     def neighbours(self) -> Neighbours | None:
         """Neighbours of the star, or None."""
-        return self.loader.neighbours(self.star)
+        # They do not depend on the star's magnitude.
+        return self.loader.near(self.star.model_copy(update={"magnitude": None}))
 
     @property
     def instrument(self) -> Instrument:
@@ -464,13 +450,28 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
     All answers report the saturation of stars and flares through this function.
     """
     saturated = {star for x in expectations if x.saturated.any() for star, flaring in [_star_of(x)] if not flaring}
-    texts: list[str] = []
+    outside = off_centre(expectations, processes) if processes else []
+    messages: list[str] = [Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside]
     for x in expectations:
         star, flaring = _star_of(x)
+        pixels, electrons = x.wavelength_nm.size, float(np.sum(x.source_electrons)) * x.n_frames
+        if electrons < 1.0:
+            text = (
+                f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {pixels} pixels of an exposure of "
+                f"{x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0."
+            )
+            messages.append(Message(text, "no light"))
         # A flare saturates the pixels that its star saturates without it, which is one fact.
-        texts += _messages_of(x, saturation=not (flaring and star in saturated))
-    outside = off_centre(expectations, processes) if processes else []
-    return worst_first([*(Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside), *texts])
+        known = of_kind(x.messages, SATURATED) if flaring and star in saturated else []
+        messages += [message for message in x.messages if message not in known]
+        quiet = float(np.min(x.read_noise_dn)) < NOISY_DN
+        if quiet and (coarse := int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))):
+            text = (
+                f"In {coarse} of {pixels} pixels of {x.name} a frame has too little noise for its rounding to whole DN "
+                "to be like noise: closed forms treat it as noise and are wrong there; simulations round each frame."
+            )
+            messages.append(Message(text, "rounding"))
+    return worst_first(messages)
 
 
 def _star_of(x: Expectation) -> tuple[tuple[object, ...], bool]:
@@ -495,27 +496,6 @@ def off_centre(expectations: list[Expectation], processes: Processes) -> list[st
                 "thresholds hold that difference"
             )
     return sentences
-
-
-def _messages_of(x: Expectation, *, saturation: bool) -> Iterator[str]:
-    """Yield the messages of an expectation, with or without saturation, and on light or noise that is too small."""
-    pixels, electrons = x.wavelength_nm.size, float(np.sum(x.source_electrons)) * x.n_frames
-    if electrons < 1.0:
-        yield Message(
-            f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {pixels} pixels of an exposure of "
-            f"{x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
-            "no light",
-        )
-    without = [] if saturation else of_kind(x.messages, SATURATED)
-    yield from (message for message in x.messages if message not in without)
-    quiet = float(np.min(x.read_noise_dn)) < NOISY_DN
-    coarse = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x))) if quiet else 0
-    if coarse:
-        yield Message(
-            f"In {coarse} of {pixels} pixels of {x.name} a frame has too little noise for its rounding to whole DN to "
-            "be like noise: closed forms treat it as noise and are wrong there; simulations round each frame.",
-            "rounding",
-        )
 
 
 def worst_first(messages: Iterable[str]) -> list[str]:

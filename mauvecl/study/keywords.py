@@ -113,32 +113,26 @@ def changes_of(
 ) -> dict[str, dict[str, Any]]:
     """Return the values that keywords set, by sections of the study; stars have their own function."""
     changes: dict[str, dict[str, Any]] = {}
-    named: dict[str, str] = {}
+    flags: dict[str, str] = {}
     for name, keyword in keywords.items():
         if given[name] is None or keyword.section == "star" or name == "nuisance":
             continue
-        other = named.setdefault(keyword.path, name)
+        other = flags.setdefault(keyword.path, name)
         if other != name:
             raise InputError(f"give either `{other}` or `{name}`: both set {keyword.path}", key=other)
         changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(given[name])
-    if given.get("nuisance"):
-        changes.setdefault("nuisances", {}).update(nuisances_of(nuisances, given["nuisance"]))
+    if spreads := given.get("nuisance"):
+        # Texts such as dark=0.1, or with the name of a file, stray.txt=free.
+        expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
+        if not isinstance(spreads, Mapping):
+            spreads = dict(read_assignment(text, "nuisance", expected) for text in spreads)
+        files = {
+            Path(name).stem: {"file": Path(name), "sd": sd} for name, sd in spreads.items() if name not in NUISANCES
+        }
+        own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()} | files
+        named = {name: sd for name, sd in spreads.items() if name in NUISANCES}
+        changes.setdefault("nuisances", {}).update(named | ({"own": own} if own else {}))
     return changes
-
-
-def nuisances_of(nuisances: NuisanceChoice, given: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
-    """Return nuisance parameters, read from texts such as dark=0.1, or with the name of a file, stray.txt=free."""
-    changed: dict[str, Any] = {}
-    own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()}
-    expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
-    if not isinstance(given, Mapping):
-        given = dict(read_assignment(text, "nuisance", expected) for text in given)
-    for name, sd in given.items():
-        if name in NUISANCES:
-            changed[name] = sd
-        else:
-            own[Path(name).stem] = {"file": Path(name), "sd": sd}
-    return changed | ({"own": own} if own else {})
 
 
 def stars_of(

@@ -7,27 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, create_model, field_validator, model_validator
+from pydantic import AfterValidator, create_model, model_validator
 
 from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
+from mauvecl.schema import physical
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Widget, says_none
-from mauvecl.schema.physical import (
-    DEFAULT_SEED,
-    DetectorTemperature,
-    Exposure,
-    Positive,
-    Probability,
-    Realisations,
-    Seed,
-    SkyBrightness,
-    Temperature,
-)
-from mauvecl.schema.section import Section, check_all, check_one, read_words
+from mauvecl.schema.fields import Accepted, Flag, Help, Range, Slider, says_none
+from mauvecl.schema.section import Section, check_all, check_one, read_words, setting
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,62 +32,53 @@ if TYPE_CHECKING:
 class Observation(Section):
     """Instrument, exposure, and how the detector is modelled."""
 
-    exposure_s: Annotated[
-        Exposure,
-        Help("Exposure time", "rounded up to whole frames of 5 s"),
-        Flag("--exposure", "-t"),
-        Widget("Exposure", "Time on the star; whole frames of 5 s are added up.", slider=Slider(5, 3600, 5)),
-        Quantity("exposure", "length of the exposure", "exposure (s)"),
-    ] = 50.0
-    instrument: Annotated[
-        str,
-        Help(
-            "Instrument", choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file"
-        ),
-        Flag("--instrument"),
-        Widget(
-            "Payload",
-            "mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
-            "MauveSim paper, which makes the dark noise 1.3 times as large.",
-            choices=("mauve", "mauvesim"),
-        ),
-    ] = DEFAULT_INSTRUMENT
-    temperature_c: Annotated[
-        DetectorTemperature | None,
-        Help("Detector temperature", default="the instrument's"),
-        Flag("--temperature"),
-        Widget(
-            hint="The dark current doubles every few degrees.",
-            group="Detector",
-            placeholder="21, or along the orbit in plans",
-            slider=Slider(-10, 40, 1),
-        ),
-        Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
-    ] = None
-    order: Annotated[Literal["paper", "physical"], Help("Order of efficiency and line spread function")] = "paper"
-    signal: Annotated[
-        Literal["net", "paper"],
-        Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
-        Flag("--signal"),
-        Widget(
-            "Counted as signal",
-            "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
-            "moves no detection.",
-            group="Sky",
-            place=2,
-        ),
-    ] = "net"
-    mode: Annotated[Literal["auto", "frames", "stacked"], Help("How the frames of an exposure are drawn")] = "auto"
-    recipe: Annotated[Literal["auto", "joint", "apart"], Help("How the noise of a frame is drawn")] = "auto"
-    changes: Annotated[
-        dict[str, Annotated[float | int | str, Accepted("a number or text")]],
-        Help("Changed values of the instrument, by name"),
-    ] = Field(default_factory=dict)
-
-    @field_validator("instrument")
-    @classmethod
-    def _current_name(cls, given: str) -> str:
-        return current_name(given)
+    exposure_s: physical.Exposure = setting(
+        50.0,
+        "Exposure time; rounded up to whole frames of 5 s",
+        flag="--exposure -t",
+        label="Exposure",
+        hint="Time on the star; whole frames of 5 s are added up.",
+        slider=Slider(5, 3600, 5),
+        quantity=("exposure", "length of the exposure", "exposure (s)"),
+    )
+    instrument: Annotated[str, AfterValidator(current_name)] = setting(
+        DEFAULT_INSTRUMENT,
+        "Instrument",
+        flag="--instrument",
+        choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file",
+        label="Payload",
+        hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
+        "MauveSim paper, which makes the dark noise 1.3 times as large.",
+        options=("mauve", "mauvesim"),
+    )
+    temperature_c: physical.DetectorTemperature | None = setting(
+        None,
+        "Detector temperature",
+        flag="--temperature",
+        usual="the instrument's",
+        hint="The dark current doubles every few degrees.",
+        group="Detector",
+        placeholder="21, or along the orbit in plans",
+        slider=Slider(-10, 40, 1),
+        quantity=("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
+    )
+    order: Literal["paper", "physical"] = setting("paper", "Order of efficiency and line spread function")
+    signal: Literal["net", "paper"] = setting(
+        "net",
+        "Signal of an S/N",
+        flag="--signal",
+        choices="net (the star alone) or paper (with the zodiacal light)",
+        label="Counted as signal",
+        hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
+        "moves no detection.",
+        group="Sky",
+        place=2,
+    )
+    mode: Literal["auto", "frames", "stacked"] = setting("auto", "How the frames of an exposure are drawn")
+    recipe: Literal["auto", "joint", "apart"] = setting("auto", "How the noise of a frame is drawn")
+    changes: dict[str, Annotated[float | int | str, Accepted("a number or text")]] = setting(
+        dict, "Changed values of the instrument, by name"
+    )
 
     def load_instrument(self) -> Instrument:
         """Load the instrument and apply `changes` and the detector temperature."""
@@ -114,33 +95,34 @@ class Observation(Section):
 class SkyLight(Section):
     """Sky background: a surface brightness, that of a target at a time, or none."""
 
-    surface_brightness: Annotated[
-        SkyBrightness | None,
-        Help("Surface brightness of the sky in V", "or none", default=f"{DEFAULT_SKY:g}"),
-        Flag("--sky", kind=str),
-        Widget(
-            "Sky brightness",
-            "Zodiacal light, V magnitudes per square arc second.",
-            name="sky_brightness",
-            first=f"{DEFAULT_SKY:g}",
-            unit="mag/arcsec²",
-            slider=Slider(20, 24, 0.1),
-        ),
-        Quantity("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
-    ] = None
-    target: Annotated[
-        str | None,
-        Help("Target whose zodiacal light is the sky, with the time", "a star such as 'AU Mic', or '290.68 +11.12'"),
-        Flag("--target"),
-        Widget("Sky target", "A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12."),
-    ] = None
-    time: Annotated[
-        str | None,
-        Help("Time of the observation, UTC, with the target"),
-        Flag("--time"),
-        Widget("Time, UTC", "Such as 2026-09-01T12:00."),
-    ] = None
-    none: Annotated[bool, Help("Whether there is no sky")] = False
+    surface_brightness: physical.SkyBrightness | None = setting(
+        None,
+        "Surface brightness of the sky in V; or none",
+        flag=Flag("--sky", kind=str),
+        usual=f"{DEFAULT_SKY:g}",
+        label="Sky brightness",
+        hint="Zodiacal light, V magnitudes per square arc second.",
+        name="sky_brightness",
+        first=f"{DEFAULT_SKY:g}",
+        unit="mag/arcsec²",
+        slider=Slider(20, 24, 0.1),
+        quantity=("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
+    )
+    target: str | None = setting(
+        None,
+        "Target whose zodiacal light is the sky, with the time; a star such as 'AU Mic', or '290.68 +11.12'",
+        flag="--target",
+        label="Sky target",
+        hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
+    )
+    time: str | None = setting(
+        None,
+        "Time of the observation, UTC, with the target",
+        flag="--time",
+        label="Time, UTC",
+        hint="Such as 2026-09-01T12:00.",
+    )
+    none: bool = setting(False, "Whether there is no sky")
 
     @model_validator(mode="before")
     @classmethod
@@ -158,6 +140,12 @@ class SkyLight(Section):
         """Return the sky of one value, which replaces all others."""
         return type(self)(**{path[0]: value})
 
+    def describe(self) -> str:
+        """Return the sky in words."""
+        if self.target is not None:
+            return f"sky at {self.target}, {self.time} UTC"
+        return "no sky" if self.none else f"sky of V = {self.surface_brightness:g} mag/arcsec2"
+
     def sky(self) -> Sky:
         """Return the sky for the host."""
         from mauvecl.host.exposure.sky import Sky
@@ -170,64 +158,55 @@ class SkyLight(Section):
 class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
-    realisations: Annotated[Realisations, Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
-    seed: Annotated[
-        Seed, Help("Seed"), Flag("--seed"), Widget(hint="The same seed gives the same noise, to the bit.", place=3)
-    ] = DEFAULT_SEED
-    statistics: Annotated[
-        tuple[str, ...],
-        Field(min_length=1),
-        Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
-        Flag("--statistic", read=read_words),
-        Flag(
-            "--all-statistics",
-            kind=bool,
-            read=lambda *_: DEFAULT_STATISTICS,
-            help=Help(f"Answer by {', '.join(DEFAULT_STATISTICS)} instead of {RECOMMENDED} alone"),
-        ),
-    ] = (RECOMMENDED,)
-    fap: Annotated[
-        Probability,
-        Help("False-alarm probability per test"),
-        Flag("--fap"),
-        Widget(
-            "False-alarm probability",
-            "How often noise alone passes for a flare, per test: it sets the threshold.",
-            unit="per test",
-            slider=Slider(1e-6, 0.1, 10**0.1, log=True),
-        ),
-    ] = 1e-3
-    tails: Annotated[
-        Literal["counted", "sampled"],
-        Help(
-            "Thresholds with fewer than 100 draws beyond them",
-            choices="counted rejects them, sampled finds them by importance sampling",
-        ),
-        Flag("--tails"),
-    ] = "counted"
-    reference: Annotated[
-        str,
-        Help("Spectrum that is subtracted", choices="template (noise-free), exposure (noisy), or stack:N of them"),
-        Flag("--reference"),
-    ] = "template"
-    variances: Annotated[
-        Literal["model", "estimated"],
-        Help("Variances", choices="model, or estimated from the counts as an observer must"),
-        Flag("--variances"),
-    ] = "model"
-    template_temperatures_k: Annotated[
-        tuple[Temperature, ...],
-        Help("Temperature of a flare that is also looked for", "shows what a wrong template costs"),
-        Flag("--template"),
-    ] = ()
-    weights: Annotated[dict[str, Path], Help("Files with weights of your own statistics, by name")] = Field(
-        default_factory=dict
+    realisations: physical.Realisations = setting(1_000_000, "Noise realisations", flag="--realisations -n")
+    seed: physical.Seed = setting(
+        physical.DEFAULT_SEED, "Seed", flag="--seed", hint="The same seed gives the same noise, to the bit.", place=3
     )
-
-    @field_validator("statistics")
-    @classmethod
-    def _expand_all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
-        return STATISTIC_NAMES if "all" in given else given
+    statistics: Annotated[
+        tuple[str, ...], AfterValidator(lambda given: STATISTIC_NAMES if "all" in given else given)
+    ] = setting(
+        (RECOMMENDED,),
+        "Detection statistic",
+        min_length=1,
+        flag=(
+            Flag("--statistic", read=read_words),
+            Flag(
+                "--all-statistics",
+                kind=bool,
+                read=lambda *_: DEFAULT_STATISTICS,
+                help=Help(f"Answer by {', '.join(DEFAULT_STATISTICS)} instead of {RECOMMENDED} alone"),
+            ),
+        ),
+        choices=f"{', '.join(STATISTIC_NAMES)}, or all",
+    )
+    fap: physical.Probability = setting(
+        1e-3,
+        "False-alarm probability per test",
+        flag="--fap",
+        label="False-alarm probability",
+        hint="How often noise alone passes for a flare, per test: it sets the threshold.",
+        unit="per test",
+        slider=Slider(1e-6, 0.1, 10**0.1, log=True),
+    )
+    tails: Literal["counted", "sampled"] = setting(
+        "counted",
+        "Thresholds with fewer than 100 draws beyond them",
+        flag="--tails",
+        choices="counted rejects them, sampled finds them by importance sampling",
+    )
+    reference: str = setting(
+        "template",
+        "Spectrum that is subtracted",
+        flag="--reference",
+        choices="template (noise-free), exposure (noisy), or stack:N of them",
+    )
+    variances: Literal["model", "estimated"] = setting(
+        "model", "Variances", flag="--variances", choices="model, or estimated from the counts as an observer must"
+    )
+    template_temperatures_k: tuple[physical.Temperature, ...] = setting(
+        (), "Temperature of a flare that is also looked for; shows what a wrong template costs", flag="--template"
+    )
+    weights: dict[str, Path] = setting(dict, "Files with weights of your own statistics, by name")
 
     def _check_values(self) -> None:
         self.comparison()
@@ -238,7 +217,7 @@ class Run(Section):
 
 
 #: Standard deviation of an unknown.
-Spread = Annotated[Positive | Literal["free"], Accepted("a number above 0, or 'free'")]
+Spread = Annotated[physical.Positive | Literal["free"], Accepted("a number above 0, or 'free'")]
 
 
 def sd_of(spread: Spread) -> float:
@@ -249,49 +228,31 @@ def sd_of(spread: Spread) -> float:
 class OwnNuisance(Section):
     """User-defined nuisance spectrum: wavelength in nm and DN per exposure at unit amplitude, as a file or points."""
 
-    file: Annotated[Path | None, Help("File with two columns, wavelength in nm and DN per exposure")] = None
-    points: Annotated[tuple[tuple[float, float], ...] | None, Help("Wavelengths in nm, and DN per exposure")] = None
-    sd: Annotated[Spread, Help("Standard deviation of the amplitude, or free")] = "free"
+    file: Path | None = setting(None, "File with two columns, wavelength in nm and DN per exposure")
+    points: tuple[tuple[float, float], ...] | None = setting(None, "Wavelengths in nm, and DN per exposure")
+    sd: Spread = setting("free", "Standard deviation of the amplitude, or free")
 
     def _check_values(self) -> None:
         check_one(self, "a nuisance spectrum", "points", "file", needed=True)
 
-    def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
-        import numpy as np
 
-        from mauvecl.detection.nuisances import at_pixels, read_at_pixels
-
-        if self.file is not None:
-            return read_at_pixels("spectrum", name, self.file, wavelength_nm)
-        return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
-
-
-Usual = Annotated[
-    bool,
-    Help("Draw the usual unknowns and marginalise over them, or take everything but the noise as known"),
-    Flag("--with-unknowns/--ideal"),
-]
-Own = Annotated[
-    dict[str, OwnNuisance],
-    Help("Your own nuisance spectra, by name"),
-    Flag(
-        "--nuisance",
-        kind=list[str],
-        help=Help(
-            f"Marginalise over {', '.join(NUISANCES)} or a file's spectrum, with a standard deviation or free",
-            "as in dark=0.1 or stray.txt=free",
-        ),
+_OWN = Flag(
+    "--nuisance",
+    kind=list[str],
+    help=Help(
+        f"Marginalise over {', '.join(NUISANCES)} or a file's spectrum, with a standard deviation or free",
+        "as in dark=0.1 or stray.txt=free",
     ),
-]
-_keys: Any = (
-    {"usual": (Usual, True)}
-    | {
-        name: (Annotated[Spread | None, Help(f"Standard deviation of {row.label}, or free")], None)
-        for name, row in NUISANCES.items()
-    }
-    | {"own": (Own, Field(default_factory=dict))}
 )
+_keys: Any = {
+    "usual": (bool, setting(
+        True, "Draw the usual unknowns and marginalise over them, or take everything but the noise as known",
+        flag="--with-unknowns/--ideal",
+    )),
+    **{name: (Spread | None, setting(None, f"Standard deviation of {row.label}, or free"))
+       for name, row in NUISANCES.items()},
+    "own": (dict[str, OwnNuisance], setting(dict, "Your own nuisance spectra, by name", flag=_OWN)),
+}  # fmt: skip
 
 
 class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  # type: ignore[misc]
@@ -308,7 +269,9 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
     def marginalised(self, quiet: Expectation) -> Nuisances | None:
         """Return the nuisance parameters for the engine, or None if there are none."""
-        from mauvecl.detection.nuisances import Nuisances, spectrum_of
+        import numpy as np
+
+        from mauvecl.detection.nuisances import Nuisances, at_pixels, read_at_pixels, spectrum_of
 
         documented = DOCUMENTED_NUISANCES if self.usual else ()
         # Parameters without effect, such as the brightness of no sky, are left out.
@@ -318,7 +281,12 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
         sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
         for name, nuisance in self.own.items():
-            own[name] = nuisance.spectrum(name, quiet.wavelength_nm)
+            # DN per exposure at unit amplitude, shape (n_pixel,).
+            if nuisance.file is not None:
+                own[name] = read_at_pixels("spectrum", name, nuisance.file, quiet.wavelength_nm)
+            else:
+                points = f"points of {shortened(name)}"
+                own[name] = at_pixels(points, "DN", np.array(nuisance.points), quiet.wavelength_nm)
             sd[name] = sd_of(nuisance.sd)
         return Nuisances.of(quiet, sd, own) if sd else None
 
@@ -330,20 +298,16 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 #: Choice of unknowns with which everything but the noise is known.
 KNOWN = NuisanceChoice(usual=False)
 
-Draws = Annotated[
-    int, Range(0, 4096), Help("Draws of unknown instrument values over which the answer is averaged"), Flag("--unknown")
-]
-Known = Annotated[
-    tuple[str, ...],
-    Help("Instrument value that is known", "as in temperature_c,light_loss"),
-    Flag("--known", read=read_words),
-]
 #: Number of draws, priors by name, and names of known values.
-_unknown_keys: Any = (
-    {"draws": (Draws, 0)}
-    | {name: (PriorField | None, value.prior) for name, value in INSTRUMENT_VALUES.items()}
-    | {"known": (Known, ())}
-)
+_unknown_keys: Any = {
+    "draws": (Annotated[int, Range(0, 4096)], setting(
+        0, "Draws of unknown instrument values over which the answer is averaged", flag="--unknown"
+    )),
+    **{name: (PriorField | None, value.prior) for name, value in INSTRUMENT_VALUES.items()},
+    "known": (tuple[str, ...], setting(
+        (), "Instrument value that is known; as in temperature_c,light_loss", flag=Flag("--known", read=read_words)
+    )),
+}  # fmt: skip
 
 
 class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_keys)):  # type: ignore[misc]

@@ -22,19 +22,10 @@ from mauvecl.host.tables.names import (
     is_missing_position,
     key_of,
 )
+from mauvecl.schema import physical
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget, first
-from mauvecl.schema.physical import (
-    Distance,
-    Duration,
-    DurationExponent,
-    DurationScatter,
-    Energy,
-    Magnitude,
-    RateExponent,
-    Share,
-)
-from mauvecl.schema.section import Section, built, check_all, check_different, check_one, given_keys, number_or_text
+from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, first
+from mauvecl.schema.section import Section, built, check_all, check_different, check_one, number_or_text, setting
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -52,39 +43,31 @@ MAX_TARGETS = 500
 class OrbitQuestion(Section):
     """Orbit, time grid, targets and visibility limits."""
 
-    start: Annotated[
-        str,
-        Help("First day or time, UTC"),
-        Flag("--start"),
-        Widget("First day", "The first day of the time that is looked at, UTC.", kind="day"),
-    ] = "2027-01-01"
-    days: Annotated[
-        float,
-        Unit("d"),
-        Range(0, open_low=True),
-        Help("Length of time"),
-        Flag("--days"),
-        Widget(
-            "Days",
-            "How many days from the first one on are looked at: 365 show every season.",
-            unit="d",
-            most=1000,
-            slider=Slider(5, 730, 5),
-        ),
-    ] = 365.0
-    step_s: Annotated[Duration, Help("Time between the computed positions"), Flag("--step")] = 60.0
-    tle: Annotated[Path | None, Help("File of two-line elements, newer than the embedded ones"), Flag("--tle")] = None
-    kind: Annotated[
-        Literal["auto", "tle", "mean"],
-        Help("Model of the orbit", choices="tle, mean, or auto (mean far from the elements' epoch)"),
-        Flag("--orbit"),
-    ] = "auto"
-    targets: Annotated[
-        tuple[str, ...], Help("Name of a target, or coordinates such as '290.0 -11.2'"), Flag("--look-at")
-    ] = ()
-    simbad: Annotated[
-        bool, Help("Ask SIMBAD for names that are not embedded", "needs mauvecl[names]"), Flag("--simbad")
-    ] = False
+    start: str = setting(
+        "2027-01-01",
+        "First day or time, UTC",
+        flag="--start",
+        label="First day",
+        hint="The first day of the time that is looked at, UTC.",
+        kind="day",
+    )
+    days: Annotated[float, Unit("d"), Range(0, open_low=True)] = setting(
+        365.0,
+        "Length of time",
+        flag="--days",
+        label="Days",
+        hint="How many days from the first one on are looked at: 365 show every season.",
+        unit="d",
+        most=1000,
+        slider=Slider(5, 730, 5),
+    )
+    step_s: physical.Duration = setting(60.0, "Time between the computed positions", flag="--step")
+    tle: Path | None = setting(None, "File of two-line elements, newer than the embedded ones", flag="--tle")
+    kind: Literal["auto", "tle", "mean"] = setting(
+        "auto", "Model of the orbit", flag="--orbit", choices="tle, mean, or auto (mean far from the elements' epoch)"
+    )
+    targets: tuple[str, ...] = setting((), "Name of a target, or coordinates such as '290.0 -11.2'", flag="--look-at")
+    simbad: bool = setting(False, "Ask SIMBAD for names that are not embedded; needs mauvecl[names]", flag="--simbad")
     limits: Limits = Limits()
 
     @field_validator("start")
@@ -126,35 +109,31 @@ class PlanTarget(Section):
     """
 
     name: Annotated[str, Help("Name of the target")]
-    coordinates: Annotated[str | None, Help("Coordinates, which replace those of the name")] = None
-    spectral_type: Annotated[
-        str | None, Help("Spectral type, such as M3V", "the nearest spectrum of the library is used")
-    ] = None
-    magnitude: Annotated[Magnitude | None, Help("V magnitude")] = None
-    distance_pc: Annotated[Distance | None, Help("Distance")] = None
-    rates: Annotated[
-        Literal["G", "K", "M", "sunlike"] | None, Help("Published flare rates", default="the spectral type's")
-    ] = None
-    mass_msun: Annotated[
-        Annotated[float, Unit("solMass"), Range(0, open_low=True)] | None,
-        Help("Mass, for the rates of Davenport et al. 2019", "needs the age"),
-    ] = None
-    age_myr: Annotated[Annotated[float, Unit("Myr"), Range(0, open_low=True)] | None, Help("Age")] = None
-    alpha: Annotated[RateExponent | None, Help("Exponent of a power law of bolometric energies")] = None
-    rate_per_day: Annotated[
-        Annotated[float, Unit("1 / d"), Range(0, open_low=True)] | None,
-        Help("Rate of flares above an energy, for the power law"),
-    ] = None
-    at_erg: Annotated[Energy | None, Help("That energy")] = None
-    rates_file: Annotated[Path | None, Help("File with a cumulative distribution of energies")] = None
-    rates_band: Annotated[str, Help("Band of the energies in that file")] = "bolometric"
-    neighbours: Annotated[Path | None, Help("Table of other stars near the target, as for a star")] = None
-    neighbours_of: Annotated[str | None, Help("The target's own row in that table, or its coordinates")] = None
-    neighbour_share: Annotated[
-        Share, Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption")
-    ] = 1.0
+    coordinates: str | None = setting(None, "Coordinates, which replace those of the name")
+    spectral_type: str | None = setting(None, "Spectral type, such as M3V; the nearest spectrum of the library is used")
+    magnitude: physical.Magnitude | None = setting(None, "V magnitude")
+    distance_pc: physical.Distance | None = setting(None, "Distance")
+    rates: Literal["G", "K", "M", "sunlike"] | None = setting(
+        None, "Published flare rates", usual="the spectral type's"
+    )
+    mass_msun: Annotated[float, Unit("solMass"), Range(0, open_low=True)] | None = setting(
+        None, "Mass, for the rates of Davenport et al. 2019; needs the age"
+    )
+    age_myr: Annotated[float, Unit("Myr"), Range(0, open_low=True)] | None = setting(None, "Age")
+    alpha: physical.RateExponent | None = setting(None, "Exponent of a power law of bolometric energies")
+    rate_per_day: Annotated[float, Unit("1 / d"), Range(0, open_low=True)] | None = setting(
+        None, "Rate of flares above an energy, for the power law"
+    )
+    at_erg: physical.Energy | None = setting(None, "That energy")
+    rates_file: Path | None = setting(None, "File with a cumulative distribution of energies")
+    rates_band: str = setting("bolometric", "Band of the energies in that file")
+    neighbours: Path | None = setting(None, "Table of other stars near the target, as for a star")
+    neighbours_of: str | None = setting(None, "The target's own row in that table, or its coordinates")
+    neighbour_share: physical.Share = setting(
+        1.0, "Share of the light of neighbours within the fibre's radius that enters it; an assumption"
+    )
 
-    unused: Annotated[tuple[str, ...], Help("Columns of its table that are not read")] = ()
+    unused: tuple[str, ...] = setting((), "Columns of its table that are not read")
 
     @model_validator(mode="before")
     @classmethod
@@ -165,11 +144,6 @@ class PlanTarget(Section):
         check_all(self, self.name, "mass_msun", "age_myr")
         check_all(self, self.name, "alpha", "rate_per_day", "at_erg")
         check_one(self, self.name, *RATES)
-
-    @property
-    def given_rates(self) -> list[str]:
-        """Keys of the given flare rates, of which a target has at most one; the mass has an age."""
-        return given_keys(self, RATES)
 
     def target(self, simbad: bool) -> Target:
         """Look up the target; given coordinates replace those of its name."""
@@ -216,42 +190,40 @@ class PlanTarget(Section):
 class PlanQuestion(Section):
     """Campaign: targets, exposure time per target, durations of flares, and how completeness is computed."""
 
-    targets: Annotated[
-        tuple[PlanTarget, ...],
-        Help("Targets of the campaign"),
-        Flag(
+    targets: tuple[PlanTarget, ...] = setting(
+        (),
+        "Targets of the campaign",
+        flag=Flag(
             "--targets",
             kind=Path,
-            read=lambda path, _: read_targets(Path(path)),
+            read=lambda path, _: read_targets(path),
             help=Help("Table of targets (CSV, ECSV, FITS, VOTable)", "name, and what is known of each"),
         ),
-    ] = ()
-    hours: Annotated[
-        Annotated[float, Unit("h"), Range(0, open_low=True)] | None,
-        Help("Exposure of each target at most", default="all"),
-        Flag("--hours"),
-        Widget(
-            "Hours on each target",
-            "How long each target is observed, at most: never longer than it is seen.",
-            first="100",
-            slider=Slider(10, 1000, 10),
-        ),
-    ] = None
-    half_width_s: Annotated[Duration, Help("Half-width of flares of the energy at_erg")] = 100.0
-    at_erg: Annotated[Energy, Help("That energy")] = 1e33
-    exponent: Annotated[DurationExponent, Help("Exponent with which half-widths grow with energy")] = 0.39
-    scatter_dex: Annotated[DurationScatter, Help("Scatter of half-widths about that law, dex")] = 0.3
-    completeness: Annotated[
-        Literal["injections", "closed form"],
-        Help("Completeness", choices="injections (into simulated noise) or 'closed form' (at once)"),
-        Flag("--completeness"),
-    ] = "closed form"
-    along_orbit: Annotated[
-        bool, Help("Whether frames have the detector temperature and particle flux along the orbit")
-    ] = True
-    injections: Annotated[int, Range(20, 1_000_000), Help("Injections of each half-width")] = 100
-    best_months: Annotated[int, Range(1, 12), Help("Number of best months in the report")] = 3
-    report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "pdf"
+    )
+    hours: Annotated[float, Unit("h"), Range(0, open_low=True)] | None = setting(
+        None,
+        "Exposure of each target at most",
+        flag="--hours",
+        usual="all",
+        label="Hours on each target",
+        hint="How long each target is observed, at most: never longer than it is seen.",
+        first="100",
+        slider=Slider(10, 1000, 10),
+    )
+    half_width_s: physical.Duration = setting(100.0, "Half-width of flares of the energy at_erg")
+    at_erg: physical.Energy = setting(1e33, "That energy")
+    exponent: physical.DurationExponent = setting(0.39, "Exponent with which half-widths grow with energy")
+    scatter_dex: physical.DurationScatter = setting(0.3, "Scatter of half-widths about that law, dex")
+    completeness: Literal["injections", "closed form"] = setting(
+        "closed form",
+        "Completeness",
+        flag="--completeness",
+        choices="injections (into simulated noise) or 'closed form' (at once)",
+    )
+    along_orbit: bool = setting(True, "Whether frames have the detector temperature and particle flux along the orbit")
+    injections: Annotated[int, Range(20, 1_000_000)] = setting(100, "Injections of each half-width")
+    best_months: Annotated[int, Range(1, 12)] = setting(3, "Number of best months in the report")
+    report: Literal["pdf", "html"] = setting("pdf", "Form of the report", flag="--report")
 
     def _check_values(self) -> None:
         check_different([target.name for target in self.targets], "the plan's target", "targets")
@@ -282,9 +254,8 @@ def read_targets(path: str | Path) -> list[dict[str, Any]]:
     """Read targets from a table of any format; see `targets_in`. Paths in it are relative to its folder."""
     from mauvecl.host.tables.opening import read_table
 
-    path = Path(path)
-    named = f"table of targets {shortened(path.name)}"
-    return targets_in(read_table(path, "table of targets"), named, path.parent)
+    named = f"table of targets {shortened(Path(path).name)}"
+    return targets_in(read_table(Path(path), "table of targets"), named, Path(path).parent)
 
 
 #: Names of columns of targets, in any case, by the keys of `PlanTarget`; keys themselves are names as well.

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, Widget, first
+from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, first
 from mauvecl.schema.physical import Positive, Probability, Wavelength
-from mauvecl.schema.section import Section, check_different, check_needs, fields_of, read_axis, read_frames
+from mauvecl.schema.section import Section, check_different, check_needs, fields_of, read_axis, read_frames, setting
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star
 
@@ -41,26 +41,20 @@ MAX_CELLS = 100_000
 class CampaignQuestion(Section):
     """Number of tests of a search, and the false alarms that the whole search may have."""
 
-    frames: Annotated[
-        Annotated[int, Range(1)] | None,
-        Help("Frames of a whole search", "shows what one test means for all of it"),
-        Flag("--campaign"),
-    ] = None
-    step: Annotated[
-        Annotated[int, Range(1)] | None,
-        Help("Frames from one stack of the search to the next", default="a stack"),
-        Flag("--campaign-step"),
-    ] = None
-    fap: Annotated[
-        Probability | None,
-        Help("Wanted probability of any false alarm in the search", "shows what each test may have"),
-        Flag("--campaign-fap"),
-    ] = None
-    alarms: Annotated[
-        Positive | None,
-        Help("Wanted number of false alarms in the search", "shows what each test may have"),
-        Flag("--campaign-alarms"),
-    ] = None
+    frames: Annotated[int, Range(1)] | None = setting(
+        None, "Frames of a whole search; shows what one test means for all of it", flag="--campaign"
+    )
+    step: Annotated[int, Range(1)] | None = setting(
+        None, "Frames from one stack of the search to the next", flag="--campaign-step", usual="a stack"
+    )
+    fap: Probability | None = setting(
+        None,
+        "Wanted probability of any false alarm in the search; shows what each test may have",
+        flag="--campaign-fap",
+    )
+    alarms: Positive | None = setting(
+        None, "Wanted number of false alarms in the search; shows what each test may have", flag="--campaign-alarms"
+    )
 
     def _check_values(self) -> None:
         check_needs(self, "the campaign", ("step", "fap", "alarms"), "frames")
@@ -69,11 +63,11 @@ class CampaignQuestion(Section):
 class SignalQuestion(Section):
     """S/N that an exposure must reach."""
 
-    snr: Annotated[Positive | None, Help("Wanted signal-to-noise ratio"), Flag("--snr")] = None
-    wavelength_nm: Annotated[Wavelength | None, Help("Wavelength"), Flag("--at")] = None
-    per: Annotated[
-        Literal["element", "pixel"], Help("Bin of the S/N", choices="element (10.5 nm) or pixel"), Flag("--per")
-    ] = "element"
+    snr: Positive | None = setting(None, "Wanted signal-to-noise ratio", flag="--snr")
+    wavelength_nm: Wavelength | None = setting(None, "Wavelength", flag="--at")
+    per: Literal["element", "pixel"] = setting(
+        "element", "Bin of the S/N", flag="--per", choices="element (10.5 nm) or pixel"
+    )
 
 
 class BulkQuestion(Section):
@@ -82,12 +76,13 @@ class BulkQuestion(Section):
     frames: Annotated[
         Literal["stack", "all"] | Annotated[tuple[Annotated[int, Range(0)], ...], Field(min_length=1)],
         Accepted("stack, all, or numbers of frames"),
-        Help("Stored frames", choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9"),
-        Flag("--frames", kind=str, read=read_frames),
-    ] = "stack"
-    components: Annotated[
-        bool, Help("Also store the mean of star, sky and noise of each pixel"), Flag("--components")
-    ] = False
+    ] = setting(
+        "stack",
+        "Stored frames",
+        flag=Flag("--frames", kind=str, read=read_frames),
+        choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9",
+    )
+    components: bool = setting(False, "Also store the mean of star, sky and noise of each pixel", flag="--components")
 
     def _check_values(self) -> None:
         if not isinstance(self.frames, str) and list(self.frames) != sorted(set(self.frames)):
@@ -107,32 +102,28 @@ class BulkQuestion(Section):
 class LimitQuestion(Section):
     """Quantity whose limit is computed, and the detection probability at the limit."""
 
-    of: Annotated[
-        Literal["magnitude", "amplitude", "exposure"],
-        Help("Quantity whose limit is computed"),
-        Flag("--of"),
-        Widget(
-            "Solve for",
-            "The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
-            "probability; all else is as entered. The tab Limit and map simulates it.",
-            first="amplitude",
-        ),
-    ] = "magnitude"
-    power: Annotated[
-        Probability,
-        Help("Wanted detection probability"),
-        Flag("--power"),
-        Widget(
-            "Wanted probability",
-            "With which a flare is to be detected at the limit.",
-            group="Detection",
-            slider=Slider(0.5, 0.99, 0.01),
-        ),
-    ] = 0.9
+    of: Literal["magnitude", "amplitude", "exposure"] = setting(
+        "magnitude",
+        "Quantity whose limit is computed",
+        flag="--of",
+        label="Solve for",
+        hint="The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
+        "probability; all else is as entered. The tab Limit and map simulates it.",
+        first="amplitude",
+    )
+    power: Probability = setting(
+        0.9,
+        "Wanted detection probability",
+        flag="--power",
+        label="Wanted probability",
+        hint="With which a flare is to be detected at the limit.",
+        group="Detection",
+        slider=Slider(0.5, 0.99, 0.01),
+    )
 
 
 def _wrong_value(quantity: Quantity, text: str) -> InputError:
-    accepted = "a name of the library" if quantity.is_name else quantity.accepted
+    accepted = "a name of the library" if quantity.range is None else quantity.range.words(quantity.unit)
     return InputError(f"a value of the axis {quantity.name!r} must be {accepted}, not {text}", key="values")
 
 
@@ -144,18 +135,18 @@ class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
     quantity: Annotated[QuantityName, Help("Quantity that varies")]
-    values: Annotated[tuple[NumberOrName, ...] | None, Help("Values")] = None
-    start: Annotated[Number | None, Help("First of evenly spaced values")] = None
-    stop: Annotated[Number | None, Help("Last of evenly spaced values")] = None
-    steps: Annotated[Annotated[int, Range(2, 1000)] | None, Help("Number of evenly spaced values")] = None
-    log: Annotated[bool, Help("Whether values are evenly spaced in the logarithm")] = False
+    values: tuple[NumberOrName, ...] | None = setting(None, "Values")
+    start: Number | None = setting(None, "First of evenly spaced values")
+    stop: Number | None = setting(None, "Last of evenly spaced values")
+    steps: Annotated[int, Range(2, 1000)] | None = setting(None, "Number of evenly spaced values")
+    log: bool = setting(False, "Whether values are evenly spaced in the logarithm")
 
     @model_validator(mode="before")
     @classmethod
     def _without_units(cls, given: Any) -> Any:
         """Convert values with a unit, such as "10 min", to the unit of the quantity."""
         quantity = QUANTITIES.get(str(given.get("quantity"))) if isinstance(given, dict) else None
-        if quantity is None or quantity.is_name:
+        if quantity is None or quantity.range is None:
             return given
         keys = [key for key in ("values", "start", "stop") if key in given]
         try:
@@ -174,8 +165,7 @@ class Axis(Section):
             raise InputError(f"the axis {self.quantity!r} needs at least one value, but has none", key="values")
         quantity = QUANTITIES[self.quantity]
         for value in self.points():
-            is_name = isinstance(value, str)
-            if is_name != quantity.is_name or (quantity.range is not None and value not in quantity.range):
+            if isinstance(value, str) != (quantity.range is None) or (quantity.range and value not in quantity.range):
                 raise _wrong_value(quantity, shown(value))
 
     def points(self) -> tuple[float | str, ...]:
@@ -197,19 +187,18 @@ class Axis(Section):
 class MapQuestion(Section):
     """Axes and contour levels of a map of the detection probability."""
 
-    x: Annotated[
-        Axis | None,
-        Help(
-            "Horizontal axis of the map",
-            "such as magnitude:4:10:16, or exposure=5,50,600",
-            default="the magnitudes over which the flares are lost",
-        ),
-        Flag("--x", kind=str, read=read_axis),
-    ] = None
-    y: Annotated[
-        Axis, Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"), Flag("--y", kind=str, read=read_axis)
-    ] = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
-    contours: Annotated[tuple[Probability, ...], Help("Detection probabilities of contours")] = (0.1, 0.5, 0.9)
+    x: Axis | None = setting(
+        None,
+        "Horizontal axis of the map; such as magnitude:4:10:16, or exposure=5,50,600",
+        flag=Flag("--x", kind=str, read=read_axis),
+        usual="the magnitudes over which the flares are lost",
+    )
+    y: Axis = setting(
+        Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True),
+        "Vertical axis of the map; such as amplitude:0.01:1:16:log",
+        flag=Flag("--y", kind=str, read=read_axis),
+    )
+    contours: tuple[Probability, ...] = setting((0.1, 0.5, 0.9), "Detection probabilities of contours")
 
     def _check_values(self) -> None:
         if self.y.quantity == ("magnitude" if self.x is None else self.x.quantity):
@@ -227,21 +216,21 @@ class MapQuestion(Section):
 class Sweep(Section):
     """Quantities that take several values, in all combinations ("product") or in parallel ("list")."""
 
-    how: Annotated[
-        Literal["product", "list"],
-        Help("Every combination of the values, or one after the other"),
-        Flag(
+    how: Literal["product", "list"] = setting(
+        "product",
+        "Every combination of the values, or one after the other",
+        flag=Flag(
             "--as-list",
             kind=bool,
             read=lambda wanted, _: "list" if wanted else None,
             help=Help("Vary the quantities of a sweep together instead of in every combination"),
         ),
-    ] = "product"
-    axes: Annotated[
-        tuple[Axis, ...],
-        Help("Values of a quantity", "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination"),
-        Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
-    ] = ()
+    )
+    axes: tuple[Axis, ...] = setting(
+        (),
+        "Values of a quantity; as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
+        flag=Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
+    )
 
     def _check_values(self) -> None:
         check_different([axis.quantity for axis in self.axes], "the sweep's quantity", "axes")

@@ -8,26 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from mauvecl.host.stars.library import ALIASES, listed_values
+from mauvecl.schema import physical
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Unit, Widget
-from mauvecl.schema.physical import (
-    Amplitude,
-    AreaRatio,
-    BalmerJump,
-    BinWidth,
-    Distance,
-    LineFraction,
-    LineScale,
-    Magnitude,
-    Radius,
-    Reddening,
-    Share,
-    Temperature,
-)
-from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes
+from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
+from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.neighbours import Neighbours
@@ -45,135 +32,120 @@ STAR_KEYS = (
 class Star(Section):
     """Spectrum, extinction and magnitude of a star; distance or radius for flare energies."""
 
-    library: Annotated[
-        str | None,
-        Help("Library name or spectrum file", "as in G2V,M3V"),
-        Flag("--star", "-s", kind=list[str]),
-        Quantity("star", "library name or file, with its magnitude", "star"),
-    ] = None
-    file: Annotated[Path | None, Help("Spectrum file, instead of a name of the library")] = None
-    magnitude: Annotated[
-        Magnitude | None,
-        Help("Magnitude", "one for all stars or one each, as in 7,8"),
-        Flag("--magnitude", "-m", kind=list[float]),
-        Widget(
-            hint="How bright the star is without the flare, in the band of the next field.",
-            first="8.5",
-            unit="",
-            slider=Slider(0, 15, 0.1),
-        ),
-        Quantity("magnitude", "magnitude of the star in its band", "magnitude"),
-    ] = None
-    band: Annotated[
-        str,
-        Help("Band of the magnitude", choices=", ".join(ALIASES)),
-        Flag("--band"),
-        Widget("Band", "The band of the magnitude. In V, Vega has 0.03, as in catalogues.", choices=tuple(ALIASES)),
-    ] = "V"
-    magnitude_system: Annotated[
-        Literal["catalogue", "vega", "ab"],
-        Help("Zero point of the magnitude", choices="catalogue, vega (Vega is 0 in every band) or ab"),
-        Flag("--magnitude-system"),
-    ] = "catalogue"
-    ebv: Annotated[
-        Reddening | None,
-        Help("Dust in front of the star, E(B-V)", "needs mauvecl[extinction]"),
-        Flag("--ebv"),
-        Widget(
-            "Reddening",
-            "Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
-            "Nothing: no dust.",
-            group="Star",
-        ),
-    ] = None
-    wavelength_unit: Annotated[
-        str | None,
-        Help("Unit of a spectrum file's wavelengths", "as in Angstrom, or 'nm air'"),
-        Flag("--wavelength-unit"),
-        Widget(
-            "Unit of wavelengths",
-            "That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
-            group="Own spectrum",
-            suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air", "Hz", "eV"),
-        ),
-    ] = None
-    flux_unit: Annotated[
-        str | None,
-        Help("Unit of a spectrum file's fluxes", "as in 'W m-2 nm-1'"),
-        Flag("--flux-unit"),
-        Widget(
-            "Unit of fluxes",
-            "That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
-            group="Own spectrum",
-            suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "W m-2 um-1", "Jy", "photon s-1 cm-2 Angstrom-1"),
-        ),
-    ] = None
-    extend: Annotated[
-        str | None,
-        Help("Library spectrum that continues a spectrum file beyond its ends, scaled to it"),
-        Flag("--extend"),
-        Widget(
-            "Continue with",
-            "Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
-            group="Own spectrum",
-            kind="library",
-        ),
-    ] = None
-    ignore_checksum: Annotated[
-        bool | None, Help("Read FITS files although their CHECKSUM or DATASUM differs"), Flag("--ignore-checksum")
-    ] = None
-    bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
-        None
+    library: str | None = setting(
+        None,
+        "Library name or spectrum file; as in G2V,M3V",
+        flag=Flag("--star", "-s", kind=list[str]),
+        quantity=("star", "library name or file, with its magnitude", "star"),
     )
-    distance_pc: Annotated[
-        Distance | None,
-        Help("Distance of the star", "for energies"),
-        Flag("--distance"),
-        Widget(
-            "Distance",
-            "With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
-            group="Measurement",
-        ),
-    ] = None
-    radius_rsun: Annotated[Radius | None, Help("Radius of the star", "for energies"), Flag("--radius")] = None
-    effective_temperature_k: Annotated[
-        Temperature | None, Help("Effective temperature of the star", "for energies"), Flag("--star-temperature")
-    ] = None
-    neighbours: Annotated[
-        Path | None,
-        Help("Table of other stars near the star", "with separation, magnitude and spectral type, or of a Gaia query"),
-        Flag("--neighbours"),
-        Widget(
-            "Neighbours",
-            "Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
-            "columns of a Gaia query. The light of those within 47 arcsec enters.",
-            group="Neighbours",
-            kind="table",
-            placeholder="name,separation,magnitude,spectral_type",
-        ),
-    ] = None
-    neighbours_of: Annotated[
-        str | None,
-        Help("The star's own row in that table, by name, or its coordinates"),
-        Flag("--neighbours-of"),
-        Widget(
-            "The star itself",
-            "Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
-            "has positions but no separations.",
-            group="Neighbours",
-        ),
-    ] = None
-    neighbour_share: Annotated[
-        Share,
-        Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
-        Flag("--neighbour-share"),
-        Widget(
-            "Share that enters",
-            "Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
-            "not published.",
-            group="Neighbours",
-        ),
-    ] = 1.0
+    file: Path | None = setting(None, "Spectrum file, instead of a name of the library")
+    magnitude: physical.Magnitude | None = setting(
+        None,
+        "Magnitude; one for all stars or one each, as in 7,8",
+        flag=Flag("--magnitude", "-m", kind=list[float]),
+        hint="How bright the star is without the flare, in the band of the next field.",
+        first="8.5",
+        unit="",
+        slider=Slider(0, 15, 0.1),
+        quantity=("magnitude", "magnitude of the star in its band", "magnitude"),
+    )
+    band: str = setting(
+        "V",
+        "Band of the magnitude",
+        flag="--band",
+        choices=tuple(ALIASES),
+        label="Band",
+        hint="The band of the magnitude. In V, Vega has 0.03, as in catalogues.",
+    )
+    magnitude_system: Literal["catalogue", "vega", "ab"] = setting(
+        "catalogue",
+        "Zero point of the magnitude",
+        flag="--magnitude-system",
+        choices="catalogue, vega (Vega is 0 in every band) or ab",
+    )
+    ebv: physical.Reddening | None = setting(
+        None,
+        "Dust in front of the star, E(B-V); needs mauvecl[extinction]",
+        flag="--ebv",
+        label="Reddening",
+        hint="Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
+        "Nothing: no dust.",
+        group="Star",
+    )
+    wavelength_unit: str | None = setting(
+        None,
+        "Unit of a spectrum file's wavelengths; as in Angstrom, or 'nm air'",
+        flag="--wavelength-unit",
+        label="Unit of wavelengths",
+        hint="That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
+        group="Own spectrum",
+        suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air", "Hz", "eV"),
+    )
+    flux_unit: str | None = setting(
+        None,
+        "Unit of a spectrum file's fluxes; as in 'W m-2 nm-1'",
+        flag="--flux-unit",
+        label="Unit of fluxes",
+        hint="That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+        group="Own spectrum",
+        suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "W m-2 um-1", "Jy", "photon s-1 cm-2 Angstrom-1"),
+    )
+    extend: str | None = setting(
+        None,
+        "Library spectrum that continues a spectrum file beyond its ends, scaled to it",
+        flag="--extend",
+        label="Continue with",
+        hint="Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
+        group="Own spectrum",
+        kind="library",
+    )
+    ignore_checksum: bool | None = setting(
+        None, "Read FITS files although their CHECKSUM or DATASUM differs", flag="--ignore-checksum"
+    )
+    bin_nm: physical.BinWidth | None = setting(
+        None, "Width of bins over which the spectrum is averaged", flag="--bin-nm"
+    )
+    distance_pc: physical.Distance | None = setting(
+        None,
+        "Distance of the star; for energies",
+        flag="--distance",
+        label="Distance",
+        hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
+        group="Measurement",
+    )
+    radius_rsun: physical.Radius | None = setting(None, "Radius of the star; for energies", flag="--radius")
+    effective_temperature_k: physical.Temperature | None = setting(
+        None, "Effective temperature of the star; for energies", flag="--star-temperature"
+    )
+    neighbours: Path | None = setting(
+        None,
+        "Table of other stars near the star; with separation, magnitude and spectral type, or of a Gaia query",
+        flag="--neighbours",
+        label="Neighbours",
+        hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
+        "columns of a Gaia query. The light of those within 47 arcsec enters.",
+        group="Neighbours",
+        kind="table",
+        placeholder="name,separation,magnitude,spectral_type",
+    )
+    neighbours_of: str | None = setting(
+        None,
+        "The star's own row in that table, by name, or its coordinates",
+        flag="--neighbours-of",
+        label="The star itself",
+        hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
+        "has positions but no separations.",
+        group="Neighbours",
+    )
+    neighbour_share: physical.Share = setting(
+        1.0,
+        "Share of the light of neighbours within the fibre's radius that enters it; an assumption",
+        flag="--neighbour-share",
+        label="Share that enters",
+        hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
+        "not published.",
+        group="Neighbours",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -249,127 +221,114 @@ FLARE_FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k",
 class FlareLight(Section):
     """Spectrum of a flare; by default a blackbody of `flare.temperature_k`."""
 
-    balmer_jump: Annotated[
-        BalmerJump | None,
-        Help("Ratio of the flare's flux just below the Balmer edge to that just above", default="1"),
-        Flag("--balmer-jump"),
-        Widget(
-            "Balmer jump",
-            "Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
-            "Nothing: a plain blackbody.",
+    balmer_jump: physical.BalmerJump | None = setting(
+        None,
+        "Ratio of the flare's flux just below the Balmer edge to that just above",
+        flag="--balmer-jump",
+        usual="1",
+        label="Balmer jump",
+        hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
+        "Nothing: a plain blackbody.",
+        quantity=(
+            "balmer_jump",
+            "flux of the flare just below the Balmer edge over that just above",
+            "Balmer jump ratio",
         ),
-        Quantity(
-            "balmer_jump", "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio"
-        ),
-    ] = None
-    electron_temperature_k: Annotated[Temperature, Help("Electron temperature of the Balmer continuum")] = 10_000.0
-    second_temperature_k: Annotated[
-        Temperature | None,
-        Help("Temperature of a second blackbody of the flare", "needs its area"),
-        Flag("--second-temperature"),
-        Widget(
-            "Second temperature", "A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none."
-        ),
-        Quantity("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
-    ] = None
-    second_area: Annotated[
-        AreaRatio | None,
-        Help("Area of the second blackbody over that of the first"),
-        Flag("--second-area"),
-        Widget("Second area", "Area at the second temperature over that at the first, if there is one.", first="0.05"),
-        Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
-    ] = None
-    lines: Annotated[
-        dict[str, LineFraction],
-        Help(
-            "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm",
-            "as in 'Mg II=0.05'",
-        ),
-        Flag("--line", kind=list[str], read=read_line_fluxes),
-    ] = Field(default_factory=dict)
-    line_fluxes: Annotated[
-        dict[str, Annotated[float, Unit("erg / (s cm2)"), Range(0)]],
-        Help("Emission line at the telescope, by name or wavelength in nm", "as in '280=1e-12'"),
-        Flag("--line-flux", kind=list[str], read=read_line_fluxes),
-    ] = Field(default_factory=dict)
-    line_scale: Annotated[
-        LineScale,
-        Help("Factor on all line fluxes"),
-        Quantity("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
-    ] = 1.0
-    file: Annotated[
-        Path | None,
-        Help("Spectrum file of an observed or computed flare"),
-        Flag("--flare-file"),
-        Widget(
-            "Own flare spectrum",
-            "Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
-            "scales it.",
-            name="flare_file",
-            place=2,
-            kind="file",
-        ),
-    ] = None
-    quiescent: Annotated[
-        Path | None,
-        Help("Spectrum file of its star without the flare, which is subtracted"),
-        Flag("--flare-quiescent"),
-        Widget(
-            "Star without the flare",
-            "Spectrum of the same star without the flare, on the same scale and in the same units. It is "
-            "subtracted. Nothing: the file holds the flare alone.",
-            group="Own flare",
-            name="flare_quiescent",
-            place=1,
-            kind="file",
-        ),
-    ] = None
-    wavelength_unit: Annotated[
-        str | None,
-        Help("Unit of the wavelengths of the flare's files"),
-        Flag("--flare-wavelength-unit"),
-        Widget(
-            "Flare: unit of wavelengths",
-            "Such as Angstrom or Angstrom air. Nothing: what the file says.",
-            group="Own flare",
-            name="flare_wavelength_unit",
-            suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
-        ),
-    ] = None
-    flux_unit: Annotated[
-        str | None,
-        Help("Unit of the fluxes of the flare's files"),
-        Flag("--flare-flux-unit"),
-        Widget(
-            "Flare: unit of fluxes",
-            "Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
-            group="Own flare",
-            name="flare_flux_unit",
-            suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
-        ),
-    ] = None
-    continue_at_k: Annotated[
-        Temperature | None,
-        Help("Temperature of a blackbody that continues the flare's file beyond its ends"),
-        Flag("--continue-at"),
-        Widget(
-            "Continue at",
-            "Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
-            "cover what the instrument sees.",
-            group="Own flare",
-        ),
-    ] = None
-    as_observed: Annotated[
-        bool,
-        Help("Take the flare for as bright at the telescope as its file states, in place of amplitudes"),
-        Flag("--as-observed"),
-        Widget(
-            "As bright as observed",
-            "Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
-            group="Own flare",
-            place=2,
-        ),
-    ] = False
+    )
+    electron_temperature_k: physical.Temperature = setting(10_000.0, "Electron temperature of the Balmer continuum")
+    second_temperature_k: physical.Temperature | None = setting(
+        None,
+        "Temperature of a second blackbody of the flare; needs its area",
+        flag="--second-temperature",
+        label="Second temperature",
+        hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
+        quantity=("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
+    )
+    second_area: physical.AreaRatio | None = setting(
+        None,
+        "Area of the second blackbody over that of the first",
+        flag="--second-area",
+        label="Second area",
+        hint="Area at the second temperature over that at the first, if there is one.",
+        first="0.05",
+        quantity=("second_area", "area of the flare's second blackbody over that of the first", "second area"),
+    )
+    lines: dict[str, physical.LineFraction] = setting(
+        dict,
+        "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm; as in 'Mg II=0.05'",
+        flag=Flag("--line", kind=list[str], read=read_line_fluxes),
+    )
+    line_fluxes: dict[str, Annotated[float, Unit("erg / (s cm2)"), Range(0)]] = setting(
+        dict,
+        "Emission line at the telescope, by name or wavelength in nm; as in '280=1e-12'",
+        flag=Flag("--line-flux", kind=list[str], read=read_line_fluxes),
+    )
+    line_scale: physical.LineScale = setting(
+        1.0,
+        "Factor on all line fluxes",
+        quantity=("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
+    )
+    file: Path | None = setting(
+        None,
+        "Spectrum file of an observed or computed flare",
+        flag="--flare-file",
+        label="Own flare spectrum",
+        hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
+        "scales it.",
+        name="flare_file",
+        place=2,
+        kind="file",
+    )
+    quiescent: Path | None = setting(
+        None,
+        "Spectrum file of its star without the flare, which is subtracted",
+        flag="--flare-quiescent",
+        label="Star without the flare",
+        hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
+        "subtracted. Nothing: the file holds the flare alone.",
+        group="Own flare",
+        name="flare_quiescent",
+        place=1,
+        kind="file",
+    )
+    wavelength_unit: str | None = setting(
+        None,
+        "Unit of the wavelengths of the flare's files",
+        flag="--flare-wavelength-unit",
+        label="Flare: unit of wavelengths",
+        hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
+        group="Own flare",
+        name="flare_wavelength_unit",
+        suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
+    )
+    flux_unit: str | None = setting(
+        None,
+        "Unit of the fluxes of the flare's files",
+        flag="--flare-flux-unit",
+        label="Flare: unit of fluxes",
+        hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+        group="Own flare",
+        name="flare_flux_unit",
+        suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
+    )
+    continue_at_k: physical.Temperature | None = setting(
+        None,
+        "Temperature of a blackbody that continues the flare's file beyond its ends",
+        flag="--continue-at",
+        label="Continue at",
+        hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
+        "cover what the instrument sees.",
+        group="Own flare",
+    )
+    as_observed: bool = setting(
+        False,
+        "Take the flare for as bright at the telescope as its file states, in place of amplitudes",
+        flag="--as-observed",
+        label="As bright as observed",
+        hint="Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
+        group="Own flare",
+        place=2,
+    )
 
     def _check_values(self) -> None:
         what = "the spectrum of a flare"
@@ -424,52 +383,48 @@ def amplitudes_in(path: Path, _: str) -> list[float]:
 class Flare(Section):
     """Amplitudes, spectrum and geometry of flares."""
 
-    amplitudes: Annotated[
-        tuple[Amplitude, ...],
-        Field(min_length=1),
-        Help("Flare amplitude", "0.24 is a rise of 24 % in the flare's band"),
-        Flag(
-            "--flares",
-            kind=Path,
-            read=amplitudes_in,
-            help=Help("Table of flares with their amplitudes", "CSV, ECSV or FITS, as AltaiPony's ampl_rec"),
+    amplitudes: tuple[physical.Amplitude, ...] = setting(
+        (0.0076, 0.02, 0.081, 0.24),
+        "Flare amplitude; 0.24 is a rise of 24 % in the flare's band",
+        min_length=1,
+        flag=(
+            Flag(
+                "--flares",
+                kind=Path,
+                read=amplitudes_in,
+                help=Help("Table of flares with their amplitudes", "CSV, ECSV or FITS, as AltaiPony's ampl_rec"),
+            ),
+            Flag("--amplitude", "-a"),
         ),
-        Flag("--amplitude", "-a"),
-        Widget(
-            "Flare amplitude",
-            "By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
-            "ultraviolet the rise is many times as large.",
-            name="amplitude_percent",
-            first="2",
-            unit="%",
-            slider=Slider(0.01, 1000, 10**0.1, log=True),
-        ),
-        Quantity("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),
-    ] = (0.0076, 0.02, 0.081, 0.24)
-    temperature_k: Annotated[
-        Temperature,
-        Help("Flare temperature"),
-        Flag("--flare-temperature"),
-        Widget(
-            hint="The flare shines as a blackbody of this temperature. The hotter, the more of its light is "
-            "ultraviolet.",
-            group="Flare's spectrum",
-            name="flare_temperature_k",
-            slider=Slider(5000, 30_000, 500),
-        ),
-        Quantity("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
-    ] = 10_000.0
-    band: Annotated[str, Help("Band of the amplitude", choices=", ".join(ALIASES)), Flag("--flare-band")] = "Kepler"
-    geometry: Annotated[
-        Literal["added", "replaces"],
-        Help("Whether a flare is added to the star or replaces part of its photosphere"),
-        Flag("--geometry"),
-    ] = "added"
-    photosphere_temperature_k: Annotated[
-        Temperature | None,
-        Help("Temperature of the photosphere that a flare replaces", default="the star's"),
-        Flag("--photosphere-temperature"),
-    ] = None
+        label="Flare amplitude",
+        hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
+        "ultraviolet the rise is many times as large.",
+        name="amplitude_percent",
+        first="2",
+        unit="%",
+        slider=Slider(0.01, 1000, 10**0.1, log=True),
+        quantity=("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),
+    )
+    temperature_k: physical.Temperature = setting(
+        10_000.0,
+        "Flare temperature",
+        flag="--flare-temperature",
+        hint="The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.",
+        group="Flare's spectrum",
+        name="flare_temperature_k",
+        slider=Slider(5000, 30_000, 500),
+        quantity=("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
+    )
+    band: str = setting("Kepler", "Band of the amplitude", flag="--flare-band", choices=", ".join(ALIASES))
+    geometry: Literal["added", "replaces"] = setting(
+        "added", "Whether a flare is added to the star or replaces part of its photosphere", flag="--geometry"
+    )
+    photosphere_temperature_k: physical.Temperature | None = setting(
+        None,
+        "Temperature of the photosphere that a flare replaces",
+        flag="--photosphere-temperature",
+        usual="the star's",
+    )
     spectrum: FlareLight = FlareLight()
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
-
-from pydantic import Field
 
 from mauvecl.flares.settings import (
     DAYS,
@@ -22,15 +19,14 @@ from mauvecl.flares.settings import (
     ShapeName,
 )
 from mauvecl.noise.disturbances import PointingDrifts
-from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing, NuisanceName
-from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
+from mauvecl.noise.unknowns import Changing, NuisanceName
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, Range, Unit
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section, check_one, given_keys, read_ranges
+from mauvecl.schema.section import Section, check_one, given_keys, read_ranges, setting
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
-    from mauvecl.flares.shapes import Shape
     from mauvecl.flares.stare import Stare
     from mauvecl.search.templates import Bank, Baseline
 
@@ -40,70 +36,60 @@ ORBIT_FRAMES_S = 5680.0
 #: Known changes during a stare.
 KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 Spreads = dict[Changing, Positive]
-#: Shape of flares in stares and searches.
-ShapeOfFlares = Annotated[ShapeName, Help("Shape of flares", choices=", ".join(SHAPE_NAMES)), Flag("--shape")]
 
 
 class StareQuestion(Section):
     """Duration and gaps of a stare, known and unknown changes during it, and its flares unless `events` are given."""
 
-    duration_s: Annotated[Duration, Help("Duration of the stare"), Flag("--duration")] = ORBIT_FRAMES_S
-    gaps: Annotated[
-        tuple[tuple[float, float], ...],
-        Unit("s"),
-        Help("Gap without recorded frames, from:to", "as in 1000:2000"),
-        Flag(
+    duration_s: Duration = setting(ORBIT_FRAMES_S, "Duration of the stare", flag="--duration")
+    gaps: Annotated[tuple[tuple[float, float], ...], Unit("s")] = setting(
+        (),
+        "Gap without recorded frames, from:to; as in 1000:2000",
+        flag=Flag(
             "--gap", kind=list[str], read=partial(read_ranges, expected="two times in s, such as 1000:2000", unit="s")
         ),
-    ] = ()
-    orbit_s: Annotated[Duration, Help("Orbital period")] = ORBIT_S
-    orbit_gap_s: Annotated[float, Unit("s"), Range(0), Help("Gap at the end of every orbit"), Flag("--orbit-gap")] = 0.0
-    along_orbit: Annotated[bool, Help("Whether detector temperature and sky follow the orbit of the section orbit")] = (
-        False
     )
-    thermal: Annotated[
-        Curve | None,
-        Help("Known change of the detector temperature, deg C"),
-        Flag(
+    orbit_s: Duration = setting(ORBIT_S, "Orbital period")
+    orbit_gap_s: Annotated[float, Unit("s"), Range(0)] = setting(
+        0.0, "Gap at the end of every orbit", flag="--orbit-gap"
+    )
+    along_orbit: bool = setting(False, "Whether detector temperature and sky follow the orbit of the section orbit")
+    thermal: Curve | None = setting(
+        None,
+        "Known change of the detector temperature, deg C",
+        flag=Flag(
             "--thermal",
             kind=float,
             read=lambda half, _: {"amplitude": half},
             help=Help("Half the range of the known thermal cycle of the orbit, deg C", default="0"),
         ),
-    ] = None
-    variability: Annotated[Curve | None, Help("Known relative change of the star's light")] = None
-    throughput: Annotated[Curve | None, Help("Known relative change of the throughput")] = None
-    sky: Annotated[Curve | None, Help("Known relative change of the sky")] = None
-    jitters: Annotated[Spreads, Help("Standard deviations of unknown changes that differ in each frame")] = Field(
-        default_factory=dict
     )
-    offsets: Annotated[Spreads, Help("Standard deviations of unknown constant changes")] = Field(default_factory=dict)
-    drifts: Annotated[Spreads, Help("Standard deviations of unknown drifts per hour")] = Field(default_factory=dict)
-    cycles: Annotated[Spreads, Help("Standard deviations of unknown cycles of the orbit")] = Field(default_factory=dict)
-    pointing: Annotated[
-        PointingDrifts | None,
-        Help("Drifts out of the fibre, each ended by a re-acquisition, all of it assumed"),
-        Flag(
+    variability: Curve | None = setting(None, "Known relative change of the star's light")
+    throughput: Curve | None = setting(None, "Known relative change of the throughput")
+    sky: Curve | None = setting(None, "Known relative change of the sky")
+    jitters: Spreads = setting(dict, "Standard deviations of unknown changes that differ in each frame")
+    offsets: Spreads = setting(dict, "Standard deviations of unknown constant changes")
+    drifts: Spreads = setting(dict, "Standard deviations of unknown drifts per hour")
+    cycles: Spreads = setting(dict, "Standard deviations of unknown cycles of the orbit")
+    pointing: PointingDrifts | None = setting(
+        None,
+        "Drifts out of the fibre, each ended by a re-acquisition, all of it assumed",
+        flag=Flag(
             "--pointing-drifts",
             kind=float,
             read=lambda rate, _: {"rate_per_h": rate},
             help=Help("Drifts out of the fibre per hour, with assumed depth and duration", default="none"),
         ),
-    ] = None
-    number: Annotated[int, Range(0, 2**32 - 1), Help("Number of the drawn stare")] = 0
-    half_width_s: Annotated[Duration, Help("Half-width of the flares"), Flag("--half-width")] = 60.0
-    shape: ShapeOfFlares = "davenport2014"
-    energies_erg: Annotated[
-        tuple[Energy, ...], Help("Bolometric energy of a flare", "instead of amplitudes"), Flag("--energy")
-    ] = ()
-    search: Annotated[
-        bool, Help("Search the stare for flares, as the section search says"), Flag("--search/--no-search")
-    ] = True
-    bands_nm: Annotated[tuple[tuple[Wavelength, Wavelength], ...], Help("Wavelength ranges of light curves")] = (
-        (200.0, 300.0),
-        (300.0, 400.0),
-        (400.0, 550.0),
-        (550.0, 700.0),
+    )
+    number: Annotated[int, Range(0, 2**32 - 1)] = setting(0, "Number of the drawn stare")
+    half_width_s: Duration = setting(60.0, "Half-width of the flares", flag="--half-width")
+    shape: ShapeName = setting("davenport2014", "Shape of flares", flag="--shape", choices=SHAPE_NAMES)
+    energies_erg: tuple[Energy, ...] = setting(
+        (), "Bolometric energy of a flare; instead of amplitudes", flag="--energy"
+    )
+    search: bool = setting(True, "Search the stare for flares, as the section search says", flag="--search/--no-search")
+    bands_nm: tuple[tuple[Wavelength, Wavelength], ...] = setting(
+        ((200.0, 300.0), (300.0, 400.0), (400.0, 550.0), (550.0, 700.0)), "Wavelength ranges of light curves"
     )
 
     def _check_values(self) -> None:
@@ -113,19 +99,6 @@ class StareQuestion(Section):
         for low, high in self.bands_nm:
             if not 0 < low < high:
                 raise InputError.of("stare.bands_nm", (low, high), "ascending wavelengths", unit="nm")
-
-    @property
-    def has_unknowns(self) -> bool:
-        """True if the stare has unknown changes."""
-        return any(getattr(self, name) for name in (*COURSES, *STARE_PROCESSES))
-
-    def all_gaps(self) -> list[tuple[float, float]]:
-        """Return the given gaps and the gap at the end of every orbit."""
-        every = [*self.gaps]
-        if self.orbit_gap_s:
-            orbits = math.ceil(self.duration_s / self.orbit_s)
-            every += [((n + 1) * self.orbit_s - self.orbit_gap_s, (n + 1) * self.orbit_s) for n in range(orbits)]
-        return every
 
 
 #: Keys of the size of an event.
@@ -140,16 +113,16 @@ class EventChoice(Section):
     """
 
     peak_s: Annotated[float, Unit("s"), Help("Time of the peak after the start of the stare")]
-    half_width_s: Annotated[Duration | None, Help("Half-width of the shape", default="the stare's")] = None
-    amplitude: Annotated[Amplitude | None, Help("Amplitude of the shape", default="the flare's")] = None
-    peak: Annotated[Amplitude | None, Help("Maximum of the shape, instead of its amplitude")] = None
-    equivalent_duration_s: Annotated[Duration | None, Help("Equivalent duration, instead of an amplitude")] = None
-    energy_erg: Annotated[Energy | None, Help("Energy, instead of an amplitude")] = None
-    energy: Annotated[Literal["bolometric", "band"], Help("Meaning of the energy")] = "bolometric"
-    temperature_k: Annotated[Temperature | None, Help("Temperature", default="the flare's")] = None
-    cooling: Annotated[CoolingLaw | None, Help("Exponential cooling from that temperature")] = None
-    shape: Annotated[ShapeName | None, Help("Shape", default="the stare's", choices=", ".join(SHAPE_NAMES))] = None
-    shape_file: Annotated[Path | None, Help("File of a shape with two columns, time in half-widths and value")] = None
+    half_width_s: Duration | None = setting(None, "Half-width of the shape", usual="the stare's")
+    amplitude: Amplitude | None = setting(None, "Amplitude of the shape", usual="the flare's")
+    peak: Amplitude | None = setting(None, "Maximum of the shape, instead of its amplitude")
+    equivalent_duration_s: Duration | None = setting(None, "Equivalent duration, instead of an amplitude")
+    energy_erg: Energy | None = setting(None, "Energy, instead of an amplitude")
+    energy: Literal["bolometric", "band"] = setting("bolometric", "Meaning of the energy")
+    temperature_k: Temperature | None = setting(None, "Temperature", usual="the flare's")
+    cooling: CoolingLaw | None = setting(None, "Exponential cooling from that temperature")
+    shape: ShapeName | None = setting(None, "Shape", usual="the stare's", choices=SHAPE_NAMES)
+    shape_file: Path | None = setting(None, "File of a shape with two columns, time in half-widths and value")
 
     def _check_values(self) -> None:
         check_one(self, "an event", *SIZES)
@@ -160,16 +133,6 @@ class EventChoice(Section):
         """Keys of the given sizes, at most one."""
         return given_keys(self, SIZES)
 
-    def load_shape(self, default: str) -> Shape:
-        """Return the shape, or the published shape named `default` if none is given."""
-        from mauvecl.flares.shapes import TableShape, shape_of
-        from mauvecl.host.tables.text_tables import read_columns
-
-        if self.shape_file is None:
-            return shape_of(self.shape or default)
-        columns = read_columns("flare shape", "values", self.shape_file)
-        return TableShape(columns[:, 0], columns[:, 1], self.shape_file.stem, shortened(self.shape_file.name))
-
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
 CYCLE_ORBITS = 3.0
@@ -178,45 +141,40 @@ CYCLE_ORBITS = 3.0
 class SearchChoice(Section):
     """Search of a stare for flares, and its rate of false alarms."""
 
-    shape: ShapeOfFlares = "davenport2014"
-    half_widths_s: Annotated[tuple[Duration, ...], Field(min_length=1), Help("Half-widths of the template bank")] = (
-        HALF_WIDTHS_S
+    shape: ShapeName = setting("davenport2014", "Shape of flares", flag="--shape", choices=SHAPE_NAMES)
+    half_widths_s: tuple[Duration, ...] = setting(HALF_WIDTHS_S, "Half-widths of the template bank", min_length=1)
+    sums: Annotated[int, Range(1, 8)] = setting(RANK, "Largest number of weighted sums per frame")
+    offset: bool = setting(True, "Whether to marginalise over the offset of the baseline")
+    slope: bool = setting(True, "Whether to marginalise over the slope of the baseline")
+    cycle: bool | None = setting(
+        None, "Whether to marginalise over the orbital cycle", usual="if the stare has an unknown cycle"
     )
-    sums: Annotated[int, Range(1, 8), Help("Largest number of weighted sums per frame")] = RANK
-    offset: Annotated[bool, Help("Whether to marginalise over the offset of the baseline")] = True
-    slope: Annotated[bool, Help("Whether to marginalise over the slope of the baseline")] = True
-    cycle: Annotated[
-        bool | None, Help("Whether to marginalise over the orbital cycle", default="if the stare has an unknown cycle")
-    ] = None
-    window_s: Annotated[
-        Annotated[float, Unit("s"), Range(0)] | None,
-        Help("Window of the baseline", default="1800, or three orbits with a cycle"),
-    ] = None
-    frame: Annotated[
-        dict[NuisanceName, Spread],
-        Help("Standard deviations of nuisance parameters of each frame, in addition to the stare's jitters"),
-    ] = Field(default_factory=dict)
-    false_alarms: Annotated[
-        Positive,
-        Help("False alarms of the search per star-day, star-month or star-year"),
-        Flag("--false-alarms"),
-        Widget(
-            "False alarms", "Expected number of detections that are only noise, in the time that the next field states."
-        ),
-    ] = 1.0
-    per: Annotated[
-        Per,
-        Help("Star-time of frames for the false alarms"),
-        Flag("--alarms-per"),
-        Widget("False alarms per", "Observing time of one star to which the number of false alarms refers."),
-    ] = "month"
-    null: Annotated[
-        Literal["sampled", "counted"],
-        Help("Threshold from importance sampling of normal noise, or counted in simulated stares"),
-    ] = "sampled"
-    nulls: Annotated[int, Range(0, 1_000_000), Help("Simulated stares without a flare")] = 100
-    points: Annotated[int, Range(1, 100), Help("Consecutive frames of the conventional rule, for comparison")] = 3
-    sigma: Annotated[Positive, Help("Threshold of the conventional rule, in standard deviations")] = 3.0
+    window_s: Annotated[float, Unit("s"), Range(0)] | None = setting(
+        None, "Window of the baseline", usual="1800, or three orbits with a cycle"
+    )
+    frame: dict[NuisanceName, Spread] = setting(
+        dict, "Standard deviations of nuisance parameters of each frame, in addition to the stare's jitters"
+    )
+    false_alarms: Positive = setting(
+        1.0,
+        "False alarms of the search per star-day, star-month or star-year",
+        flag="--false-alarms",
+        label="False alarms",
+        hint="Expected number of detections that are only noise, in the time that the next field states.",
+    )
+    per: Per = setting(
+        "month",
+        "Star-time of frames for the false alarms",
+        flag="--alarms-per",
+        label="False alarms per",
+        hint="Observing time of one star to which the number of false alarms refers.",
+    )
+    null: Literal["sampled", "counted"] = setting(
+        "sampled", "Threshold from importance sampling of normal noise, or counted in simulated stares"
+    )
+    nulls: Annotated[int, Range(0, 1_000_000)] = setting(100, "Simulated stares without a flare")
+    points: Annotated[int, Range(1, 100)] = setting(3, "Consecutive frames of the conventional rule, for comparison")
+    sigma: Positive = setting(3.0, "Threshold of the conventional rule, in standard deviations")
 
     def _check_values(self) -> None:
         if list(self.half_widths_s) != sorted(set(self.half_widths_s)):
@@ -262,28 +220,25 @@ Size = Literal["amplitude", "duration", "energy", "band_energy"]
 class InjectionQuestion(Section):
     """Grid of sizes and half-widths of injected flares, which have the study's flare temperature and band."""
 
-    of: Annotated[
-        Size | None,
-        Help(
-            "Measure of the size of injected flares",
-            "durations in s, energies in erg",
-            default="energy if the star's size is known, else amplitude",
-        ),
-        Flag("--size"),
-    ] = None
-    low: Annotated[Positive | None, Help("Smallest size", default="0.3 of what is found"), Flag("--smallest")] = None
-    high: Annotated[Positive | None, Help("Largest size", default="3 times what is found"), Flag("--largest")] = None
-    sizes: Annotated[int, Range(2, 256), Help("Number of sizes, evenly spaced in the logarithm")] = 16
-    widths: Annotated[int, Range(1, 256), Help("Number of half-widths, evenly spaced in the logarithm")] = 16
-    half_width_low_s: Annotated[Duration, Help("Smallest half-width")] = 10.0
-    half_width_high_s: Annotated[Duration, Help("Largest half-width")] = 1800.0
-    count: Annotated[
-        int, Range(10, 10**8), Help("Injections of each size and half-width"), Flag("--injections", "-n")
-    ] = 2_000
-    positions: Annotated[int, Range(2, 100_000), Help("Peak times in the stare")] = 40
-    fitted: Annotated[
-        int, Range(0, 100_000), Help("Injections of each size and half-width that are fitted if they are detected")
-    ] = 40
+    of: Size | None = setting(
+        None,
+        "Measure of the size of injected flares; durations in s, energies in erg",
+        flag="--size",
+        usual="energy if the star's size is known, else amplitude",
+    )
+    low: Positive | None = setting(None, "Smallest size", flag="--smallest", usual="0.3 of what is found")
+    high: Positive | None = setting(None, "Largest size", flag="--largest", usual="3 times what is found")
+    sizes: Annotated[int, Range(2, 256)] = setting(16, "Number of sizes, evenly spaced in the logarithm")
+    widths: Annotated[int, Range(1, 256)] = setting(16, "Number of half-widths, evenly spaced in the logarithm")
+    half_width_low_s: Duration = setting(10.0, "Smallest half-width")
+    half_width_high_s: Duration = setting(1800.0, "Largest half-width")
+    count: Annotated[int, Range(10, 10**8)] = setting(
+        2_000, "Injections of each size and half-width", flag="--injections -n"
+    )
+    positions: Annotated[int, Range(2, 100_000)] = setting(40, "Peak times in the stare")
+    fitted: Annotated[int, Range(0, 100_000)] = setting(
+        40, "Injections of each size and half-width that are fitted if they are detected"
+    )
 
     def _check_values(self) -> None:
         if self.low is not None and self.high is not None and not self.low < self.high:

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.flares.settings import Cooling
+from mauvecl.flares.shapes import Shape, TableShape, shape_of
 from mauvecl.flares.stare import Event, Stare, check_contributions, temperatures_of
+from mauvecl.host.tables.text_tables import read_columns
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, STARE_PROCESSES, Changing, Course
-from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.physical import DAY_S
 from mauvecl.study.stare import KNOWN_CHANGES, EventChoice, StareQuestion
 
@@ -74,13 +76,11 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
     if q.along_orbit:
         stare = _along_orbit(study, instrument.frame_s, changes)
     else:
-        stare = Stare.of(
-            q.duration_s,
-            frame_s=instrument.frame_s,
-            gaps=q.all_gaps(),
-            temperature_c=instrument.temperature_c,
-            **changes,
-        )
+        n_orbits = math.ceil(q.duration_s / q.orbit_s) if q.orbit_gap_s else 0
+        ends = [(n + 1) * q.orbit_s for n in range(n_orbits)]
+        gaps = [*q.gaps, *((end - q.orbit_gap_s, end) for end in ends)]
+        changes |= {"frame_s": instrument.frame_s, "temperature_c": instrument.temperature_c, "gaps": gaps}
+        stare = Stare.of(q.duration_s, **changes)
     for _, changed, _, mean in priors:
         name = "temperature_c" if changed == "temperature" else changed
         value: Any = getattr(stare, name)
@@ -182,19 +182,36 @@ def events_of(study: Study, source: Source) -> list[Event]:
     events = [_event(study, choice) for choice in choices]
     # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
     kelvin = temperatures_of(events)
-    return [_of_energy(study, source, choice, event, kelvin) for choice, event in zip(choices, events, strict=True)]
+    for n, (choice, event) in enumerate(zip(choices, events, strict=True)):
+        if choice.energy_erg is None:
+            continue
+        energy = energy_of(study, source, event, choice.energy, kelvin)
+        if energy is None:
+            raise InputError(
+                f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} needs the star's distance_pc, "
+                "or radius_rsun and effective_temperature_k",
+                key="events.energy_erg",
+            )
+        # The energy is linear in the amplitude.
+        events[n] = replace(event, amplitude=choice.energy_erg / energy)
+    return events
 
 
 def _event(study: Study, choice: EventChoice) -> Event:
     """Return a flare, with amplitude 1 if its energy is given."""
-    shape, flare = choice.load_shape(study.stare.shape), study.flare
+    flare, file, cooling = study.flare, choice.shape_file, choice.cooling
+    if file is None:
+        shape: Shape = shape_of(choice.shape or study.stare.shape)
+    else:
+        columns = read_columns("flare shape", "values", file)
+        shape = TableShape(columns[:, 0], columns[:, 1], file.stem, shortened(file.name))
     half = study.stare.half_width_s if choice.half_width_s is None else choice.half_width_s
     kelvin = flare.temperature_k if choice.temperature_k is None else choice.temperature_k
-    if choice.cooling is not None and flare.spectrum.file is not None:
+    if cooling is not None and flare.spectrum.file is not None:
         raise InputError(
             "events.cooling needs a flare that has a temperature, but its spectrum is from a file", key="events.cooling"
         )
-    temperature = kelvin if choice.cooling is None else Cooling(kelvin, choice.cooling.end_k, choice.cooling.fold_s)
+    temperature = kelvin if cooling is None else Cooling(kelvin, cooling.end_k, cooling.fold_s)
     amplitude = flare.amplitudes[0] if choice.amplitude is None else choice.amplitude
     if choice.peak is not None:
         amplitude = amplitude_of_peak(choice.peak, shape)
@@ -203,18 +220,3 @@ def _event(study: Study, choice: EventChoice) -> Event:
     elif choice.energy_erg is not None:
         amplitude = 1.0
     return Event(choice.peak_s, half, amplitude, temperature, shape)
-
-
-def _of_energy(study: Study, source: Source, choice: EventChoice, event: Event, temperatures_k: Float) -> Event:
-    """Return the flare with the amplitude that follows from its energy, if one is given."""
-    if choice.energy_erg is None:
-        return event
-    # The energy is linear in the amplitude.
-    energy = energy_of(study, source, event, choice.energy, temperatures_k)
-    if energy is None:
-        raise InputError(
-            f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} needs the star's distance_pc, "
-            "or radius_rsun and effective_temperature_k",
-            key="events.energy_erg",
-        )
-    return replace(event, amplitude=choice.energy_erg / energy)

@@ -18,21 +18,12 @@ from pydantic import BaseModel, Field
 from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit import Limits
-from mauvecl.host.tables.files import (
-    check_keys,
-    parsing,
-    possible,
-    read_bytes,
-    read_ecsv,
-    read_text,
-    toml,
-    without_columns,
-)
+from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, found
-from mauvecl.schema.section import Section, built, fields_of
+from mauvecl.schema.fields import AnyUnit, Flag, Help, found, number
+from mauvecl.schema.section import Section, built, fields_of, setting
 from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
 from mauvecl.study.keywords import Keyword, changes_of, stars_of, values_of
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -56,7 +47,7 @@ if TYPE_CHECKING:
 
 def read_embedded_study(path: Path) -> str:
     """Return the text of the study in an answer's metadata."""
-    study = read_ecsv(path, "study", "give an answer's ECSV table").meta.get("study")
+    study = files.read_ecsv(path, "study", "give an answer's ECSV table").meta.get("study")
     if not isinstance(study, str):
         raise InputError(f"{path.name} contains no study; give an answer's ECSV table", key="study")
     return study
@@ -118,12 +109,17 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
     Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
     Raises InputError if no file with the name and digest is found.
     """
+    study = table.parent / "study.toml"
     for section in tables_in(data):
         for key in [key for key, name in section.items() if f"{key}_sha256" in section and isinstance(name, str)]:
             name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
-            places = [table.parent / name, table.parent.parent / name, Path(name), *_beside(table, name)]
-            files = ((place, without_columns(place)[0]) for place in places)
-            found = next((place for place, file in files if file.is_file() and _digest(file) == digest), None)
+            text = files.read_text(study, "study file") if study.is_file() else ""
+            tables = tables_in(files.toml(text, "study file 'study.toml'"))
+            texts = (text for keys in tables for text in keys.values() if isinstance(text, str))
+            named = (table.parent / text for text in texts if Path(text).name == name)
+            places = [table.parent / name, table.parent.parent / name, Path(name), *named]
+            there = (place for place in places if files.without_columns(place)[0].is_file())
+            found = next((place for place in there if _digest(place) == digest), None)
             if found is None:
                 raise InputError(
                     f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is "
@@ -133,30 +129,8 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
             section[key] = str(found.resolve())
 
 
-def _beside(table: Path, name: str) -> list[Path]:
-    """Return the files of this name in the ``study.toml`` next to a table."""
-    study = table.parent / "study.toml"
-    if not study.is_file():
-        return []
-    data = toml(read_text(study, "study file"), "study file 'study.toml'")
-    texts = [value for section in tables_in(data) for value in section.values() if isinstance(value, str)]
-    return [table.parent / file for file in texts if Path(file).name == name]
-
-
-def _digest(file: Path) -> str:
-    return hashlib.sha256(read_bytes(file, "spectrum file")).hexdigest()
-
-
-def parse_toml_value(text: str) -> Any:
-    """Parse a TOML value; a bare word is text."""
-    check_keys(text, f"value {shortened(text)}")
-    with parsing(f"value {shortened(text)}", "give a TOML value"):
-        try:
-            parsed = tomllib.loads(f"value = {text}")
-        except tomllib.TOMLDecodeError:
-            return text
-    # Text of several lines would define several keys.
-    return parsed["value"] if len(parsed) == 1 else text
+def _digest(path: Path) -> str:
+    return hashlib.sha256(files.read_bytes(files.without_columns(path)[0], "spectrum file")).hexdigest()
 
 
 def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
@@ -204,9 +178,7 @@ class Study(Section):
     True
     """
 
-    version: Annotated[Literal[2], Help("Version of the study's keys and defaults; none in files of version 1")] = (
-        VERSION
-    )
+    version: Literal[2] = setting(VERSION, Help("Version of the study's keys and defaults; none in files of version 1"))
     star: Annotated[tuple[Star, ...], Field(min_length=1)] = PAPER_STARS
     flare: Flare = Flare()
     observation: Observation = Observation()
@@ -244,9 +216,9 @@ class Study(Section):
     def read(cls, path: str | Path) -> Self:
         """Read a study file, or the study in an answer's ECSV table."""
         path = Path(path)
-        text = read_embedded_study(path) if path.suffix == ".ecsv" else read_text(path, "study file")
-        data = toml(text, f"study file {shortened(path.name)}")
-        if not _has_values(data):
+        text = read_embedded_study(path) if path.suffix == ".ecsv" else files.read_text(path, "study file")
+        data = files.toml(text, f"study file {shortened(path.name)}")
+        if not _without_empty(data):
             raise InputError(
                 f"study file {shortened(path.name)} must set at least one key, such as magnitude in [[star]], but "
                 "sets nothing; a verb without a study file answers the paper's question",
@@ -262,7 +234,7 @@ class Study(Section):
     @classmethod
     def build(cls, data: dict[str, Any], where: str) -> Self:
         """Validate nested data; raises InputError for the first invalid value."""
-        possible(data, where)
+        files.possible(data, where)
         return built(cls, data, where)
 
     @classmethod
@@ -324,7 +296,12 @@ class Study(Section):
             path, equals, value = (part.strip() for part in text.partition("="))
             if not (path and equals):
                 raise InputError.of("setting", text, "key=value, such as run.fap=0.01")
-            set_key(data, path.split("."), parse_toml_value(value), text)
+            named, parsed = f"value {shortened(value)}", dict[str, Any]()
+            files.check_keys(value, named)
+            # A bare word is text, as is one of several lines, which would define several keys.
+            with files.parsing(named, "give a TOML value"), contextlib.suppress(tomllib.TOMLDecodeError):
+                parsed = tomllib.loads(f"value = {value}")
+            set_key(data, path.split("."), parsed["value"] if len(parsed) == 1 else value, text)
         return self.build(data, where)
 
     def with_enough_tails(self, *, sampled: bool = True, raised: bool = False) -> tuple[Self, list[str]]:
@@ -398,7 +375,7 @@ class Study(Section):
                     section[key] = value.name
                     # Keep the answer even if the file no longer exists.
                     with contextlib.suppress(InputError):
-                        section[f"{key}_sha256"] = _digest(without_columns(value)[0])
+                        section[f"{key}_sha256"] = _digest(value)
         return tomli_w.dumps(data)
 
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
@@ -422,7 +399,9 @@ class Study(Section):
         if quantity not in QUANTITIES:
             raise InputError.of("quantity", quantity, f"one of {', '.join(QUANTITIES)}")
         swept = QUANTITIES[quantity]
-        return self.with_value(swept.path, swept.checked(value))
+        if swept.range is not None:
+            value = number(quantity.replace("_", " "), value, swept.unit, swept.range)
+        return self.with_value(swept.path, value)
 
     @property
     def has_neighbours(self) -> bool:
@@ -436,11 +415,6 @@ def _without_empty(data: Any) -> Any:
     if not isinstance(data, dict):
         return data
     return {key: inner for key, value in data.items() if (inner := _without_empty(value)) != {}}
-
-
-def _has_values(data: Any) -> bool:
-    """Return whether nested tables contain any key."""
-    return any(map(_has_values, data.values())) if isinstance(data, dict) else True
 
 
 #: The paper's noise budgets (its section "Noise"): the Be star HD 37202 and both flare stars, 50 s and 600 s.

@@ -100,9 +100,6 @@ def test_linker_is_found_without_path(path: str | None, tmp_path: Path) -> None:
 
 # Kinds of input
 
-LONG, NOT_TEXT, CONTROL = "x" * 5000, "\udcff\udcfe", "y" * 300 + ".txt"
-NAMES = [LONG, NOT_TEXT, CONTROL]
-
 
 def refused(*words: str, folder: Path) -> str:
     """Run the command, check that it fails with one sentence, and return the sentence."""
@@ -114,14 +111,22 @@ def refused(*words: str, folder: Path) -> str:
     return line
 
 
-@pytest.mark.parametrize("name", NAMES, ids=["long", "undecodable", "a long part"])
-@pytest.mark.parametrize(
-    "words",
-    ["simulate --star", "simulate", "simulate --instrument", "detect --flares", "verify", "library add",
-     "detect --star G2V -n 5000 --fap .05 --cluster"],
-)  # fmt: skip
-def test_invalid_file_names_exit_with_code_2(words: str, name: str, tmp_path: Path) -> None:
-    refused(*words.split(), name, folder=tmp_path)
+#: Commands with names that no file can have, and with other words that tables of refusals cannot hold.
+IMPOSSIBLE = [
+    *((*words.split(), name) for name in ("x" * 5000, "\udcff\udcfe", "y" * 300 + ".txt") for words in (
+        "simulate --star", "simulate", "simulate --instrument", "detect --flares", "verify", "library add",
+        "detect --star G2V -n 5000 --fap .05 --cluster",
+    )),
+    (*DETECT, "--cluster", "tcp://\udcff:1"), (*DETECT, "--cluster", "local:" + "9" * 5000),
+    ("library", "fetch", "ngsl:HD 1", "--from", "http://\udcff/"), ("verify", "deep"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(len(IMPOSSIBLE)))
+def test_impossible_words_are_refused(number: int, tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "zarr.json").write_text("[" * 100_000)
+    refused(*IMPOSSIBLE[number], folder=tmp_path)
 
 
 NUMBERS = ["1e-308", "5e-324", "1e-31", "1e31", "1e308", "9" * 5000, str(2**64), "0x" + "f" * 5000, "-" + "9" * 400]
@@ -197,18 +202,6 @@ def test_output_that_is_a_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     refused(*OBSERVE, "-o", "file", folder=tmp_path)
     refused(*OBSERVE, "-o", "file/below", folder=tmp_path)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [(*DETECT, "--cluster", "tcp://\udcff:1"), (*DETECT, "--cluster", "local:" + "9" * 5000),
-     ("library", "fetch", "ngsl:HD 1", "--from", "http://\udcff/"), ("verify", "deep")],
-    ids=["cluster", "long cluster", "collection", "deep store"],
-)  # fmt: skip
-def test_what_tables_of_refusals_cannot_hold_is_refused(words: tuple[str, ...], tmp_path: Path) -> None:
-    (tmp_path / "deep").mkdir()
-    (tmp_path / "deep" / "zarr.json").write_text("[" * 100_000)
-    refused(*words, folder=tmp_path)
 
 
 # Questions without end.

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -177,16 +178,6 @@ def test_numbers_of_tables_below_a_million_have_no_power_of_ten(tmp_path: Path) 
     assert not re.search(r"\de\+0[0-5]|nan", shown)
 
 
-def test_flags_of_a_flare_set_its_spectrum(tmp_path: Path) -> None:
-    star = ("--star", "M3V", "-m", "9", "--amplitude", "0.05", "--no-pictures", "-n", "20000", "--fap", "0.01")
-    lines = ("--line", "Mg II=0.03", "--line", "280.5 = 0.01", "--line-flux", "H beta=1e-13")
-    run("detect", *star, "--balmer-jump", "2.5", *lines, "--output", "out", folder=tmp_path)
-    light = Study.read(tmp_path / "out" / "study.toml").flare.spectrum
-    assert light.balmer_jump == 2.5
-    assert light.lines == {"Mg II": 0.03, "280.5": 0.01}
-    assert light.line_fluxes == {"H beta": 1e-13}
-
-
 def test_assumptions_about_a_spectrum_are_the_first_message(tmp_path: Path) -> None:
     words = ("--wavelength-unit", "Angstrom", "-m", "8", "--exposure", "5", "--no-pictures", "-o", "out")
     done = run("simulate", "--star", DATA / "spectra" / "10lac_stis_001.txt", *words, folder=tmp_path).stdout
@@ -225,6 +216,33 @@ def test_plan_is_read_back_from_its_table_and_targets_are_not_an_answer(tmp_path
     run("visible", "targets.ecsv", "--days", "1", "--no-pictures", folder=tmp_path)
 
 
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
+
+
+def finished(folder: Path) -> dict[str, int]:
+    """Return the parts that a run has finished, with the times at which they were written."""
+    return {path.name: path.stat().st_mtime_ns for path in folder.glob("[!.]*.npz")}
+
+
+def stopped(
+    command: list[str], kept: Path, stop: signal.Signals, meanwhile: Callable[[], object] = lambda: None
+) -> None:
+    """Stop a command as soon as it has finished another part; what it had finished is kept, and not written again."""
+    before = finished(kept)
+    process = subprocess.Popen(command, cwd=kept.parents[1], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while finished(kept).keys() <= before.keys():
+        time.sleep(0.005)
+        assert process.poll() is None, process.communicate()
+    meanwhile()
+    process.send_signal(stop)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == CODES[stop]
+    assert "Traceback" not in errors
+    if stop != signal.SIGKILL:
+        assert "kept in 'out/checkpoint', and the same command with --resume continues from there" in errors
+    assert before.items() < finished(kept).items()
+
+
 LONG = ("detect", "--star", "G2V", "-m", "7.4", "--statistic", "chi2", "-n", "100000", "--no-pictures", "-o", "out")
 #: Files of somebody else in the folder of a checkpoint.
 FOREIGN = ("epoch-1.pt", "mine.npz", "deep/keep", ".unfinished-mine")
@@ -233,88 +251,44 @@ FOREIGN = ("epoch-1.pt", "mine.npz", "deep/keep", ".unfinished-mine")
 @pytest.mark.long
 def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
     """Resume after Ctrl-C, SIGTERM and SIGKILL; only files that a run wrote are removed, at a restart or the end."""
-    command, shards, kept = [*SMALL_SHARDS, *LONG, "--resume"], tmp_path / "out" / "checkpoint", 0
+    command, shards = [*SMALL_SHARDS, *LONG, "--resume"], tmp_path / "out" / "checkpoint"
     (shards / "deep").mkdir(parents=True)
     for name in FOREIGN:
         (shards / name).write_text("keep me")
 
-    def counted() -> int:
-        return sum(int(path.stem.split("-")[-1]) for path in shards.glob("[!.]*-*-*-*.npz"))
+    def is_locked() -> None:
+        for how in ("--restart", "--resume"):
+            code, _, reported = ended(*LONG, how, folder=tmp_path)
+            assert (code, "another" in reported) == (2, True), reported
 
-    for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-        process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        while counted() == kept:
-            time.sleep(0.005)
-            assert process.poll() is None
-        if stop == signal.SIGINT:
-            # While it runs, its folder is locked.
-            for how in ("--restart", "--resume"):
-                code, _, reported = ended(*LONG, how, folder=tmp_path)
-                assert (code, "another" in reported) == (2, True), reported
-        process.send_signal(stop)
-        _, errors = process.communicate(timeout=60)
-        assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[stop]
-        assert "Traceback" not in errors
-        if stop != signal.SIGKILL:
-            assert "kept in 'out/checkpoint', and the same command with --resume continues from there" in errors
-        assert counted() > kept
-        kept = counted()
+    for stop, meanwhile in ((signal.SIGINT, is_locked), (signal.SIGTERM, bool), (signal.SIGKILL, bool)):
+        stopped(command, shards, stop, meanwhile)
+    kept = sum(int(path.stem.split("-")[-1]) for path in shards.glob("[!.]*-*-*-*.npz"))
     assert "--resume" in run(*LONG, folder=tmp_path, code=2).stderr
     (shards / f".unfinished-{next(shards.glob('*-*-*-*.npz')).name}").write_text("killed while it was written")
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "out" / "run.json").read_text())["shards"]["resumed"] == kept
     assert {str(p.relative_to(shards)) for p in shards.rglob("*") if p.is_file()} == set(FOREIGN)
-    alone = tmp_path / "alone"
-    alone.mkdir()
-    run(*LONG, folder=alone)
+    run(*LONG[:-1], "alone", folder=tmp_path)
     for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
-        assert (tmp_path / "out" / name).read_bytes() == (alone / "out" / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
     run(*LONG, "--restart", folder=tmp_path)
     assert {str(p.relative_to(shards)) for p in shards.rglob("*") if p.is_file()} == set(FOREIGN)
 
 
-PLAN = """
-plan = {targets = [{name = "eps Eri"}, {name = "GJ 205"}], hours = 10, injections = 20}
-orbit = {days = 3, step_s = 300}
-search = {half_widths_s = [120]}
-"""
-STARE = """
-star = [{library = "M3V", magnitude = 9}, {library = "K5V", magnitude = 8}]
-stare = {duration_s = 1000}
-search = {half_widths_s = [60]}
-"""
-MEASURE = """
-star = [{library = "M3V", magnitude = 9}]
-flare = {amplitudes = [0.1, 0.3, 0.5, 1.0], spectrum = {balmer_jump = 2}}
-measure = {fits = 60}
-nuisances = {dark = "free"}
-"""
+#: Studies, by verb, of which it finishes several parts.
+STUDIES = DATA / "studies" / "resumed"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("verb", "study"), [("plan", PLAN), ("stare", STARE), ("measure", MEASURE)])
-def test_killed_run_is_resumed_to_the_same_bits(verb: str, study: str, tmp_path: Path) -> None:
-    """Kill a run twice: what it had finished is not written again, and the tables are those of an undisturbed run."""
-    (tmp_path / "study.toml").write_text(study)
-    words = [verb, "study.toml", "--no-pictures", "--quiet"]
-    again = [*SMALL_SHARDS, *words, "--output", "out", "--resume"]
-    kept = tmp_path / "out" / "checkpoint"
-
-    def finished() -> dict[str, int]:
-        return {path.name: path.stat().st_mtime_ns for path in kept.glob("[!.]*.npz")}
-
-    before: dict[str, int] = {}
+@pytest.mark.parametrize("verb", ["plan", "stare", "measure"])
+def test_killed_run_is_resumed_to_the_same_bits(verb: str, tmp_path: Path) -> None:
+    """Kill a run twice; the tables are those of an undisturbed run."""
+    words = [verb, STUDIES / f"{verb}.toml", "--no-pictures", "--quiet"]
+    again, kept = [*SMALL_SHARDS, *words, "--output", "out", "--resume"], tmp_path / "out" / "checkpoint"
     for _ in range(2):
-        process = subprocess.Popen(again, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        while finished().keys() <= before.keys():
-            time.sleep(0.005)
-            assert process.poll() is None, process.communicate()
-        process.send_signal(signal.SIGKILL)
-        process.communicate(timeout=60)
-        now = finished()
-        assert before.items() <= now.items(), "what was finished is kept, and not written again"
-        before = now
+        stopped(again, kept, signal.SIGKILL)
     refusal = run(*words, "--output", "out", folder=tmp_path, code=2).stderr
     assert "--resume" in refusal
     assert "--restart" in refusal
@@ -363,7 +337,7 @@ LIGHT: dict[str, set[str]] = {
     "import mauvecl; mauvecl.expect, mauvecl.Source":
         {"synphot", "matplotlib", "pyopencl", "specutils", "astropy.table", "astropy.coordinates"},
     "from mauvecl.cli.app import app; sys.argv[1:] = ['--help']; app(standalone_mode=False)":
-        {"pyopencl", "synphot", "astropy", "scipy", "pydantic", "mauvecl.study.study"},
+        {"pyopencl", "synphot", "astropy", "scipy", "pydantic", "mauvecl.study"},
     "from mauvecl.schema.section import read_ranges; read_ranges(['5:6'], '--gap', expected='', unit='s')": {"astropy"},
 }  # fmt: skip
 

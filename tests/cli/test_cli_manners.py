@@ -73,7 +73,7 @@ def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
 
 
 #: Modules during whose import a command is interrupted, and code that wraps the interrupt in another error.
-IMPORTED = ("importlib", "typing", "__future__", "mauvecl.schema.errors", "typer")
+IMPORTED = ("importlib", "typing", "__future__", "mauvecl.host", "typer")
 WRAPPED = (
     "type(str(), (), dict(name=Named()))",
     "real('pydantic_core').SchemaValidator(dict(type='literal', expected=[Named()]))",
@@ -160,7 +160,7 @@ ROOT = Path(mauvecl.__file__).parent
 OF_FLAGS = ("cli/", "web/tab.py")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 #: Docstrings, help texts, comments, the names of flags of fields, and whole commands, named as they are typed.
-MEANT = re.compile(r'"""[\s\S]*?"""|#.*|Flag\([^)]*|`(?:mauvecl|wsl) [^`]*`')
+MEANT = re.compile(r'"""[\s\S]*?"""|#.*|Flag\([^)]*|flag="[^"]*"|`(?:mauvecl|wsl) [^`]*`')
 
 
 def test_no_module_below_the_command_line_names_a_flag() -> None:

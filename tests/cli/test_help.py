@@ -170,16 +170,6 @@ def test_every_verb_with_flares_takes_the_flags_of_their_spectrum() -> None:
 # Values
 
 
-@pytest.mark.parametrize(
-    ("text", "value"), [("1e6", 10**6), ("2.5e3", 2500), (" 7000 ", 7000), ("9007199254740993", 2**53 + 1)]
-)
-def test_counts_are_read(text: str, value: int, tmp_path: Path) -> None:
-    run("simulate", "--star", "G2V,M3V", "-m", "7,8", f"--seed={text}", "--no-pictures", folder=tmp_path)
-    study = Study.read(tmp_path / "mauvecl-simulate" / "study.toml")
-    assert study.run.seed == value
-    assert [(star.library, star.magnitude) for star in study.star] == [("G2V", 7.0), ("M3V", 8.0)]
-
-
 def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
     flags = {
         max(option.opts, key=len): name

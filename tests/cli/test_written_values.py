@@ -1,6 +1,9 @@
 """Values as people write them: with units, in per cent, without a star, and with few realisations."""
 
+import shlex
+from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import pytest
 from astropy.table import Table
@@ -18,12 +21,27 @@ def test_lists_of_a_study_have_units() -> None:
     assert Study.of(sweep=[axis]).sweep.axes[0].points() == (60.0, 5.0, 7200.0)
 
 
-def test_flags_take_units(tmp_path: Path) -> None:
-    words = ("-s", "M3V", "-m", "9 mag", "-t", "10min", "-a", "24%,2 %", "--flare-temperature", "9000 K")
-    run("simulate", *words, "--sky", "22 mag/arcsec2", "--no-pictures", folder=tmp_path)
-    study = Study.read(tmp_path / "mauvecl-simulate" / "study.toml")
-    assert (study.star[0].magnitude, study.observation.exposure_s, study.flare.temperature_k) == (9.0, 600.0, 9000.0)
-    assert (study.flare.amplitudes, study.sky.surface_brightness) == (pytest.approx((0.24, 0.02)), 22.0)
+#: Flags of a simulation, and the values that they set.
+FLAGS: dict[str, dict[str, Any]] = {
+    "-s M3V -m '9 mag' -t 10min --flare-temperature '9000 K' --sky '22 mag/arcsec2'":
+        {"star.0.magnitude": 9.0, "observation.exposure_s": 600.0, "flare.temperature_k": 9000.0,
+         "sky.surface_brightness": 22.0},
+    "-s M3V -m 9 -a '24%,2 %'": {"flare.amplitudes": pytest.approx((0.24, 0.02))},
+    "-s M3V -m 9 --balmer-jump 2.5 --line 'Mg II=0.03' --line '280.5 = 0.01' --line-flux 'H beta=1e-13'":
+        {"flare.spectrum.balmer_jump": 2.5, "flare.spectrum.lines": {"Mg II": 0.03, "280.5": 0.01},
+         "flare.spectrum.line_fluxes": {"H beta": 1e-13}},
+    "-s G2V,M3V -m 7,8 --seed=2.5e3": {"run.seed": 2500, "star.1.library": "M3V", "star.1.magnitude": 8.0},
+    "-s G2V -m 7 '--seed= 7000 '": {"run.seed": 7000},
+    "-s G2V -m 7 --seed=9007199254740993": {"run.seed": 2**53 + 1},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", FLAGS)
+def test_flags_set_keys(words: str, tmp_path: Path) -> None:
+    run("simulate", *shlex.split(words), "--no-pictures", folder=tmp_path)
+    study: Any = Study.read(tmp_path / "mauvecl-simulate" / "study.toml").model_dump()
+    for key, value in FLAGS[words].items():
+        assert reduce(lambda part, name: part[int(name) if name.isdigit() else name], key.split("."), study) == value
 
 
 def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:
