@@ -18,7 +18,7 @@ from tables import processor, versions, write
 
 from mauvecl import BalmerFlare, Engine, FlareModel, Instrument, Nuisances, Source, expect, fit, forecast
 from mauvecl.detection.distributions import clopper_pearson
-from mauvecl.fits.flare_model import Reduction, derived_values
+from mauvecl.fits.flare_model import ReducedSums, derived_values
 
 SNRS, TEMPERATURES_K = (3.0, 5.0, 10.0, 30.0, 100.0, 300.0), (6_000.0, 10_000.0, 20_000.0, 30_000.0)
 QUANTITIES = ("temperature", "amplitude", "flux 200-320 nm", "flux bolometric", "jump")
@@ -88,7 +88,7 @@ def curvature(quiet, model: FlareModel, kelvin: float, linear: np.ndarray, unkno
 
     Along the amplitudes that fit best at temperatures one standard error below and above the true one.
     """
-    reduction = Reduction.of(model, quiet, model.counts(kelvin, linear), unknown)
+    reduction = ReducedSums.of(model, quiet, model.counts(kelvin, linear), unknown)
     error = forecast(quiet, model, kelvin, linear, unknown)
     log_k = np.log(kelvin)
     step = min(error.errors[0] / kelvin, np.log(kelvin / 3000.0), np.log(200_000.0 / kelvin))

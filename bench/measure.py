@@ -41,7 +41,7 @@ from mauvecl import (
     fit_two_temperatures,
 )
 from mauvecl.detection.statistics import Linear
-from mauvecl.fits.flare_model import Reduction, derived_values
+from mauvecl.fits.flare_model import ReducedSums, derived_values
 from mauvecl.fits.profile import Profile, covariance, with_bounds
 from mauvecl.fits.spectrum import BATCH
 
@@ -50,7 +50,7 @@ FRAMES, SLOW, ROUNDS = 10_000, 100, 5
 BLOCK, PART = 16_384, 2_500
 
 
-def estimate(values: np.ndarray, model: FlareModel, reduction: Reduction) -> None:
+def estimate(values: np.ndarray, model: FlareModel, reduction: ReducedSums) -> None:
     """Fit the sums of drawn exposures, without intervals."""
     sums = np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
     for start in range(0, len(sums), BATCH):
@@ -76,7 +76,7 @@ def main() -> None:
     ):  # fmt: skip
         lit = expect(star.flaring(0.5, spectrum=BalmerFlare(9500.0, true_jump)), mauve, exposure=50.0)
         model = FlareModel.of(star, mauve, quiet, jump=jump)
-        reduction = Reduction.of(model, quiet, lit.net_source_dn - quiet.net_source_dn)
+        reduction = ReducedSums.of(model, quiet, lit.net_source_dn - quiet.net_source_dn)
         # The sums as statistics, which a device draws by pixel.
         asked = tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(reduction.weights))
 

@@ -27,7 +27,7 @@ from mauvecl.cli.app import app
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.web.closed_forms import ClosedForms, Question
+from mauvecl.web.closed_forms import ClosedForms, FieldValues
 from mauvecl.web.fields import FIELDS, IDEAL, UPLOADED_FILE, Choice, Number
 from mauvecl.web.page import TABS, State, reads_of
 from mauvecl.web.tab import Tab, commands_and_programs, simulate
@@ -106,7 +106,7 @@ def page_tables(tab: Tab, state: State, closed: ClosedForms, folder: Path) -> di
     return {name: tab.table(name, closed, answers) for name in tab.files if tab.offers(name, answers)}
 
 
-def command_tables(tab: Tab, question: Question, folder: Path) -> dict[str, Table]:
+def command_tables(tab: Tab, question: FieldValues, folder: Path) -> dict[str, Table]:
     """Run the printed commands of a tab, and return the tables that they write."""
     with _working_in(folder):
         for number, one in enumerate(commands_and_programs(tab, question, folder)):

@@ -121,7 +121,7 @@ STEPS = 100
 
 
 @dataclass(frozen=True, eq=False)
-class Unknown:
+class UnknownEffect:
     """Effect of unknown instrument values on a limit."""
 
     draws: forms.DrawnStudies
@@ -149,7 +149,7 @@ class Limit(InCell):
     check: Point  # detection probability at the value, simulated again with another seed
     points: tuple[Point, ...]  # simulations of the search
     curve: tuple[tuple[float, float], ...] = field(compare=False, repr=False)  # the closed form around the limit
-    unknown: Unknown | None  # for limits averaged over unknown instrument values
+    unknown: UnknownEffect | None  # for limits averaged over unknown instrument values
     messages: tuple[str, ...]  # saturation at the limit, without and with the flare
     cost: forms.Cost  # loss of S/N to unknowns at the limit
     quiet: Expectation = field(compare=False, repr=False)  # the star at the limit, without the flare
@@ -333,7 +333,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = No
         star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
         check=check, points=simulated, curve=question.curve(value.value),
-        unknown=Unknown(draws, roots, forms.shares(draws, roots)) if draws else None,
+        unknown=UnknownEffect(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
         cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
     )  # fmt: skip

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.closed_forms import throughput_cases
-from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, Reduction, usable_variance, variance_of
+from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, ReducedSums, usable_variance, variance_of
 from mauvecl.fits.profile import Profile
 from mauvecl.fits.spectrum import Forecast, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
 from mauvecl.host.arrays import true_runs
@@ -142,7 +142,7 @@ class ExpectedMeasurement(InCell):
         assert isinstance(self.fitted, FlareModel)
         best, linear = self.perfect.log_k, self.perfect.factor[0] * self.perfect.amplitudes[0]
         mean_dn = self.fitted.counts(float(np.exp(best[0])), linear)
-        reduction = Reduction.of(self.fitted, self.quiet, mean_dn, self.unknown, self.skipped_nm)
+        reduction = ReducedSums.of(self.fitted, self.quiet, mean_dn, self.unknown, self.skipped_nm)
         mean, light = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed, reduction.light
         of_light = None
         if light is not None:

@@ -196,7 +196,7 @@ def _best(title: str, x: Expectation, number: int) -> str:
     return f"{best}{without}{first_of(number, 'cases')}."
 
 
-class Observation(NamedTuple):
+class SimulatedObservation(NamedTuple):
     """A simulated observation."""
 
     title: str
@@ -229,7 +229,7 @@ class SimulateAnswer(Answer):
     ENDINGS = ("ecsv", "fits")
 
     study: Study
-    observations: list[Observation]
+    observations: list[SimulatedObservation]
     messages: list[str]
 
     #: Peak, best closed-form S/N and saturated pixels of each observation.
@@ -287,7 +287,7 @@ def simulate(
             title = star_label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **case.draw_options)
             table.meta["study"] = study.text()
-            observations.append(Observation(title, x, table))
+            observations.append(SimulatedObservation(title, x, table))
     messages = collect_messages([observation.expectation for observation in observations], study.processes)
     return SimulateAnswer(study, observations, messages)
 

@@ -68,7 +68,7 @@ class Line(Series):
 
 
 @dataclass(frozen=True)
-class Band(Series):
+class Area(Series):
     """Area between two lines."""
 
     alpha: float = 0.22

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Dots, Line, Panel, Picture, Rule, Series
+from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Dots, Line, Panel, Picture, Rule, Series
 from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
 from mauvecl.detection.names import NoThresholdError
 from mauvecl.detection.requests import statistic_label
@@ -85,7 +85,7 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
         edges, counts = outcome.histogram(statistic, flare, bins=120)
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
         ends += [edges[0], edges[-1]]
-        series.append(Band("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)))
+        series.append(Area("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)))
         series.append(Line(name, colour, step=True, at=(middle, height)))
     # Statistics that are scaled by the flare have a threshold per flare.
     own, cuts = chosen if kind.shaped and not linear else [0], list[float]()
@@ -148,7 +148,7 @@ def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
     for colour, (title, curve) in zip(cycle(COLOURS), named, strict=False):
         fap, probability, low, high = roc_columns(curve)
         text = f"{title}: area {curve.area.value:.4f}".removeprefix(": ")
-        series += [Line(text, colour, at=(fap, probability)), Band("", colour, alpha=0.3, at=(fap, low, high))]
+        series += [Line(text, colour, at=(fap, probability)), Area("", colour, alpha=0.3, at=(fap, low, high))]
     x, y = Axis("false-alarm probability per test", log=True), Axis("detection probability", limits=(0, 1.02))
     return Panel(x, y, series)
 
@@ -167,7 +167,7 @@ def spectra(stars: Sequence[Shown]) -> Picture:
         drawn = [(names[k], outcome.flares[k], COLOURS[i % len(COLOURS)]) for i, k in enumerate(_drawn_flares(names))]
         mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
         spectra = [Line(name, colour, at=(nm, x.signal_dn / x.exposure_s)) for name, x, colour in drawn[::-1]]
-        band = Band("1 sigma of a pixel", alpha=0.35, at=(nm, mean - noise, mean + noise))
+        band = Area("1 sigma of a pixel", alpha=0.35, at=(nm, mean - noise, mean + noise))
         series = [*spectra, band, Line("no flare", "text", dash="dashed", at=(nm, mean))]
         y = Axis("net signal (DN s$^{-1}$ pixel$^{-1}$)")
         above.append(Panel(WAVELENGTH, y, series, f"{title}, {quiet.exposure_s:g} s"))
@@ -233,8 +233,8 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult]]) -> Picture:
 def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable) -> Panel:
     """Return the S/N in closed form, over the ranges of realisations."""
     series: list[Series] = [
-        Band("95 % of realisations", "star", alpha=0.25, at=(nm, table["q2.5"], table["q97.5"])),
-        Band("68 % of realisations", "star", alpha=0.45, at=(nm, table["q16"], table["q84"])),
+        Area("95 % of realisations", "star", alpha=0.25, at=(nm, table["q2.5"], table["q97.5"])),
+        Area("68 % of realisations", "star", alpha=0.45, at=(nm, table["q16"], table["q84"])),
         Line("closed form", "text", width=1.2, at=(nm, expected)),
     ]
     return Panel(WAVELENGTH, Axis(f"S/N {what}"), series, title)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from mauvecl.charts import matplotlib as figures
-from mauvecl.charts.chart import Axis, Band, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.chart import Area, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
 from mauvecl.schema.columns import First, part_note
 
@@ -78,7 +78,7 @@ def curves(answer: InjectAnswer) -> Picture:
         for k, colour in zip(picked, cycle(COLOURS), strict=False):
             name = f"half-width {f.half_widths_s[k]:.0f} s"
             series += [
-                Band("", colour, alpha=0.25, at=(f.sizes, f.completeness_low[k], f.completeness_high[k])),
+                Area("", colour, alpha=0.25, at=(f.sizes, f.completeness_low[k], f.completeness_high[k])),
                 Line(name, colour, at=(f.sizes, f.completeness[k])),
             ]
         series.append(Rule("50 % and 90 %", "text", along="y", at=(0.5, 0.9)))
@@ -265,7 +265,7 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
         parts: list[Series] = [
             *strips,
             Dots("frames", "text", size=2.5, alpha=0.7, at=(time[used], flux[used])),
-            Band("95 % of the level", "sky", alpha=0.3, at=(time, middle - reach, middle + reach)),
+            Area("95 % of the level", "sky", alpha=0.3, at=(time, middle - reach, middle + reach)),
             Line("level without flares", "sky", width=1.6, at=(time, middle)),
         ]
         if left_out.any():
@@ -319,7 +319,7 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     assert spectra is not None
     noise = spectra.series.noise
     nm, series = noise.wavelength_nm, list[Series]()
-    series.append(Band("95 % of normal noise", at=(nm, noise.low / noise.stated, noise.high / noise.stated)))
+    series.append(Area("95 % of normal noise", at=(nm, noise.low / noise.stated, noise.high / noise.stated)))
     for name, which, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
         if which.any():
             series.append(Dots(name, colour, size=4, at=(nm[which], (noise.measured / noise.stated)[which])))
@@ -360,7 +360,7 @@ SCATTER = Chart(
     "scatter", "Noise of quiescent frames", Axis("frames in a mean", log=True),
     Axis("scatter (noise of one frame)", log=True),
     (
-        Band("95 % of independent frames", name="range", alpha=0.4),
+        Area("95 % of independent frames", name="range", alpha=0.4),
         Line("independent frames", name="white"),
         Dots("measured", "star", size=8, tips=("frames", "scatter")),
     ),

@@ -11,7 +11,7 @@ from typing import Any, ParamSpec
 
 import numpy as np
 
-from mauvecl.charts.chart import AXES, Band, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets, register
+from mauvecl.charts.chart import AXES, Area, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets, register
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
@@ -79,7 +79,7 @@ def _figure_class() -> Any:
     """Return the class of figures, which imports matplotlib."""
     from matplotlib.figure import Figure
 
-    class Picture(Figure):
+    class NotebookFigure(Figure):
         """Matplotlib figure that notebooks display."""
 
         def _repr_png_(self) -> bytes:
@@ -87,7 +87,7 @@ def _figure_class() -> Any:
             self.savefig(content, format="png")
             return content.getvalue()
 
-    return Picture
+    return NotebookFigure
 
 
 def new_figure(size: tuple[float, float], **how: Any) -> Any:
@@ -312,7 +312,7 @@ def _draw_series(axis: Any, item: Series) -> Any:
         case Targets():
             for colour, (name, x, y) in zip(cycle(COLOURS), at, strict=False):
                 axis.plot(x, y, color=colour, label=name, **width)
-        case Band():
+        case Area():
             axis.fill_between(*at, step="mid" if item.step else None, **look, linewidth=0)
         case Dots():
             form = "o" if item.marker == "circle" else item.marker or "none"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import WAVELENGTH, Axis, Band, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Strips, Targets
+from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Strips, Targets
 from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of, styled_picture
 from mauvecl.schema.columns import First, with_error
 
@@ -44,7 +44,7 @@ def source(star: Source) -> Panel:
 def expectation(x: Expectation) -> Panel:
     """Plot the mean signal of an exposure with its noise."""
     w, mean, noise = (x.table[name].value for name in ("wavelength", "signal", "noise"))
-    band = Band("1 sigma of a pixel", alpha=0.35, at=(w, mean - noise, mean + noise))
+    band = Area("1 sigma of a pixel", alpha=0.35, at=(w, mean - noise, mean + noise))
     line = Line("mean signal", "star", width=1.2, at=(w, mean))
     return Panel(Axis("wavelength (nm)", limits=(w[0], w[-1])), Axis("DN per pixel"), [band, line],
                  f"{x.name}, {x.exposure_s:g} s")  # fmt: skip
@@ -109,7 +109,7 @@ def throughput(instrument: Instrument) -> Picture:
         origin, label = "calibrated", "95 %"
         low, high = (np.exp(sign * 1.96 * errors.sd(w)) for sign in (-1, 1))
     quantum = Line("", "star", at=(w, 100 * instrument.quantum_efficiency(w)))
-    band, line = Band(label, alpha=0.25, at=(w, low * spread, high * spread)), Line("", "flare", at=(w, spread))
+    band, line = Area(label, alpha=0.25, at=(w, low * spread, high * spread)), Line("", "flare", at=(w, spread))
     above = Panel(WAVELENGTH, Axis("quantum efficiency (%)"), [quantum], f"{instrument.name}: {origin}")
     below = Panel(WAVELENGTH, Axis("end-to-end throughput (%)"), [line, band])
     return Picture([[above], [below]], (3.6, 4.0), share_x=True)
@@ -132,7 +132,7 @@ BIN, GROUPS = 16, 60
 THROUGHPUT = Chart(
     "throughput", "Throughput: fitted and nominal", WAVELENGTH, Axis("electrons per photon (%)"),
     (
-        Band("95 % interval", "star", "band", alpha=0.35),
+        Area("95 % interval", "star", "band", alpha=0.35),
         Line("fitted", "star", width=2, tips=("nm", "fitted (%)")),
         Line("nominal", dash="dashed"),
     ),

@@ -524,7 +524,7 @@ class MeanSums:
 
 
 @dataclass(frozen=True, eq=False)
-class Reduction(MeanSums):
+class ReducedSums(MeanSums):
     """Weights of sums, and the mean sums of a model's flares."""
 
     variance: Float  # of the exposure, zero in pixels that are not used, shape (n_pixel,)

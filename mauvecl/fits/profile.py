@@ -30,7 +30,7 @@ from mauvecl.fits.flare_model import Ratio, derived_values
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from mauvecl.fits.flare_model import FlareModel, MeanSums, Reduction
+    from mauvecl.fits.flare_model import FlareModel, MeanSums, ReducedSums
 
 Float = NDArray[np.float64]
 
@@ -749,7 +749,7 @@ class BoundedProfile(Profile):
         return climbed
 
 
-def with_bounds(reduction: Reduction, sums: Float, best: BestFit) -> BestFit:
+def with_bounds(reduction: ReducedSums, sums: Float, best: BestFit) -> BestFit:
     """Return fits with amplitudes of at least zero, from fits without this bound."""
     negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
     return best.replaced(negative, BoundedProfile(reduction, sums[negative]).best()) if negative.size else best

@@ -22,7 +22,7 @@ from mauvecl.fits.flare_model import (
     Derived,
     FlareModel,
     Ranges,
-    Reduction,
+    ReducedSums,
     check_enough,
     derived_values,
     undimmed,
@@ -270,15 +270,15 @@ class _Problem:
         #: Mean of the frames without a flare, and rises of chi-squared at the ends of intervals of each level.
         self.mean_dn = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
         self.rises = [float(scipy.stats.chi2.isf(1 - level, 1)) for level in levels]
-        #: Reduction of exposures with a flare, for its mean and further options of `Reduction.of`.
-        self.reduction = partial(Reduction.of, model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
+        #: Reduction of exposures with a flare, for its mean and further options of `ReducedSums.of`.
+        self.reduction = partial(ReducedSums.of, model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
 
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
         """Yield frames less their mean without a flare, in blocks that fit into a processor's cache."""
         for start in range(0, rows.size, FRAMES_AT_ONCE):
             yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
 
-    def profile(self, reduction: Reduction, rows: NDArray[np.intp]) -> Profile:
+    def profile(self, reduction: ReducedSums, rows: NDArray[np.intp]) -> Profile:
         """Return the profile of some frames."""
         light = np.zeros((0, self.mean_dn.size)) if reduction.light is None else reduction.light.weights[None]
         weights = np.vstack([reduction.weights, light])
@@ -286,7 +286,7 @@ class _Problem:
         n = len(reduction.weights)
         return Profile(reduction, sums[:, :n], sums[:, n] if len(light) else None)
 
-    def quiescent_chi2(self, reduction: Reduction, rows: NDArray[np.intp]) -> Float:
+    def quiescent_chi2(self, reduction: ReducedSums, rows: NDArray[np.intp]) -> Float:
         """Return chi-squared of some frames without a flare, shape (n,)."""
         return np.concatenate([reduction.quiescent_chi2(excess) for excess in self._excess(rows)])
 
@@ -301,7 +301,7 @@ class _Problem:
         used = usual.variance > 0.0
         counts = np.count_nonzero(raw > np.where(used, _highest_usable(quiet), np.inf), axis=1)
 
-        def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
+        def best(rows: NDArray[np.intp], reduction: ReducedSums) -> None:
             for some in _batches(rows):
                 fit_of_some = self.profile(reduction, some).best()
                 log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
@@ -321,7 +321,7 @@ class _Problem:
 
     def groups(
         self, log_k: Float, linear: Float, rows: NDArray[np.intp], near: bool
-    ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
+    ) -> Iterator[tuple[NDArray[np.intp], ReducedSums]]:
         """Yield batches of frames whose fitted flares have nearly the same variance, with their reduction.
 
         The frames are some `rows` of all, and `near` says whether pixels are near saturation in any of these.
@@ -356,7 +356,7 @@ class _Problem:
             reduction = self.reduction(mean, highest_dn=highest, clipped=clipped)
             yield from ((batch, reduction) for batch in _batches(own))
 
-    def measured(self, rows: NDArray[np.intp], reduction: Reduction) -> Measurement:
+    def measured(self, rows: NDArray[np.intp], reduction: ReducedSums) -> Measurement:
         """Measure the flares of some frames of one variance."""
         model = self.model
         profile = self.profile(reduction, rows)
@@ -377,7 +377,7 @@ class _Problem:
         return self.measurement(model, reduction, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
 
     def measurement(
-        self, model: FlareModel, reduction: Reduction, profile: Profile, best: BestFit, quiescent: Float,
+        self, model: FlareModel, reduction: ReducedSums, profile: Profile, best: BestFit, quiescent: Float,
         ends: tuple[Float, Float], second: tuple[float, Slopes] | None = None,
     ) -> Measurement:  # fmt: skip
         """Return the measurement of best fits with the ends of their intervals.
@@ -489,7 +489,7 @@ def forecast_model(
     linear = factor * np.asarray(amplitudes, np.float64)[None]
     log_k, single = np.log(np.atleast_1d(temperature_k)), model.single if isinstance(model, TwoTemperatures) else model
     counts = factor * model.counts(temperature_k, amplitudes)
-    reduction = Reduction.of(single, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
+    reduction = ReducedSums.of(single, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
     one, own, slopes = single, reduction, None
     if isinstance(model, TwoTemperatures):
         second, log_k = float(log_k[1]), log_k[:1]
@@ -559,7 +559,7 @@ class TwoTemperatures:
             (*map(both, single.derived, single.splines), kelvin, share),
         )  # fmt: skip
 
-    def slopes(self, log_k: float, reduction: Reduction, lower: Float, linear: Float) -> Slopes:
+    def slopes(self, log_k: float, reduction: ReducedSums, lower: Float, linear: Float) -> Slopes:
         """Return derivatives with respect to a second log temperature of flares with lower ones, (n,), and amplitudes.
 
         The reduction is that of the model of one blackbody.
@@ -631,7 +631,7 @@ def fit_two_temperatures(
 class _Search:
     """Largest gains of exposures with a common variance at second temperatures in and next to their intervals."""
 
-    def __init__(self, model: TwoTemperatures, whole: Profile, reduction: Reduction, allowed: list[float]) -> None:
+    def __init__(self, model: TwoTemperatures, whole: Profile, reduction: ReducedSums, allowed: list[float]) -> None:
         self._model, self._whole, self._reduction, self._allowed = model, whole, reduction, allowed
         log_k = reduction.log_k
         #: Second log temperatures that may be tried, and the largest gain at each, minus infinity if not tried.

@@ -20,7 +20,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
-from mauvecl.fits.flare_model import EVERY, Ranges, Reduction
+from mauvecl.fits.flare_model import EVERY, Ranges, ReducedSums
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
@@ -153,7 +153,7 @@ def measure_along(
         If the frames have another shape, the expectation has several frames, or no bin reaches the S/N.
     """
     raw, stare = checked_frames(frames, quiet, stare)
-    reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
+    reduction = ReducedSums.of(model, quiet, None, nuisances, skipped_nm)
     sums = less_known(raw, quiet, known_strengths(stare, quiet), reduction.weights)
     total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
     shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
@@ -292,7 +292,7 @@ class _Data:
     quiet_covariance: Float  # shape (n_frame, n_sum, n_sum)
     unknown: tuple[_Level, ...]  # levels of the stare
     jitters: tuple[_Level, ...]  # levels that differ from frame to frame
-    reduction: Reduction
+    reduction: ReducedSums
     model: FlareModel
     shape: Shape
     spread: scipy.interpolate.CubicSpline  # covariance that a blackbody of amplitude 1 adds, over log temperature
@@ -539,7 +539,7 @@ def _data(
 ) -> _Data:  # fmt: skip
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
     clipped = clipped_pixels(raw, quiet)
-    reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
+    reduction = ReducedSums.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
     components = Components(quiet, np.zeros((0, weights.shape[1])), weights)

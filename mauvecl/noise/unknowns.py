@@ -72,7 +72,7 @@ class Unknown:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Process(Unknown):
+class UnknownProcess(Unknown):
     """Unknown factor on a part of the signal, drawn per frame or exposure."""
 
     of: SignalPart = "light"
@@ -178,7 +178,7 @@ STARE_PROCESSES: dict[str, type[PointingDrifts]] = {"pointing": PointingDrifts}
 
 #: Processes in the order of their tables in kernels: fields of `Processes`, keys of studies' ``processes``.
 PROCESSES = _by_name(
-    Process(
+    UnknownProcess(
         name="jitter",
         when="frame",
         stream=4,
@@ -190,7 +190,7 @@ PROCESSES = _by_name(
         drawn="share of the light lost in each frame, uniform, 0-5 %",
         source="the paper: light lost by pointing errors stays below 5 %; uniform and anew in each frame: assumption",
     ),
-    Process(
+    UnknownProcess(
         name="detector_temperature",
         of="dark",
         stream=5,
@@ -203,12 +203,12 @@ PROCESSES = _by_name(
         drawn="detector temperature, normal, +-0.5 deg C around the nominal one, cut at 2.5 deg C",
         source="assumption: the thermal cycle of one orbit",
     ),
-    Process(name="light_loss", stream=6, low=0.0, high=0.99, change=_lost("light_loss"), expected="light_loss"),
-    Process(
+    UnknownProcess(name="light_loss", stream=6, low=0.0, high=0.99, change=_lost("light_loss"), expected="light_loss"),
+    UnknownProcess(
         name="pointing_loss", stream=7, low=0.0, high=0.99, change=_lost("pointing_loss"), expected="pointing_loss"
     ),
-    Process(name="qe_scale", stream=8, low=0.01, high=100.0, change=lambda _, scale: scale - 1.0),
-    Process(
+    UnknownProcess(name="qe_scale", stream=8, low=0.01, high=100.0, change=lambda _, scale: scale - 1.0),
+    UnknownProcess(
         name="sky_level",
         of="sky",
         stream=11,

@@ -57,7 +57,7 @@ INJECTION_KEY = 0x696E6A65
 
 
 @dataclass(frozen=True, eq=False)
-class Completeness:
+class InjectionCompleteness:
     """Share of injected flares that the search detects."""
 
     half_widths_s: Float  # shape (n_width,)
@@ -75,7 +75,7 @@ class Completeness:
 def inject(
     survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int, temperature_k: float = NO_COLOUR_K,
     steps: Steps = UNREPORTED,
-) -> Completeness:  # fmt: skip
+) -> InjectionCompleteness:  # fmt: skip
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
     They are injected into `free` frames, which belong to no event; the others are left out. `steps` reports each width.
@@ -111,7 +111,7 @@ def inject(
             drawn *= np.sqrt(np.maximum(shapes, 0.0))[:, :, None]
             best = _largest_near(part, peaks, float(width), amplitudes, shapes[:, :, None] * direction, drawn)
             detected[w] += (best >= threshold).sum(axis=1)
-    return Completeness(widths, durations, detected, TIMES)
+    return InjectionCompleteness(widths, durations, detected, TIMES)
 
 
 def _largest_near(
@@ -183,7 +183,7 @@ class Analysis:
     candidates: float  # threshold for candidates
     dip: float  # statistic of the largest dip, which is the threshold if it is too large for the noise
     events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
-    completeness: Completeness  # share of flares that the search detects in these frames
+    completeness: InjectionCompleteness  # share of flares that the search detects in these frames
     scatter: list[Scatter]
     residual: Float  # shape (n_quiet, n_sum); of quiescent frames given those before them, in standard deviations
     quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.search import DetectedEvent, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import REACH
 
@@ -99,7 +99,7 @@ def fit_quiet_light(
 class EventLight:
     """Light of the flares that fit an event."""
 
-    event: Detection
+    event: DetectedEvent
     rows: slice
     light: Float  # along the direction of the event, shape (n_row,)
     photon: Float  # variance that it adds
@@ -216,7 +216,9 @@ def alternate(
     return fitted, taken
 
 
-def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps = UNREPORTED) -> tuple[list[Detection], Bool]:
+def detect_events(
+    survey: SeriesSurvey, threshold: float, steps: Steps = UNREPORTED
+) -> tuple[list[DetectedEvent], Bool]:
     """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
     # Where the star is constant, or seen for a short time, events may take any number of frames.
     varies_for_days = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
@@ -227,10 +229,10 @@ def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps = UNREPOR
     return events, taken
 
 
-def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Steps) -> tuple[list[Detection], Bool]:
+def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Steps) -> tuple[list[DetectedEvent], Bool]:
     """Detect events whose tails end at a flux in standard deviations of a frame, as `detect_events`."""
     n = survey.stare.n_frames
-    taken, found = np.zeros(n, np.bool_), list[Detection]()
+    taken, found = np.zeros(n, np.bool_), list[DetectedEvent]()
     light = np.zeros_like(survey.sums)
     noise = float(np.sqrt(np.median(survey.variance))) * min(process.excess for process in survey.processes)
     search = survey.search
@@ -270,9 +272,9 @@ def most_events(n_frames: int) -> int:
     return max(MOST_EVENTS, int(MOST_PER_FRAME * n_frames))
 
 
-def _merged(found: list[Detection]) -> list[Detection]:
+def _merged(found: list[DetectedEvent]) -> list[DetectedEvent]:
     """Return the events in order of time, without those that overlap a larger one or are its beginning or tail."""
-    kept: list[Detection] = []
+    kept: list[DetectedEvent] = []
     for one in sorted(found, key=lambda each: each.first):
         if kept:
             smaller, larger = sorted((one, kept[-1]), key=lambda each: each.value)
@@ -294,7 +296,7 @@ def _light_of(survey: SeriesSurvey, peak_s: float, half_width_s: float, amplitud
     return rows, amplitude * survey.bank.shape.mean_over(edges, peak_s, half_width_s)
 
 
-def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, threshold: float) -> list[Detection]:
+def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, threshold: float) -> list[DetectedEvent]:
     """Return the largest events among the frames that are left, at most one near another."""
     both = np.stack([part.sums, UNCERTAIN * light]) if light.any() else part.sums[None]
     # Local maxima above the threshold, of which there are many where the process does not describe the light.
@@ -314,16 +316,16 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
     order = np.argsort(bests)[::-1][: 4 * most_events(part.stare.n_frames)]
     scales = min(one.shortest_s for one in part.processes)
     scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
-    accepted: list[Detection] = []
+    accepted: list[DetectedEvent] = []
     peaks, reaches = np.empty((2, order.size))
     for n, (value, half_width, peak, along, amplitude) in enumerate(np.array(others)[:, order].T.tolist()):
         peaks[n], reaches[n] = peak, max(NEAR_WIDTHS * half_width, scale)
         if (np.abs(peak - peaks[:n]) > np.maximum(reaches[n], reaches[:n])).all():
-            accepted.append(Detection(value, half_width, peak, int(along), amplitude, 0, 0))
+            accepted.append(DetectedEvent(value, half_width, peak, int(along), amplitude, 0, 0))
     return accepted
 
 
-def _extent(survey: SeriesSurvey, taken: Bool, faint: float, one: Detection) -> tuple[int, int]:
+def _extent(survey: SeriesSurvey, taken: Bool, faint: float, one: DetectedEvent) -> tuple[int, int]:
     """Return the first and last frame in which the template of an event is brighter than a flux."""
     tau = np.linspace(0.0, LONGEST_TAIL, 1200)
     bright = tau[one.amplitude * survey.bank.shape.at(tau) > faint]
@@ -345,7 +347,7 @@ def _extent(survey: SeriesSurvey, taken: Bool, faint: float, one: Detection) -> 
 
 
 def _extended(
-    survey: SeriesSurvey, taken: Bool, extents: list[tuple[int, int]], found: list[Detection], *, crowded: bool
+    survey: SeriesSurvey, taken: Bool, extents: list[tuple[int, int]], found: list[DetectedEvent], *, crowded: bool
 ) -> list[tuple[int, int]]:
     """Extend events to frames that are brighter than the level; in crowded light curves, cut off those that are not."""
     quiet = ~taken

@@ -21,7 +21,7 @@ from mauvecl.flares.shapes import SHAPES, Shape
 from mauvecl.observations.event_windows import GENERAL_WEIGHT, Family, FittedFlare, Likelihood, Profile, Window
 
 if TYPE_CHECKING:
-    from mauvecl.observations.search import Detection, SeriesSurvey
+    from mauvecl.observations.search import DetectedEvent, SeriesSurvey
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -49,7 +49,7 @@ ROUNDS, SETTLED = 3, 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Mixture:
+class NormalMixture:
     """Mixture of normal distributions of the equivalent duration."""
 
     log_weight: Float  # shape (n,)
@@ -100,17 +100,17 @@ def _log_above(x: float, log_weight: Float, mean: Float, sd: Float, goal: float)
     return float(scipy.special.logsumexp(log_weight + scipy.special.log_ndtr((mean - x) / sd))) - goal
 
 
-def joined(parts: Sequence[Mixture]) -> Mixture:
+def joined(parts: Sequence[NormalMixture]) -> NormalMixture:
     """Return the mixture of several."""
     names = ("log_weight", "mean", "sd")
-    return Mixture(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return NormalMixture(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Fit of an event by flares of a family with some departure from their shape."""
 
-    mixture: Mixture
+    mixture: NormalMixture
     shape: Profile  # the best of the family
     flares: list[FittedFlare]  # the best, of that shape
     epsilon: float
@@ -136,7 +136,7 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
     return fits + _single(window, Family.general(), *best.best, wide)
 
 
-def flares_of(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[list[FittedFlare], float, float]:
+def flares_of(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> tuple[list[FittedFlare], float, float]:
     """Return the flares of the bank's shape that fit an event best, and scale and photon noise of its `Window`."""
     window = Window.of(survey, taken, one)
     shape = survey.bank.shape
@@ -150,7 +150,7 @@ def _flare(shape: Profile, peak: float, width: float, amplitude: float) -> Fitte
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class PosteriorGrid:
     """Posterior of a single flare of a family at nodes of peak and half-width that are not negligible."""
 
     family: Family
@@ -177,7 +177,9 @@ class Grid:
         return np.asarray((self.family.weights @ (self.parts @ weights))[self.shape, self.node])
 
     @classmethod
-    def of(cls, likelihood: Likelihood, family: Family, box: Float, outer: Float, before: Grid | None = None) -> Grid:
+    def of(
+        cls, likelihood: Likelihood, family: Family, box: Float, outer: Float, before: PosteriorGrid | None = None
+    ) -> PosteriorGrid:
         """Compute the posterior on a grid that is refined or widened until it covers all that is not negligible.
 
         `box` and `outer` are the first and the largest range of the peak and of the logarithm of the half-width.
@@ -242,12 +244,12 @@ def _ranges(window: Window) -> Float:
     return np.array([[low, high], np.log(width)])
 
 
-def _first_fit(window: Window, family: Family) -> Grid:
+def _first_fit(window: Window, family: Family) -> PosteriorGrid:
     """Return the posterior of a single flare without departures from a shape."""
     outer = _ranges(window)
-    grid = Grid.of(Likelihood.of(window, [], family.shape(0), 0.0), family, outer, outer)
+    grid = PosteriorGrid.of(Likelihood.of(window, [], family.shape(0), 0.0), family, outer, outer)
     shape, flare = grid.best
-    return Grid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, outer, grid)
+    return PosteriorGrid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, outer, grid)
 
 
 def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
@@ -354,7 +356,7 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
 
 
 def _single(
-    window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, last: Grid | None = None
+    window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, last: PosteriorGrid | None = None
 ) -> list[Fit]:
     """Fit a single flare with each departure of a family, which follows from a first fit, `shape` and `flare`.
 
@@ -365,7 +367,7 @@ def _single(
     fits = []
     for epsilon in family.epsilon:
         likelihood = Likelihood.of(window, [flare], shape, epsilon)
-        last = grid = Grid.of(likelihood, family, box, outer, last)
+        last = grid = PosteriorGrid.of(likelihood, family, box, outer, last)
         for _ in range(ROUNDS - 1 if epsilon else 0):
             # The departures are those of a flare, and the likelihood may fall as they follow the fit.
             found, member = grid.best, shape.name == family.name
@@ -375,7 +377,7 @@ def _single(
                 break
             change = abs(np.log(found[1].equivalent_duration_s / flare.equivalent_duration_s))
             (shape, flare), likelihood = found, own
-            last = grid = Grid.of(own, family, grid.box, outer, grid)
+            last = grid = PosteriorGrid.of(own, family, grid.box, outer, grid)
             if member and change < SETTLED:
                 break
         box = grid.box
@@ -390,7 +392,7 @@ def _single(
         sd = np.sqrt(along**2 / grid.information + likelihood.left + mean**2 * likelihood.level_variance) / level
         constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
         prior = float(np.log(family.prior / len(family.epsilon)))
-        fits.append(Fit(Mixture(grid.log + constant + prior, mean, sd), shape, [flare], epsilon))
+        fits.append(Fit(NormalMixture(grid.log + constant + prior, mean, sd), shape, [flare], epsilon))
     return fits
 
 
@@ -428,5 +430,5 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
         # As the grid of a single flare, without the factor of one amplitude.
         log = likelihood.log_factor - 0.5 * float(likelihood.chi2(light)) + prior
         log += 0.5 * float(np.linalg.slogdet(covariance)[1]) + (3 * n - 1) / 2 * np.log(2 * np.pi)
-        fits.append(Fit(Mixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares, epsilon))
+        fits.append(Fit(NormalMixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares, epsilon))
     return fits

@@ -30,7 +30,7 @@ from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape, cons
 from mauvecl.search.templates import REACH
 
 if TYPE_CHECKING:
-    from mauvecl.observations.search import Detection, SeriesSurvey
+    from mauvecl.observations.search import DetectedEvent, SeriesSurvey
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -191,7 +191,7 @@ class Window:
     """Bins of consecutive frames around an event, with sums along the direction of its template."""
 
     survey: SeriesSurvey
-    one: Detection
+    one: DetectedEvent
     edges: Float  # shape (n, 2); start and end of each bin
     values: Float  # shape (n,)
     noise: Float  # shape (n,); variance of the mean of each bin's frames
@@ -202,7 +202,7 @@ class Window:
     quiet_level: float = 1.0  # of the star at the peak, by the frames without events, in units of the survey's level
 
     @classmethod
-    def of(cls, survey: SeriesSurvey, taken: Bool, one: Detection, direction: int | None = None) -> Window:
+    def of(cls, survey: SeriesSurvey, taken: Bool, one: DetectedEvent, direction: int | None = None) -> Window:
         """Collect the frames of an event, and those around it that belong to no event."""
         direction = one.direction if direction is None else direction
         unit = survey.bank.directions[direction]

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import map_in_threads
-from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
+from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
 from mauvecl.observations.process import UNREPORTED, Process, Steps
-from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
+from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -75,7 +75,7 @@ class Energy:
         return self.p_value < POOR
 
 
-def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: Detection) -> Energy:
+def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: DetectedEvent) -> Energy:
     """Measure the equivalent duration of an event; the arguments are those of `measure_event`."""
     peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
     level = float(flux_level[peak]) * survey.scale / survey.level
@@ -96,7 +96,7 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     share = np.exp(np.array([one.log_total for one in mixtures]) - mixture.log_total)
     published = [fit for fit in fits if fit.shape.name != GENERAL]
     # Flares of other temperatures have another light for the same sum.
-    mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
+    mixture = joined([NormalMixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
                       for weight, factor in _directions(survey, taken, one)])  # fmt: skip
     level = float(plain.level_without(model))
     summed, error = _summed(survey, taken, flux_level, one)
@@ -135,7 +135,7 @@ def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> b
     return lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level
 
 
-def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple[float, float]]:
+def _directions(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> list[tuple[float, float]]:
     """Return the log weight of each direction of the bank, and its light relative to that of the event's direction."""
     if len(survey.bank.directions) == 1:
         return [(0.0, 1.0)]
@@ -154,7 +154,7 @@ def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple
             for value, scale in scores if value > 0]  # fmt: skip
 
 
-def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: Detection) -> tuple[float, float]:
+def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: DetectedEvent) -> tuple[float, float]:
     """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
 
     Missing frames are interpolated. The error includes that of the level given the quiescent frames.
@@ -259,7 +259,7 @@ class ObservedEvent:
 
 
 def measure_events(
-    survey: SeriesSurvey, taken: Bool, found: list[Detection], causes: Sequence[Kind] | None = None,
+    survey: SeriesSurvey, taken: Bool, found: list[DetectedEvent], causes: Sequence[Kind] | None = None,
     steps: Steps = UNREPORTED,
 ) -> list[ObservedEvent]:  # fmt: skip
     """Measure detected events in order of time; `taken` are their frames, and `causes` follow from their spectra.
@@ -280,7 +280,7 @@ def measure_events(
 
 
 def measure_event(
-    survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
+    survey: SeriesSurvey, taken: Bool, level: Float, found: DetectedEvent, cause: Kind = "flare"
 ) -> ObservedEvent:
     """Measure an event, given its cause, the frames of all events, `taken`, and the level in units of the scale."""
     first, last = found.first, found.last

@@ -39,7 +39,7 @@ WHITE = Process((), 1.0)
 
 
 @dataclass(frozen=True)
-class Detection:
+class DetectedEvent:
     """Event above the threshold of the search, before it is measured."""
 
     value: float  # statistic of the best template

@@ -30,7 +30,7 @@ from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_curve import check_usable, quiescent_light
 from mauvecl.observations.process import UNREPORTED, Steps
-from mauvecl.observations.search import MIN_BASELINE, WHITE, Detection, SeriesSurvey, bank_of, stare_of
+from mauvecl.observations.search import MIN_BASELINE, WHITE, DetectedEvent, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
 
@@ -372,7 +372,7 @@ class EventSpectrum:
 
 
 def event_spectrum(
-    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: DetectedEvent
 ) -> EventSpectrum:
     """Compare the spectrum of an event with those of flares and of changes that resemble them."""
     spectrum, variance = _weighted(survey, series, taken, one)
@@ -404,7 +404,7 @@ def event_spectrum(
 
 
 def _window(
-    survey: SeriesSurvey, taken: NDArray[np.bool_], one: Detection
+    survey: SeriesSurvey, taken: NDArray[np.bool_], one: DetectedEvent
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return the frames of an event and of its surroundings without other events, and which belong to the event."""
     lead, tail = survey.bank.window(one.half_width_s)
@@ -417,7 +417,7 @@ def _window(
 
 
 def _weighted(
-    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: DetectedEvent
 ) -> tuple[Float, Float]:
     """Return the spectrum of an event, of the size of its peak, and its variance.
 
@@ -469,7 +469,7 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_
 
 
 def measure_flare(
-    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: DetectedEvent
 ) -> Measurement | str:
     """Fit a flare to the sum of the spectra of an event, or return the reason why none is.
 

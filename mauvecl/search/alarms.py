@@ -26,7 +26,7 @@ from mauvecl.search.flare_fits import (
     Block,
     Factor,
     FittedFlares,
-    Quantity,
+    ProfiledQuantity,
     SummedStare,
 )
 from mauvecl.search.templates import LEAD, TAIL
@@ -362,11 +362,14 @@ def _intervals(
     """Return the intervals of a flare's values, and a note."""
     area = np.log(rows.sums.survey.bank.shape.equivalent_duration)
     quantities = {
-        "peak_s": Quantity(PEAK), "amplitude": Quantity(AMPLITUDE), "half_width_s": Quantity(WIDTH),
-        "temperature_k": Quantity(KELVIN), "equivalent_duration_s": Quantity(AMPLITUDE, lambda _: (0.0, 0.0)),
-    }  # fmt: skip
+        "peak_s": ProfiledQuantity(PEAK),
+        "amplitude": ProfiledQuantity(AMPLITUDE),
+        "half_width_s": ProfiledQuantity(WIDTH),
+        "temperature_k": ProfiledQuantity(KELVIN),
+        "equivalent_duration_s": ProfiledQuantity(AMPLITUDE, lambda _: (0.0, 0.0)),
+    }
     if energy is not None:
-        quantities["energy"] = Quantity(AMPLITUDE, energy)
+        quantities["energy"] = ProfiledQuantity(AMPLITUDE, energy)
     intervals, notes = {"energy": (np.nan, np.nan)}, []
     for name, quantity in quantities.items():
         if quantity.column == KELVIN and KELVIN not in rows.sums.free:

@@ -72,7 +72,7 @@ class BlendFit:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ProfiledQuantity:
     """Parameter of a flare or, with a factor, the logarithm of amplitude x half-width x factor."""
 
     column: int  # of the parameter that varies to hold the quantity: its own, or the amplitude
@@ -91,7 +91,7 @@ class Held:
     """Constraint of a fit: the value of a quantity of a flare."""
 
     flare: int
-    quantity: Quantity
+    quantity: ProfiledQuantity
     value: float
 
     def apply(self, theta: Float) -> None:
@@ -309,7 +309,7 @@ class Block:
         covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
         return covariance
 
-    def interval(self, best: BlendFit, j: int, quantity: Quantity, rises: float) -> tuple[float, float, bool]:
+    def interval(self, best: BlendFit, j: int, quantity: ProfiledQuantity, rises: float) -> tuple[float, float, bool]:
         """Return the interval of a flare's quantity from the profile likelihood, and whether the fit ends it.
 
         Chi-squared rises by `rises` at its ends. Raises BetterFitError if profiling finds a better fit.

@@ -40,7 +40,7 @@ SPECTRA = {
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class FieldValues:
     """Valid values of all fields of `fields.FIELDS`, by name, and the contents of files that stand in them."""
 
     values: Mapping[str, Any]
@@ -148,14 +148,14 @@ OTHER = "detection otherwise"
 class ClosedForms:
     """Closed-form answer to a question."""
 
-    question: Question
+    question: FieldValues
     case: Case
     #: Content of the visitor's files, as arguments of the verb by name.
     given: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, question: Question, folder: Path, *, chance: bool = True, given: Mapping[str, Any] | None = None
+        cls, question: FieldValues, folder: Path, *, chance: bool = True, given: Mapping[str, Any] | None = None
     ) -> ClosedForms:
         """Answer a question; `folder` holds the visitor's files for the study, and `given` their contents.
 

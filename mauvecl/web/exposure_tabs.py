@@ -14,8 +14,8 @@ from mauvecl.answers.signal import simulate
 from mauvecl.charts.chart import (
     SATURATED,
     WAVELENGTH,
+    Area,
     Axis,
-    Band,
     Bars,
     Chart,
     ChartData,
@@ -74,7 +74,7 @@ NOISE = Tab(
 @Chart(
     "snr", "Signal to noise without a flare", WAVELENGTH, Axis("S/N"),
     (
-        Band("95 % of realisations, per element", name="spread", alpha=0.4),
+        Area("95 % of realisations, per element", name="spread", alpha=0.4),
         SATURATED,
         Line("per pixel", "sky", "pixel", tips=("S/N per pixel",)),
         Line("per element of 10.5 nm", "star", "element", width=2, tips=("wavelength (nm)", "S/N per element")),
@@ -116,7 +116,7 @@ SIGNAL = Tab(
 @Chart(
     "recorded", "One exposure, less bias and dark", WAVELENGTH, Axis("DN in the exposure"),
     (
-        Band("95 % of draws with the flare", "flare", "spread"),
+        Area("95 % of draws with the flare", "flare", "spread"),
         SATURATED,
         Line("drawn exposure", name="drawn", width=1),
         Line("sky", "sky"),
@@ -191,7 +191,7 @@ SPECTRUM = Tab(
 @Chart(
     "excess", "Flare minus quiet, in sigma of the noise", WAVELENGTH, Axis("sigma of the noise"),
     (
-        Band("95 % of the noise", name="noise", alpha=0.16),
+        Area("95 % of the noise", name="noise", alpha=0.16),
         SATURATED,
         Dots("drawn exposure", name="drawn"),
         Line("expected per pixel", "sky", "pixel", width=1.2),
@@ -238,9 +238,9 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
         Bars("simulated", "star", "null bars", listed=False),
         Bars("simulated", "flare", "flare bars", listed=False),
         Listed("simulated", form="bars", show="if any"),
-        Band("no flare", "star", "null area", alpha=0.18, listed=False),
+        Area("no flare", "star", "null area", alpha=0.18, listed=False),
         Line("no flare", "star", "null", width=2, tips=("statistic", "density")),
-        Band("flare", "flare", "flare area", alpha=0.18, listed=False),
+        Area("flare", "flare", "flare area", alpha=0.18, listed=False),
         Line("flare", "flare", width=2, tips=("statistic", "density")),
         Rule("threshold", "threshold"),
     ),
@@ -278,7 +278,7 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
     "roc", "Receiver operating characteristic", Axis("false-alarm probability per test", log=True, limits=(1e-6, 1)),
     Axis("detection probability", limits=(-0.02, 1.03)),
     (
-        Band("simulated, 95 %", name="simulated", alpha=0.4),
+        Area("simulated, 95 %", name="simulated", alpha=0.4),
         Line("closed form", "flare", width=2, tips=("false-alarm probability", "detection probability")),
         Own(),
     ),

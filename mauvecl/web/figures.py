@@ -11,8 +11,8 @@ from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.plotting import figure
 
 from mauvecl.charts.chart import (
+    Area,
     Axis,
-    Band,
     Bars,
     Chart,
     Contours,
@@ -184,7 +184,7 @@ class Canvas:
         }  # fmt: skip
         fill: dict[str, Any] = {"source": source, "fill_color": colour, "fill_alpha": series.alpha}
         match series:
-            case Band():
+            case Area():
                 return plot.varea(*columns, **fill)
             case Strips():
                 hatch = {"hatch_pattern": "/", "hatch_color": colour, "hatch_alpha": 0.5} if series.hatched else {}

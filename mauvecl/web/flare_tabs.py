@@ -16,7 +16,7 @@ from scipy.interpolate import PchipInterpolator
 
 from mauvecl.answers.measure import COLUMNS
 from mauvecl.answers.measurements import expected_measurements, models_of
-from mauvecl.charts.chart import Axis, Band, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
+from mauvecl.charts.chart import Area, Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.study.observation import KNOWN, NuisanceChoice
@@ -327,8 +327,8 @@ def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     "region", "Temperature and amplitude: 95 % confidence region", Axis("temperature (K)"),
     Axis("amplitude of the blackbody (%)"),
     (
-        Band("dark and star free", "sky", "free", alpha=0.3),
-        Band("everything known", "flare", "known", alpha=0.5),
+        Area("dark and star free", "sky", "free", alpha=0.3),
+        Area("everything known", "flare", "known", alpha=0.5),
         Dots("simulated fits", name="fits", size=3),
         Own("the flare"),
     ),
@@ -379,7 +379,7 @@ def _ellipse(best: Float, ahead: Forecast) -> tuple[Float, Float, Float]:
     "course", "Temperature of the flare along a stare", Axis("time from the start of the stare (s)"),
     Axis("temperature (K)", log=True),
     (
-        Band("bins of frames: 95 % interval", "star", "bins", alpha=0.3),
+        Area("bins of frames: 95 % interval", "star", "bins", alpha=0.3),
         Dots("bins of frames", "star", "estimates"),
         Line("simulated flare", "total", "true", dash="dashed"),
         Line("joint fit", "flare", "joint", width=2),
@@ -460,7 +460,7 @@ LENGTHS = ("shortest", "middle", "longest")
             series
             for k, called in enumerate(LENGTHS)
             for series in (
-                Band(f"{called} flares", called, f"band {k}", listed=False),
+                Area(f"{called} flares", called, f"band {k}", listed=False),
                 Line(f"{called} flares", called, f"line {k}", width=2,
                      tips=("amplitude (%)", f"found of the {called}")),
             )

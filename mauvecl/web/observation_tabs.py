@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.frames import Frames
-    from mauvecl.web.closed_forms import ClosedForms, Question
+    from mauvecl.web.closed_forms import ClosedForms, FieldValues
     from mauvecl.web.figures import Canvas
     from mauvecl.web.uploads import Observations
 
@@ -192,7 +192,7 @@ def scatter(closed: ClosedForms, answer: AnalyseAnswer) -> ChartData:
     return ChartData(text, series)
 
 
-def read_frames(question: Question) -> dict[str, Any]:
+def read_frames(question: FieldValues) -> dict[str, Any]:
     """Read the frames."""
     frames = read_frames_of(
         question.uploads["frames"], question.uploads.get("mapping"), quality_bits=question.quality_bits
@@ -202,7 +202,7 @@ def read_frames(question: Question) -> dict[str, Any]:
     return {"frames": frames}
 
 
-def name_of(field: str, otherwise: str) -> Callable[[Question], str]:
+def name_of(field: str, otherwise: str) -> Callable[[FieldValues], str]:
     """Return the words of a question about a file: its name, or other words without one."""
     return lambda question: question.uploads[field].name if field in question.uploads else otherwise
 
@@ -258,7 +258,7 @@ def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     return ChartData(text, transfer_series(answer)[0])
 
 
-def read_observations(question: Question) -> dict[str, Any]:
+def read_observations(question: FieldValues) -> dict[str, Any]:
     """Read frames and spectra."""
     archive: Observations = question.uploads["observations"]
     files = {name: VisitorFile(name, content) for name, content in unpacked(archive.content).items()}
@@ -440,7 +440,7 @@ def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
 
 
-def columns_of_plan(question: Question) -> list[list[str]]:
+def columns_of_plan(question: FieldValues) -> list[list[str]]:
     """Return the targets, and the columns that a plan will have."""
     names = [target["name"] for target in question.targets] or ["each target"]
     headings = [column.heading for column in COLUMNS if column.heading]

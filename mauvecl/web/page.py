@@ -23,7 +23,7 @@ from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.schema.fields import as_typed
 from mauvecl.study.plan import PlanTarget
-from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, Question, chances, short
+from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, FieldValues, chances, short
 from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
 from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
@@ -248,7 +248,7 @@ class State:
         """Return the text of the named fields, on which an answer depends."""
         return tuple(self.entered[name] for name in FIELDS if name in names)
 
-    def question(self, names: Collection[str] = tuple(FIELDS)) -> Question:
+    def question(self, names: Collection[str] = tuple(FIELDS)) -> FieldValues:
         """Return the question, whose other fields have their first values.
 
         Raises InputError with the accepted values if a requested field is invalid.
@@ -258,7 +258,7 @@ class State:
             all_of_them = "; ".join(f"{ENTRIES[name].label}: {why}" for name, why in faults.items())
             raise InputError(all_of_them, key=next(iter(faults)))
         values = {name: (self._values if name in names else FIRST)[name] for name in FIELDS}
-        return Question(
+        return FieldValues(
             values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
         )
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.verbs import Verb
     from mauvecl.charts.chart import Chart
     from mauvecl.runs.pool import Pool
-    from mauvecl.web.closed_forms import Answers, ClosedForms, Question
+    from mauvecl.web.closed_forms import Answers, ClosedForms, FieldValues
 
 #: Cells along each axis of the page's map, and realisations per cell.
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
@@ -118,7 +118,7 @@ def simulate(
 FIXED = ("star", "amplitude")
 
 
-def target_words(question: Question) -> str:
+def target_words(question: FieldValues) -> str:
     """Return the targets and days of a question in words."""
     names = ", ".join(target["name"] for target in question.targets) or "no target yet"
     return f"{names}; {question.days:g} days from {question.start}"
@@ -139,7 +139,7 @@ class Tab:
     view: int = 0  # number of that table among the answer's `views`
     #: Another table below the pictures, and the rows before there is an answer.
     own_view: Callable[[ClosedForms, Answers], View] | None = None
-    rows_before: Callable[[Question], list[list[str]]] = lambda question: []
+    rows_before: Callable[[FieldValues], list[list[str]]] = lambda question: []
     #: Questions of "Share, export, cite"; by default its own simulations.
     questions: tuple[str, ...] = ()
     #: Key of `GROUPS` under whose heading it stands; by default that of the verb that answers its first question.
@@ -147,9 +147,9 @@ class Tab:
     #: Whether the chance of detection stands above it, whose fields it then shows.
     chance: bool = True
     #: Its question in words, if it has no chance.
-    words: Callable[[Question], str] = lambda q: f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
+    words: Callable[[FieldValues], str] = lambda q: f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
     #: Reads the file of the field that it `needs` on a thread of its own, and returns arguments of the verb.
-    given: Callable[[Question], dict[str, Any]] = lambda question: {}
+    given: Callable[[FieldValues], dict[str, Any]] = lambda question: {}
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
     also: tuple[str, ...] = ()
     never: tuple[str, ...] = ()
@@ -356,7 +356,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
         return path.name, path.read_bytes()
 
 
-def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[dict[str, str]]:
+def commands_and_programs(tab: Tab, question: FieldValues, folder: Path) -> list[dict[str, str]]:
     """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
     entries = []
     for name in tab.questions:

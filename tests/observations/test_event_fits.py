@@ -22,7 +22,7 @@ from mauvecl.observations.detection import detect_events
 
 @pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
 def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> None:
-    mixture = event_fits.Mixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))
+    mixture = event_fits.NormalMixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))
     expected = stats.truncnorm(-mean / 2, np.inf, mean, 2.0)
     for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
         assert mixture.quantile(probability) == pytest.approx(float(expected.ppf(probability)), rel=1e-5)
@@ -32,7 +32,7 @@ def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> 
 def test_quantiles_of_many_parts_are_those_of_their_sum(middle: float) -> None:
     rng = np.random.default_rng(2)
     log_weight, mean, log_sd = rng.normal([0.0, middle, 0.0], [1.0, 2.0, 0.4], (50_000, 3)).T
-    mixture, weight = event_fits.Mixture(log_weight, mean, np.exp(log_sd)), np.exp(log_weight)
+    mixture, weight = event_fits.NormalMixture(log_weight, mean, np.exp(log_sd)), np.exp(log_weight)
     shares = (0.025, 0.16, 0.5, 0.84, 0.975)
     none, *above = (weight @ stats.norm.sf(q, mean, np.exp(log_sd)) for q in (0.0, *map(mixture.quantile, shares)))
     assert np.array(above) / none == pytest.approx(1 - np.array(shares), abs=2e-5)
@@ -87,7 +87,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(
     for n in (SHORT, LONG):
         survey = survey_of(n, model)
         start = float(survey.stare.start_s[n // 2])
-        one = searches.Detection(100.0, 120.0, start, 0, 20.0, n // 2 - 8, n // 2 + 120)
+        one = searches.DetectedEvent(100.0, 120.0, start, 0, 20.0, n // 2 - 8, n // 2 + 120)
         taken = np.zeros(n, np.bool_)
         taken[one.first : one.last + 1] = True
         measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy)
