@@ -206,8 +206,7 @@ class Star(Section):
         """Read the star's neighbours, or return None if it has none."""
         if self.neighbours is None:
             return None
-        from mauvecl.host.exposure.neighbour_tables import read_neighbours
-        from mauvecl.host.exposure.neighbours import Neighbours
+        from mauvecl.host.exposure.neighbours import Neighbours, read_neighbours
 
         stars, notes = read_neighbours(self.neighbours, self.neighbours_of)
         return Neighbours(stars, self.neighbour_share, notes)

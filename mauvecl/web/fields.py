@@ -198,7 +198,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 
 def neighbours(text: str) -> str | None:
     """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
-    from mauvecl.host.exposure.neighbour_tables import FILES
+    from mauvecl.host.exposure.neighbours import FILES
 
     if not text.strip():
         return None
