@@ -114,25 +114,14 @@ COLUMNS = {
 @validated
 @dataclass(frozen=True, eq=False)
 class PixelMap(ContentEquality):
-    """Properties of each pixel of the whole array; None keeps the instrument's value.
+    """Properties of each pixel of the whole array, shape (n_pixel,) each; None keeps the instrument's value."""
 
-    Attributes
-    ----------
-    response, dark, gain : ndarray, shape (n_pixel,), optional
-        Factors on the electrons per photon, the dark current and the DN per electron. A hot pixel has a large factor
-        on its dark current.
-    bias_dn, read_noise_dn : ndarray, shape (n_pixel,), optional
-        DN and DN rms per frame, which replace the instrument's values.
-    source : str
-        "tag: source" of the values.
-    """
-
-    response: Float | None = None
-    dark: Float | None = None
-    gain: Float | None = None
-    bias_dn: Annotated[Float, Unit("DN")] | None = None
-    read_noise_dn: Annotated[Float, Unit("DN")] | None = None
-    source: str = "A: assumed, no source given"
+    response: Float | None = None  #: Factor on the electrons per photon.
+    dark: Float | None = None  #: Factor on the dark current; a hot pixel has a large one.
+    gain: Float | None = None  #: Factor on the DN per electron.
+    bias_dn: Annotated[Float, Unit("DN")] | None = None  #: Replaces the instrument's value.
+    read_noise_dn: Annotated[Float, Unit("DN")] | None = None  #: Replaces the instrument's value; rms per frame.
+    source: str = "A: assumed, no source given"  #: Tag and source of the values.
 
     def __post_init__(self) -> None:
         sizes = set()
@@ -252,25 +241,16 @@ CALIBRATED = {
 @validated
 @dataclass(frozen=True, eq=False)
 class ThroughputErrors(ContentEquality):
-    """Covariance of the logarithm of the throughput: the sum of the outer products of modes.
+    """Covariance of the logarithm of the throughput: the sum of the outer products of modes."""
 
-    Attributes
-    ----------
-    wavelength_nm : ndarray, shape (n,)
-        Ascending; modes are linear between these wavelengths and constant beyond them.
-    modes : ndarray, shape (n_mode, n)
-        Changes of the natural logarithm of the throughput for amplitudes of one standard deviation, those that matter
-        most first.
-    source : str
-        "tag: source" of the values.
-    values : mapping of tuple
-        Changes of the natural logarithm of other values in the first modes, by name: `CALIBRATED`. Counts determine the
-        product of gain and throughput, for instance, so that an error of the gain changes both.
-    """
-
+    #: Ascending, shape (n,); modes are linear between these wavelengths and constant beyond them.
     wavelength_nm: Annotated[Float, Unit("nm")]
+    #: Changes of the natural logarithm of the throughput for amplitudes of one standard deviation, shape (n_mode, n);
+    #: those that matter most first.
     modes: Float
-    source: str = "A: assumed, no source given"
+    source: str = "A: assumed, no source given"  #: Tag and source of the values.
+    #: Changes of the natural logarithm of other values in the first modes, by name: `CALIBRATED`. Counts determine the
+    #: product of gain and throughput, for instance, so that an error of the gain changes both.
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -38,13 +37,12 @@ FILE_VERSION = 2
 MAX_EXTENDED = 16
 
 
-def read_entries(
-    path: Path, files: Mapping[str, type[Curve | PixelMap | ThroughputErrors]]
-) -> dict[str, tuple[Any, str]]:
-    """Return the values and sources of a file, merged over those of the file that it extends.
+#: Class of a value that an instrument file may give as a path.
+Kind = type[Curve | PixelMap | ThroughputErrors]
 
-    Values of the classes in `files` may be paths, relative to their file.
-    """
+
+def _read_entries(path: Path) -> dict[str, tuple[Any, str]]:
+    """Return the values and sources of a file, merged over those of the file that it extends."""
     entries: dict[str, tuple[Any, str]] = {}
     for _ in range(MAX_EXTENDED):
         content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
@@ -54,7 +52,7 @@ def read_entries(
         if "sources" in content:
             fault = f"{path.name}: unknown key 'sources'; give each value's source in the value's own table"
             raise InputError(fault, key="sources")
-        entries = {name: _entry(name, entry, path, files.get(name)) for name, entry in content.items()} | entries
+        entries = {name: _entry(name, entry, path) for name, entry in content.items()} | entries
         if extended is None:
             return entries
         if version is None and extended == "mauve":
@@ -69,11 +67,9 @@ def read_entries(
     raise InputError(fault, key="extends")
 
 
-def _entry(
-    name: str, entry: Any, path: Path, kind: type[Curve | PixelMap | ThroughputErrors] | None
-) -> tuple[Any, str]:
+def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
     """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path."""
-    source = f"A: assumed, no source in {path.name}"
+    kind, source = FILES.get(name), f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
         if unknown or "value" not in entry:
@@ -111,7 +107,7 @@ def _as_curve(value: Any, unit: str) -> Any:
     return _read_path(plain, Curve)
 
 
-def _read_path(value: Any, kind: type[Curve | PixelMap | ThroughputErrors]) -> Any:
+def _read_path(value: Any, kind: Kind) -> Any:
     """Read a path as an object of a class; return other values unchanged."""
     return kind.read(value) if isinstance(value, str | Path) else value
 
@@ -396,6 +392,10 @@ class Instrument(Section):
 
     def _optics(self, wavelength_nm: Float) -> Float:
         losses = (1 - self.coupling_loss) ** self.couplings * (1 - self.light_loss) * (1 - self.pointing_loss)
+        calibration = 1.0 if self.throughput_factor is None else self.throughput_factor.at(wavelength_nm)
+        if self.throughput_errors is not None and self.throughput_amplitudes:
+            modes = self.throughput_errors.at(wavelength_nm)[: len(self.throughput_amplitudes)]
+            calibration = calibration * np.exp(np.tensordot(self.throughput_amplitudes, modes, 1))
         return np.asarray(
             losses
             * self.grating_efficiency.at(wavelength_nm)
@@ -404,16 +404,8 @@ class Instrument(Section):
             * self.spectrometer_mirror_reflectivity.at(wavelength_nm) ** self.spectrometer_mirrors
             * self.collection_lens_efficiency.at(wavelength_nm)
             * self.window_efficiency.at(wavelength_nm)
-            * self._calibrated(wavelength_nm)
+            * calibration
         )
-
-    def _calibrated(self, wavelength_nm: Float) -> Float | float:
-        """Return the factor of the calibration on the throughput."""
-        factor = 1.0 if self.throughput_factor is None else self.throughput_factor.at(wavelength_nm)
-        if self.throughput_errors is None or not self.throughput_amplitudes:
-            return factor
-        modes = self.throughput_errors.at(wavelength_nm)[: len(self.throughput_amplitudes)]
-        return np.asarray(factor * np.exp(np.tensordot(self.throughput_amplitudes, modes, 1)))
 
     def quantum_efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the electrons per photon that reaches the detector.
@@ -496,7 +488,7 @@ class Instrument(Section):
 
 def _from_file(name: str | Path) -> Instrument:
     path = instrument_path(name, Path())
-    entries = read_entries(path, FILES)
+    entries = _read_entries(path)
     values: dict[str, Any] = {name: value for name, (value, _) in entries.items()}
     values["sources"] = {name: source for name, (_, source) in entries.items() if name not in LABELS}
     return Instrument.build(values, path.name)
@@ -510,7 +502,8 @@ LABELS = ("name", "notice", "sources")
 CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is Curve)
 OPTICS = tuple(name for name in CURVES if name != "quantum_efficiency_a_per_w")
 #: Readers of the values that instrument files may give as paths.
-FILES: dict[str, type[Curve | PixelMap | ThroughputErrors]] = dict.fromkeys((*CURVES, "throughput_factor"), Curve) | {
+FILES: dict[str, Kind] = {
+    **dict.fromkeys((*CURVES, "throughput_factor"), Curve),
     "pixel_map": PixelMap,
     "throughput_errors": ThroughputErrors,
 }
@@ -545,12 +538,6 @@ class LineSpread:
     def reach(self) -> float:
         """Largest distance of a line from a pixel's centre at which light reaches the pixel."""
         return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
-
-    @property
-    def mean_density(self) -> float:
-        """Integral of the square of the line spread function averaged over a pixel, nm^-1."""
-        offset = np.linspace(-self.reach, self.reach, 4001)
-        return float(np.trapezoid((self.landing(offset) / self.pixel) ** 2, offset))
 
     def landing(self, offset_nm: Float) -> Float:
         """Return the fraction of a line's light that falls on a pixel whose centre is `offset_nm` from the line."""
