@@ -28,8 +28,7 @@ from mauvecl.host.stars.coverage import (
     supplemented,
     without_undefined_ends,
 )
-from mauvecl.host.stars.flare import Geometry, with_flare
-from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum, blackbody
+from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbody, with_flare
 from mauvecl.host.stars.library import (
     ModelStar,
     OwnStar,

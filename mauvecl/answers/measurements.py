@@ -23,7 +23,7 @@ from mauvecl.fits.spectrum import (
 )
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare_spectra import (
+from mauvecl.host.stars.flare import (
     PARSEC_CM,
     SUN_CM,
     BalmerFlare,
@@ -38,7 +38,7 @@ from mauvecl.study.analyses import fitted_models
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.stars.flare_spectra import FlareSpectrum
+    from mauvecl.host.stars.flare import FlareSpectrum
     from mauvecl.host.stars.source import Source
     from mauvecl.study.cases import Case
     from mauvecl.study.star import Star

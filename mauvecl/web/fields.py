@@ -121,7 +121,7 @@ def typed_points(text: str) -> tuple[tuple[float, float], ...]:
 
 def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     """Parse emission lines such as "Mg II = 0.03, Balmer = 0.1"."""
-    from mauvecl.host.stars.flare_spectra import EmissionLine
+    from mauvecl.host.stars.flare import EmissionLine
 
     pairs = [pair.partition("=") for pair in text.split(",") if text.strip()]
     share = Number(range_of(LineFraction))
