@@ -15,7 +15,6 @@ from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
 from mauvecl.flares.settings import Curve
-from mauvecl.host.orbit.geometry import sunlight
 from mauvecl.host.orbit.orbit import Target, Track
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 from mauvecl.host.stars.library import nearest_spectrum
@@ -62,8 +61,8 @@ class OrbitConditions:
     @classmethod
     def along(cls, track: Track) -> OrbitConditions:
         """Compute the conditions along an orbit with the assumed models."""
-        light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
-        return cls(Thermal().temperature_c(light, track.times.step_s), Particles().rate_per_cm2_s(track))
+        temperature_c = Thermal().temperature_c(track.sunlight, track.times.step_s)
+        return cls(temperature_c, Particles().rate_per_cm2_s(track))
 
     def of(self, visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
         """Return the conditions of target `k`, or None if it is never visible."""
