@@ -44,29 +44,17 @@ class Band:
     name: str
     system: Literal["Vega", "AB"]  # magnitude system of catalogues in this band
     vega: float  # Vega's magnitude in that system; NaN for AB
-    zero_point: str  # source of the zero point
-    origin: str  # source of the curve
     wavelength_nm: Float  # shape (n,)
     throughput: Float  # relative response per photon, shape (n,)
 
 
+@cache
 def band(name: str) -> Band:
     """Return a band, given its name or alias in any case."""
-    return _load(known_band(name))
-
-
-@cache
-def _load(name: str) -> Band:
+    name = known_band(name)
     table = spectrum_table(f"{name.lower().replace(' ', '_')}.ecsv", "bands")
-    return Band(
-        name=name,
-        system=table.meta["system"],
-        vega=float(table.meta.get("vega", np.nan)),
-        zero_point=table.meta["zero_point"],
-        origin=table.meta["origin"],
-        wavelength_nm=table["wavelength"],
-        throughput=table["throughput"],
-    )
+    vega = float(table.meta.get("vega", np.nan))
+    return Band(name, table.meta["system"], vega, table["wavelength"], table["throughput"])
 
 
 def scale(name: str, system: System = "catalogue") -> str:

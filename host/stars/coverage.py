@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import LineSpread
+    from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
 
@@ -71,33 +71,13 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
-class Spectrum(Protocol):
-    """Spectrum of a star that has a name, as a `Source` is."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def wavelength_nm(self) -> Float: ...
-    @property
-    def flux_flam(self) -> Float: ...
-    @property
-    def measured_nm(self) -> tuple[float, float] | None: ...
-
-
-def check_covers(source: Spectrum, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
+def check_covers(source: Source, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
     """Raise InputError if the measured range of a source does not cover that of the pixels."""
     low, high = source.measured_nm or source.wavelength_nm[[0, -1]]
     if low > needed_nm[0] or high < needed_nm[1]:
         needed = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm"
         fault = f"spectrum {source.name} must span {needed}, not {low:g}-{high:g} nm"
         raise InputError(f"{fault}: `extend` continues it by a library spectrum", key="extend")
-
-
-def coverage(wavelength: Float) -> str:
-    """Return the message on the wavelengths that a spectrum covers before it is continued."""
-    part = measured_part(wavelength)
-    share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
-    return f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}"
 
 
 def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
@@ -164,13 +144,6 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
     return tuple(messages)
 
 
-@cache
-def _nominal_line() -> LineSpread:
-    from mauvecl.host.instrument.instrument import Instrument, LineSpread
-
-    return LineSpread.of(Instrument.load("mauve"))
-
-
 def continued(
     name: str,
     wavelength: Float,
@@ -190,6 +163,10 @@ def continued(
     span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
     if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
         return wavelength, flux, ()
+    if line is None:
+        from mauvecl.host.instrument.instrument import Instrument, LineSpread
+
+        line = LineSpread.of(Instrument.load("mauve"))
     messages = []
     edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
     brightest = max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
@@ -201,7 +178,7 @@ def continued(
         level = max(float(flux[near].mean()), 0.0)
         # Light in the outermost pixel from beyond the end.
         beyond = sign * (end - needed_nm[side])
-        share = float((line or _nominal_line()).below(np.array([beyond]))[0]) * level / brightest
+        share = float(line.below(np.array([beyond]))[0]) * level / brightest
         if dark_only and (beyond > 0 or share > MAX_CONTINUED):
             continue
         if share > MAX_CONTINUED:
@@ -239,7 +216,7 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, other: Spectrum, *, ultraviolet: tuple[str, ...] = ()
+    name: str, wavelength: Float, flux: Float, other: Source, *, ultraviolet: tuple[str, ...] = ()
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one, scaled at the join, and return messages.
 
@@ -270,7 +247,7 @@ def extended(
     return wavelength, flux, tuple(messages) or (f"its extension {other.name} reaches no farther and is not used",)
 
 
-def _join(name: str, wavelength: Float, flux: Float, other: Spectrum, blue: bool) -> tuple[Float, float]:
+def _join(name: str, wavelength: Float, flux: Float, other: Source, blue: bool) -> tuple[Float, float]:
     """Return the range in which two spectra are compared, widened by the noise of the first, and their ratio there."""
     both = f"spectrum {name} and its extension {other.name}"
     low, high = max(wavelength[0], other.wavelength_nm[0]), min(wavelength[-1], other.wavelength_nm[-1])
