@@ -82,10 +82,6 @@ class Curve:
         """Return the values at wavelengths in nm, shape of `wavelength_nm`; the end values hold beyond the knots."""
         return np.asarray(np.interp(np.asarray(wavelength_nm, np.float64), self.wavelength_nm, self.value))
 
-    def covers(self, low_nm: float, high_nm: float) -> bool:
-        """Return whether the knots reach from one wavelength to the other; a flat curve always does."""
-        return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
-
 
 def _converted(table: Numbers, name: str, *units: u.UnitBase) -> Float:
     """Return a column's numbers in the first of `units` that its unit converts to."""

@@ -191,22 +191,17 @@ class Elements:
             raise InputError(f"{fault}, but SGP4 refuses them (error {self.satellite.error})", key="elements")
 
     @classmethod
-    def read(cls, path: str | Path) -> Elements:
+    def read(cls, path: str | Path | None = None) -> Elements:
         """Read the newest set of Mauve in a file, or of its only satellite; titles and comments are ignored.
 
-        Raises InputError if the file holds no set or those of several other satellites, or a line's checksum is wrong.
+        Without a path it is the public set that the package contains. Raises InputError if the file holds no set or
+        those of several other satellites, or a line's checksum is wrong.
         """
-        path = Path(path)
-        return cls._of(read_text(path, "orbit file"), f"file {path.name}", shortened(str(path)))
-
-    @classmethod
-    def embedded(cls) -> Elements:
-        """Return the public elements of Mauve that the package contains."""
-        text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
-        return cls._of(text, "public catalogue, object 66756, embedded", "the embedded elements")
-
-    @classmethod
-    def _of(cls, text: str, source: str, named: str) -> Elements:
+        if path is None:
+            text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
+            source, named = "public catalogue, object 66756, embedded", "the embedded elements"
+        else:
+            text, source, named = read_text(path, "orbit file"), f"file {Path(path).name}", shortened(str(Path(path)))
         lines = [line.rstrip() for line in text.splitlines()]
         sets = [
             (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
@@ -277,13 +272,13 @@ class Orbit:
     the mean orbit beyond.
     """
 
-    elements: Elements = field(default_factory=Elements.embedded)
+    elements: Elements = field(default_factory=Elements.read)
     kind: Kind = "auto"
 
     @classmethod
     def load(cls, file: str | Path | None = None, kind: Kind = "auto") -> Orbit:
         """Read an orbit from a file of two-line elements; the default is the embedded set."""
-        return cls(Elements.embedded() if file is None else Elements.read(file), kind)
+        return cls(Elements.read(file), kind)
 
     def resolved(self, times: TimeGrid) -> Literal["tle", "mean"]:
         """Return the kind of propagation that a plan uses."""

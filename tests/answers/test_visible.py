@@ -1,10 +1,8 @@
 """Visibility answers: tables agree with each other and with the host, and the calendar is valid."""
 
 import tomllib
-from typing import Any
 
 import icalendar
-import pytest
 from scenes import paper
 
 from mauvecl import Study, visible
@@ -12,27 +10,17 @@ from mauvecl import Study, visible
 NAMES = ("eps Eri", "AU Mic", "EK Dra")
 
 
-@pytest.fixture(scope="module")
-def study() -> Study:
-    targets = ", ".join(f"'{name}'" for name in NAMES)
-    return paper(f"orbit.targets=[{targets}]", "orbit.start=2027-02-10T06:00", "orbit.days=40")
+STUDY = paper(f"orbit.targets={[*NAMES]}", "orbit.start=2027-02-10T06:00", "orbit.days=40")
 
 
-@pytest.fixture(scope="module")
-def found(study: Study) -> Any:
-    return visible(study)
-
-
-def test_messages_name_unseen_targets_and_the_orbit(found: Any) -> None:
+def test_messages_and_calendar_beyond_the_elements() -> None:
+    found = visible(STUDY)
     reported = " ".join(found.messages)
     assert "EK Dra is never seen: the limit of declination (-46.4 to 31.8 deg) alone leaves nothing" in reported
     assert "mean Sun-synchronous" in reported
     assert "Stray light is not modelled" in reported
     assert {"earth_limb_deg", "sun_deg", "moon_deg", "proton_flux"} <= set(found.assumptions["limit"])
     assert all("assumption" in source for source in found.assumptions["source"])
-
-
-def test_calendar_beyond_the_elements_has_days(found: Any) -> None:
     events = icalendar.Calendar.from_ical(found.documents["visible.ics"]()).walk("VEVENT")
     assert {str(event["SUMMARY"]) for event in events} == {"eps Eri", "AU Mic"}
     for name in NAMES:
@@ -59,9 +47,9 @@ def test_toml_dates_are_read() -> None:
         assert paper(f"orbit.start={text}").orbit.times().iso(0.0) == f"2027-01-{found}:00:00"
 
 
-def test_study_contains_all_flags(study: Study) -> None:
+def test_study_contains_all_flags() -> None:
     limits = ["orbit.limits.moon_deg=none", "orbit.limits.anomaly=[[-90, -50], [40, -50], [0, 0]]"]
-    changed = study.with_settings([*limits, "orbit.limits.eclipse=only"])
+    changed = STUDY.with_settings([*limits, "orbit.limits.eclipse=only"])
     assert Study.build(tomllib.loads(changed.toml()), "text") == changed
     assert changed.orbit.limits.moon_deg is None
     assert 'moon_deg = "none"' in changed.toml()
