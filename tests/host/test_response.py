@@ -4,20 +4,13 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import erf
 
 from mauvecl import Instrument, Sky, Source, expect
 
 Float = NDArray[np.float64]
 Order = Literal["paper", "physical"]
-
-
-def rate_of(instrument: Instrument, nm: ArrayLike, flux: ArrayLike, order: Order = "paper") -> Float:
-    """Return the electrons per second of a spectrum, of which the star has a trillionth."""
-    star = Source.from_arrays(np.asarray(nm), 1e-12 * np.asarray(flux, float))
-    x = expect(star, instrument, exposure=instrument.frame_s, sky=Sky.none(), order=order)
-    return np.asarray(1e12 * x.source_electrons / x.frame_s)
 
 
 def landing(offset: Float, instrument: Instrument) -> Float:
@@ -63,7 +56,9 @@ def test_random_spectra_agree_with_quadrature(
     rng = np.random.default_rng(20250101)
     wavelength = np.sort(np.append(rng.uniform(150, 790, n), [150, 790]))
     flux = rng.random(wavelength.size) * np.where(rng.random(wavelength.size) < 0.03, 50, 1)
-    rate = rate_of(instrument, wavelength, flux, order)
+    star = Source.from_arrays(wavelength, 1e-12 * flux)
+    x = expect(star, instrument, exposure=instrument.frame_s, sky=Sky.none(), order=order)
+    rate = 1e12 * x.source_electrons / x.frame_s
     # Light of every wavelength reaches one of these.
     for pixel in (0, 1, *range(53, 1642, 53), 1642):
         # Far below the requested 1e-6.
