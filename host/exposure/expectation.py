@@ -425,33 +425,23 @@ def expect(
     n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
         raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
-    needed_nm = (instrument.output_min_nm, instrument.output_max_nm)
-    check_covers(source, needed_nm, f"{instrument.name}'s output range ")
-    check_level(source, source.name, "magnitude")
-    source = continued_to_reach(source, instrument)
+    source = _usable(source, instrument)
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
     electrons = _electrons_per_frame(source, instrument, order)
-    near = sky_electrons = np.zeros(electrons.shape)
-    provenance = _provenance(source, instrument, sky, zodiacal) | {
-        "order": order,
-        "signal": signal,
-        "requested exposure": f"{exposure:g} s",
-        "exposure": f"{n_frames} x {instrument.frame_s:g} s",
-    }
-    if zodiacal is not None:
-        sky_electrons = _electrons_per_frame(zodiacal, instrument, order).clip(0.0)
-    if neighbours is not None:
-        near = instrument.frame_s * neighbours.electrons_per_second(instrument, order)
-        provenance |= neighbours.provenance(instrument)
+    nothing = np.zeros(electrons.shape)
+    near = nothing if neighbours is None else instrument.frame_s * neighbours.electrons_per_second(instrument, order)
+    asked: dict[str, str] = {"order": order, "signal": signal, "requested exposure": f"{exposure:g} s"}
+    asked["exposure"] = f"{n_frames} x {instrument.frame_s:g} s"
+    asked |= {} if neighbours is None else neighbours.provenance(instrument)
     x = Expectation(
         **_detector(instrument),
         source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
-        sky_electrons=sky_electrons,
+        sky_electrons=nothing if zodiacal is None else _electrons_per_frame(zodiacal, instrument, order).clip(0.0),
         neighbour_electrons=_faint_enough(near, "a neighbour"),
         n_frames=n_frames,
         signal=signal,
         name=source.name,
-        provenance=provenance,
+        provenance=_provenance(source, instrument, sky, zodiacal) | asked,
     )
     drawn = np.sqrt(x.variance_dn2) / (n_frames * x.gain_dn_per_electron)
     messages = [*_saturation(x), *(f"{source.name}: {text}." for text in source.messages)]
@@ -518,6 +508,14 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
             "it is reddened again (ebv)."
         )
     yield from filter(None, (instrument.notice, source.scale))
+
+
+def _usable(source: Source, instrument: Instrument) -> Source:
+    """Return a source with continued ends; raises InputError unless it covers the output range and has a scale."""
+    needed_nm = (instrument.output_min_nm, instrument.output_max_nm)
+    check_covers(source, needed_nm, f"{instrument.name}'s output range ")
+    check_level(source, source.name, "magnitude")
+    return continued_to_reach(source, instrument)
 
 
 def continued_to_reach(source: Source, instrument: Instrument) -> Source:

@@ -201,7 +201,8 @@ class Elements:
             text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
             source, named = "public catalogue, object 66756, embedded", "the embedded elements"
         else:
-            text, source, named = read_text(path, "orbit file"), f"file {Path(path).name}", shortened(str(Path(path)))
+            path = Path(path)
+            text, source, named = read_text(path, "orbit file"), f"file {path.name}", shortened(str(path))
         lines = [line.rstrip() for line in text.splitlines()]
         sets = [
             (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")

@@ -23,6 +23,9 @@ from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, write_whole
 from mauvecl.schema.errors import InputError
 
+#: Unit of the fluxes of kept stars.
+FLUX = "erg / (s cm2 Angstrom)"
+
 
 def add(
     path: str | Path,
@@ -54,18 +57,16 @@ def add(
     """
     from astropy.table import Table
 
-    given = path
-    path, _ = without_columns(path)
-    content = read_bytes(path, "spectrum file")
-    source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
+    file, _ = without_columns(path)
+    content = read_bytes(file, "spectrum file")
+    source = Source.read(path, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
     check_covers(source)
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
-    table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
-    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
+    table = Table([source.wavelength_nm, source.flux_flam], names=("wavelength", "flux"), units=("nm", FLUX))
     table.meta = {
         "name": name,
-        "origin": origin or f"file {path.name}",
+        "origin": origin or f"file {file.name}",
         "file_sha256": hashlib.sha256(content).hexdigest(),
         "spectrum_sha256": source.digest,
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

@@ -40,13 +40,10 @@ def test_with_returns_a_marked_copy(mauve: Instrument) -> None:
     assert {mauve: 1}[mauve.with_(temperature_c=21.0)] == 1
 
 
-CURVE = (Path(__file__).parents[1] / "data" / "grating.ecsv").read_text(encoding="utf-8")
-
-
 def test_user_file_extends_an_embedded_instrument(tmp_path: Path, mauve: Instrument) -> None:
-    (tmp_path / "grating.ecsv").write_text(CURVE)
+    grating = Path(__file__).parents[1] / "data" / "grating.ecsv"
     (tmp_path / "mine.toml").write_text(
-        'extends = "mauvesim"\nname = "mine"\nlight_loss = 0.2\ngrating_efficiency = "grating.ecsv"\n'
+        f'extends = "mauvesim"\nname = "mine"\nlight_loss = 0.2\ngrating_efficiency = "{grating}"\n'
         'read_noise_dn = { value = 11, tag = "D", source = "lab" }\nwindow_efficiency = 0.9\n'
     )
     mine = Instrument.load(str(tmp_path / "mine.toml"))

@@ -27,8 +27,7 @@ def test_each_spectrum_is_usable_and_has_an_origin(entry: Any) -> None:
     assert dark.sum() == 0 or (dark.sum() <= 2 and "zero in 2 bins" in entry["treatment"])
     header = Table.read(LIBRARY / "spectra" / entry["file"], format="ascii.ecsv").meta
     for key in ("origin", "citation", "licence", "uv_quality"):
-        assert entry[key]
-        assert header[key] == entry[key]
+        assert header[key] == entry[key] != ""
     assert 2500 < float(entry["temperature_k"]) < 30_000
     assert source.temperature_k == float(entry["temperature_k"])
     # Templates are kept at V = 0; the Sun and Vega need no magnitude.

@@ -186,7 +186,6 @@ def test_shadow_and_eclipse_rule(month: Any) -> None:
 
 
 def test_days_months_and_orbits_begin_where_they_do(month: Any) -> None:
-    """What they add up to is in `test_visible.py`."""
     names, hours = month.by_month()
     assert names == ["2026-12", "2027-01"]
     assert month.by_orbit(0).sum() / 60 == pytest.approx(month.hours[0])
