@@ -14,10 +14,9 @@ from mauvecl import Source
 
 LIBRARY = Path(mauvecl.__file__).parent / "host" / "stars" / "library"
 TABLE = Table.read(LIBRARY / "index.ecsv", format="ascii.ecsv")
-NAMES = [str(name) for name in TABLE["name"]]
 
 
-@pytest.mark.parametrize("entry", list(TABLE), ids=NAMES)
+@pytest.mark.parametrize("entry", list(TABLE), ids=list(TABLE["name"]))
 def test_each_spectrum_is_usable_and_has_an_origin(entry: Any) -> None:
     assert all(entry[field] for field in ("treatment", "temperature_source"))
     source = Source.from_library(entry["name"])
