@@ -5,11 +5,10 @@ from scenes import paper
 
 from mauvecl import visible
 
-NAMES = ("eps Eri", "AU Mic", "EK Dra")
-
 
 def test_messages_and_calendar_beyond_the_elements() -> None:
-    found = visible(paper(f"orbit.targets={[*NAMES]}", "orbit.start=2027-02-10T06:00", "orbit.days=40"))
+    names = ["eps Eri", "AU Mic", "EK Dra"]
+    found = visible(paper(f"orbit.targets={names}", "orbit.start=2027-02-10T06:00", "orbit.days=40"))
     reported = " ".join(found.messages)
     assert "EK Dra is never seen: the limit of declination (-46.4 to 31.8 deg) alone leaves nothing" in reported
     assert "mean Sun-synchronous" in reported
@@ -18,7 +17,7 @@ def test_messages_and_calendar_beyond_the_elements() -> None:
     assert all("assumption" in source for source in found.assumptions["source"])
     events = icalendar.Calendar.from_ical(found.documents["visible.ics"]()).walk("VEVENT")
     assert {str(event["SUMMARY"]) for event in events} == {"eps Eri", "AU Mic"}
-    for name in NAMES:
+    for name in names:
         days_of = found.by_day[found.by_day["target"] == name]
         # Half an hour and more is shown as a day.
         seen = (days_of["hours"].value >= 0.5).sum()
@@ -38,4 +37,5 @@ def test_calendar_near_the_epoch_has_windows() -> None:
 def test_toml_dates_are_read() -> None:
     starts = {"2027-01-01": "01T00", "2027-01-01T06:00:00": "01T06", "2027-01-01T06:00:00+02:00": "01T04"}
     for text, found in starts.items():
-        assert paper(f"orbit.start={text}").orbit.times().iso(0.0) == f"2027-01-{found}:00:00"
+        times = paper(f"orbit.start={text}").orbit.times()
+        assert (times.iso(0.0), times.iso(0.5, 1)) == (f"2027-01-{found}:00:00", f"2027-01-{found}:00:00.5")

@@ -190,12 +190,11 @@ def test_days_months_and_orbits_begin_where_they_do(month: Any) -> None:
     assert names == ["2026-12", "2027-01"]
     assert month.by_orbit(0).sum() / 60 == pytest.approx(month.hours[0])
     # Days begin at midnight: the first after 17.5 hours.
-    second = np.floor((month.track.times.seconds / 3600 - 17.5) / 24) == 0
-    assert month.by_day(0)[1] == pytest.approx(month.seen[second, 0].sum() / 60)
-    assert len(month.by_day(0)) == 41
+    hour, days = month.track.times.seconds / 3600, month.by_day(0)
+    assert days[1] == pytest.approx(month.seen[np.floor((hour - 17.5) / 24) == 0, 0].sum() / 60)
+    assert len(days) == 41
     # The first of January begins after 11 days and 17.5 hours.
-    split = month.track.times.seconds < (11 * 24 + 17.5) * 3600
-    assert hours[0] == pytest.approx(month.seen[split].sum(axis=0) / 60)
+    assert hours[0] == pytest.approx(month.seen[hour < 11 * 24 + 17.5].sum(axis=0) / 60)
     # Orbits of 94.6 minutes in forty days.
     assert len(month.by_orbit(0)) in (609, 610)
     assert seen(**MONTH, limits={"duty_cycle": 0.5}).hours == pytest.approx(month.hours / 2)
