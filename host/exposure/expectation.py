@@ -22,8 +22,8 @@ from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.spectra.units import SPAN_NM
-from mauvecl.host.stars.coverage import check_covers, continued
-from mauvecl.host.stars.source import Source, listed_star
+from mauvecl.host.stars.coverage import continued
+from mauvecl.host.stars.source import Source, check_covers, listed_star
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package

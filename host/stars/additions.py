@@ -17,9 +17,8 @@ from pathlib import Path
 from urllib.parse import urljoin, urlsplit
 
 from mauvecl.host import VERSION
-from mauvecl.host.stars.coverage import check_covers
 from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept
-from mauvecl.host.stars.source import Source
+from mauvecl.host.stars.source import Source, check_covers
 from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, write_whole
 from mauvecl.schema.errors import InputError
 

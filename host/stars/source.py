@@ -197,7 +197,9 @@ class Source(Drawable, ContentEquality):
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
             ultraviolet = other.messages if isinstance(extend, str) else ()
-            wavelength, flux, added = extended(name, wavelength, flux, other, ultraviolet=ultraviolet)
+            wavelength, flux, added = extended(
+                name, wavelength, flux, (other.name, other.wavelength_nm, other.flux_flam), ultraviolet=ultraviolet
+            )
             messages += added
         check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
@@ -414,6 +416,15 @@ class Source(Drawable, ContentEquality):
         flux = self.flux_flam[inside] * model.extinguish(self.wavelength_nm[inside] * u.nm, Ebv=ebv)
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)
+
+
+def check_covers(source: Source, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
+    """Raise InputError if the measured range of a source does not cover that of the pixels."""
+    low, high = source.measured_nm or source.wavelength_nm[[0, -1]]
+    if low > needed_nm[0] or high < needed_nm[1]:
+        needed = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm"
+        fault = f"spectrum {source.name} must span {needed}, not {low:g}-{high:g} nm"
+        raise InputError(f"{fault}: `extend` continues it by a library spectrum", key="extend")
 
 
 def listed_star(name: str) -> Source:
