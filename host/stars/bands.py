@@ -80,7 +80,11 @@ def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: S
     if not star > 0.0:
         raise InputError(f"the spectrum must have light in the band {chosen.name}, but has none", key="band")
     if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
-        return _ab_magnitude(star, grid, chosen)
+        # The mean flux per wavelength, converted at the pivot wavelength.
+        at, through = chosen.wavelength_nm * ANGSTROM, chosen.throughput
+        pivot = float(np.sqrt(np.trapezoid(through * at, at) / np.trapezoid(through / at, at)))
+        mean = HC * star / float(np.trapezoid(grid * _interpolate(grid, at, through), grid))
+        return -2.5 * math.log10(mean * pivot**2 / c.to_value(u.AA / u.s) / AB_ZERO)
     vega = math.log10(photons(*_vega(), chosen.name))
     return 2.5 * (vega - math.log10(star)) + (chosen.vega if system == "catalogue" else 0.0)
 
@@ -140,11 +144,3 @@ def _interpolate(grid: Float, at: Float, values: Float) -> Float:
     after = np.clip(np.searchsorted(at, grid, side="right"), 1, at.size - 1)
     share = np.clip((grid - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
     return np.asarray(values[after - 1] * (1.0 - share) + values[after] * share)
-
-
-def _ab_magnitude(star: float, grid: Float, chosen: Band) -> float:
-    """Return the AB magnitude of a photon rate: its mean flux per wavelength, converted at the pivot wavelength."""
-    at, through = chosen.wavelength_nm * ANGSTROM, chosen.throughput
-    pivot = float(np.sqrt(np.trapezoid(through * at, at) / np.trapezoid(through / at, at)))
-    mean = HC * star / float(np.trapezoid(grid * _interpolate(grid, at, through), grid))
-    return -2.5 * math.log10(mean * pivot**2 / c.to_value(u.AA / u.s) / AB_ZERO)
