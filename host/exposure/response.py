@@ -144,7 +144,8 @@ def _gathering(line: LineSpread, wavelength: Float, by_light: Instrument | None)
     """Yield the terms of the second factor of the matrix, each of shape (n_panel_node, n_wavelength).
 
     An entry is the integral (nm) over a panel of one of its Lagrange polynomials times the hat function of a node, and
-    times the efficiency in the physical order.
+    times the efficiency in the physical order. A term is that of many cells, each within one panel and between two
+    nodes.
     """
     panels = line.panel_edges(np.array(_knots(by_light)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])
@@ -154,36 +155,27 @@ def _gathering(line: LineSpread, wavelength: Float, by_light: Instrument | None)
         return
     inside = [edges[(edges > low) & (edges < high)] for edges in (panels, wavelength)]
     edges = np.unique(np.concatenate([[low], *inside, [high]]))
-    for start in range(0, edges.size - 1, CHUNK):
-        yield _gather(wavelength, by_light, panels, edges[start : start + CHUNK + 1], shape)
-
-
-def _gather(
-    wavelength: Float, by_light: Instrument | None, panels: Float, edges: Float, shape: tuple[int, int]
-) -> csr_array:
-    """Return the term of `_gathering` for the cells between `edges`, each within one panel and between two nodes."""
-    abscissa, weight = leggauss(CELL_NODES)
-    width = np.diff(edges)
-    middle = edges[:-1] + width / 2
-    panel = np.searchsorted(panels, middle) - 1
-    node = np.searchsorted(wavelength, middle) - 1
-    at = middle[:, None] + width[:, None] / 2 * abscissa  # (n_cell, CELL_NODES)
-    mass = width[:, None] / 2 * weight
-    if by_light:
-        mass = mass * W_PER_NM_IN_FLAM * by_light.electrons_per_joule_cm2(at, held=True)
-    span = (wavelength[node + 1] - wavelength[node])[:, None]
-    right = (at - wavelength[node][:, None]) / span
-    in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]
-    # Lagrange polynomials of the panel's nodes from Legendre polynomials, without division or cancellation.
-    x, weights = leggauss(PANEL_NODES)
+    (abscissa, weight), (x, weights) = leggauss(CELL_NODES), leggauss(PANEL_NODES)
+    # Lagrange polynomials of a panel's nodes from Legendre polynomials, without division or cancellation.
     from_legendre = (np.arange(PANEL_NODES)[:, None] + 0.5) * legvander(x, PANEL_NODES - 1).T * weights
-    lagrange = legvander(in_panel, PANEL_NODES - 1) @ from_legendre
-    rows = np.broadcast_to(panel[:, None] * PANEL_NODES + np.arange(PANEL_NODES), (panel.size, PANEL_NODES))
-    values = [np.einsum("cq,cqk->ck", mass * share, lagrange) for share in (1 - right, right)]
-    columns = [np.broadcast_to((node + side)[:, None], rows.shape) for side in (0, 1)]
-    index = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
-    # Entries with the same index are summed.
-    return csr_array((np.concatenate([v.ravel() for v in values]), index), shape=shape)
+    for start in range(0, edges.size - 1, CHUNK):
+        width = np.diff(edges[start : start + CHUNK + 1])
+        middle = edges[start : start + width.size] + width / 2
+        panel, node = np.searchsorted(panels, middle) - 1, np.searchsorted(wavelength, middle) - 1
+        at = middle[:, None] + width[:, None] / 2 * abscissa  # (n_cell, CELL_NODES)
+        mass = width[:, None] / 2 * weight
+        if by_light:
+            mass = mass * W_PER_NM_IN_FLAM * by_light.electrons_per_joule_cm2(at, held=True)
+        span = (wavelength[node + 1] - wavelength[node])[:, None]
+        right = (at - wavelength[node][:, None]) / span
+        in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]
+        lagrange = legvander(in_panel, PANEL_NODES - 1) @ from_legendre
+        rows = np.broadcast_to(panel[:, None] * PANEL_NODES + np.arange(PANEL_NODES), (panel.size, PANEL_NODES))
+        values = [np.einsum("cq,cqk->ck", mass * share, lagrange) for share in (1 - right, right)]
+        columns = [np.broadcast_to((node + side)[:, None], rows.shape) for side in (0, 1)]
+        index = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
+        # Entries with the same index are summed.
+        yield csr_array((np.concatenate([v.ravel() for v in values]), index), shape=shape)
 
 
 def _read_only(matrix: csr_array) -> csr_array:

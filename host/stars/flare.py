@@ -171,7 +171,11 @@ class BalmerFlare(FlareSpectrum):
     temperature_k: Temperature = 10_000.0
     jump: BalmerJump = 2.0
     electron_temperature_k: Temperature = ELECTRON_TEMPERATURE_K
-    nodes_nm = np.array([BALMER_EDGE_NM, BALMER_EDGE_NM + EDGE_WIDTH_NM])  # both sides of the edge
+
+    @property
+    def nodes_nm(self) -> Float:  # type: ignore[override]
+        """Both sides of the Balmer edge, nm."""
+        return np.array([BALMER_EDGE_NM, BALMER_EDGE_NM + EDGE_WIDTH_NM])
 
     def flux(self, wavelength_nm: Wavelengths) -> Float:
         extra = balmer_continuum(wavelength_nm, self.electron_temperature_k)
@@ -248,19 +252,37 @@ class FlareWithLines(FlareSpectrum):
     fluxes_cgs: Mapping[str, LineFlux] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        lines = [EmissionLine.named(name) for name in (*self.fractions, *self.fluxes_cgs)]
+        for name in (*self.fractions, *self.fluxes_cgs):
+            EmissionLine.named(name)
         both = set(self.fractions) & set(self.fluxes_cgs)
         if both:
             raise InputError(f"the line {min(both)!r} needs either a fraction or a flux, but has both", key="lines")
-        nodes = [self.continuum.nodes_nm, *(line.nodes_nm for line in lines)]
-        for name, value in {
-            "temperature_k": self.continuum.temperature_k,
-            "surface": self.continuum.surface,
-            "messages": self.continuum.messages,
-            "fixed_lines": any(self.fluxes_cgs.values()),
-            "nodes_nm": np.unique(np.concatenate(nodes)),
-        }.items():
-            object.__setattr__(self, name, value)
+
+    @property
+    def temperature_k(self) -> float | None:  # type: ignore[override]
+        """Temperature of the continuum, K."""
+        return self.continuum.temperature_k
+
+    @property
+    def surface(self) -> bool:  # type: ignore[override]
+        """True if `flux` is that of the flare's surface."""
+        return self.continuum.surface
+
+    @property
+    def messages(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Assumptions of the continuum."""
+        return self.continuum.messages
+
+    @property
+    def fixed_lines(self) -> bool:  # type: ignore[override]
+        """True if some lines have a fixed flux at the telescope."""
+        return any(self.fluxes_cgs.values())
+
+    @property
+    def nodes_nm(self) -> Float:  # type: ignore[override]
+        """Nodes of the continuum and of the lines, nm."""
+        lines = [EmissionLine.named(name).nodes_nm for name in (*self.fractions, *self.fluxes_cgs)]
+        return np.unique(np.concatenate([self.continuum.nodes_nm, *lines]))
 
     @property
     def continuum_flux(self) -> float:
