@@ -79,7 +79,7 @@ class Neighbour:
             nearest, (_, colour) = min(_typical().items(), key=lambda item: abs(item[1][1] - wanted))
             return nearest, f"of BP - RP = {wanted:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
         needed = "needs a spectral type, spectrum file, temperature or colour, since its light enters the fibre"
-        raise InputError(f"{self._place} {needed}", key="neighbours")
+        raise InputError(f"{self._place}, {needed}", key="neighbours")
 
     @property
     def _place(self) -> str:
