@@ -80,7 +80,7 @@ class Expectation(Drawable, ContentEquality):
     frame_s: Duration  #: Length of a frame; the exposure is n_frames * frame_s.
     #: Index of each pixel's resolution element, ascending from 0: half-open bins from the start of the output range.
     element: NDArray[np.int32]
-    #: Centres of these bins, shape (n_element,); the last may hold fewer pixels.
+    #: Centres of the resolution elements, shape (n_element,); the last may hold fewer pixels.
     element_wavelength_nm: Annotated[Float, Unit("nm")]
     adc_max_dn: int
     saturation_dn: Annotated[float, Unit("DN")]  #: Raw level at which the detector saturates.
