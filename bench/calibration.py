@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from tables import processor, versions, write
 
 from mauvecl import Study, calibrate
-from mauvecl.host.instrument.curves import Curve
+from mauvecl.host.instrument.curves import SpectralCurve
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.throughput import ERROR_KNOTS, ONE_STAR_ERROR
 from tests.observations.test_calibration import NOMINAL, STARS, deviations, frames_of, relative, truth
@@ -70,7 +70,7 @@ def main() -> None:
     asked = parser.parse_args()
     true = truth()
     if asked.truth in FACTORS:
-        true = truth(throughput_factor=Curve(tuple(NM), tuple(FACTORS[asked.truth])))
+        true = truth(throughput_factor=SpectralCurve(tuple(NM), tuple(FACTORS[asked.truth])))
     rows = ", ".join(map(row_of, asked.stars))
     study = Study().with_settings([f'calibrate.observations=[{rows}, {{frames="y"}}]'])
     stars = [source for one in study.calibrate.observations if (source := one.source()) is not None]

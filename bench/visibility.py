@@ -45,13 +45,13 @@ def main() -> None:
         rows.append((what, time.perf_counter() - started[0] - sum(r[1] for r in rows),
                      cpu_s() - started[1] - sum(r[2] for r in rows)))  # fmt: skip
 
-    from mauvecl.host.orbit.geometry import TimeGrid, direction
-    from mauvecl.host.orbit.orbit import Orbit
+    from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid
     from mauvecl.host.orbit.visibility import Visibility, zodiacal_light
 
     done("imports")
     rng = np.random.default_rng(1)
-    target = direction(rng.uniform(0, 360, given.targets), np.degrees(np.arcsin(rng.uniform(-0.7, 0.5, given.targets))))
+    places = rng.uniform(0, 360, given.targets), np.degrees(np.arcsin(rng.uniform(-0.7, 0.5, given.targets)))
+    target = np.array([Target("made up", *place, "drawn").direction for place in zip(*places, strict=True)])
     track = Orbit.load().track(TimeGrid("2027-01-01", given.days, given.step))
     assert track.position_km.size
     done("orbit")

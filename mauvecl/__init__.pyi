@@ -43,11 +43,11 @@ from mauvecl.host.exposure.expectation import expect as expect
 from mauvecl.host.exposure.sky import Sky as Sky
 from mauvecl.host.instrument.curves import PixelMap as PixelMap
 from mauvecl.host.instrument.instrument import Instrument as Instrument
-from mauvecl.host.stars.flare_spectra import BalmerFlare as BalmerFlare
-from mauvecl.host.stars.flare_spectra import Blackbody as Blackbody
-from mauvecl.host.stars.flare_spectra import FlareWithLines as FlareWithLines
-from mauvecl.host.stars.flare_spectra import ObservedFlare as ObservedFlare
-from mauvecl.host.stars.flare_spectra import TwoBlackbodies as TwoBlackbodies
+from mauvecl.host.stars.flare import BalmerFlare as BalmerFlare
+from mauvecl.host.stars.flare import Blackbody as Blackbody
+from mauvecl.host.stars.flare import FlareWithLines as FlareWithLines
+from mauvecl.host.stars.flare import ObservedFlare as ObservedFlare
+from mauvecl.host.stars.flare import TwoBlackbodies as TwoBlackbodies
 from mauvecl.host.stars.source import Source as Source
 from mauvecl.noise.disturbances import CosmicRays as CosmicRays
 from mauvecl.noise.disturbances import Normal as Normal

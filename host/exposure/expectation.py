@@ -22,8 +22,8 @@ from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.spectra.units import SPAN_NM
-from mauvecl.host.stars.coverage import check_covers, continued
-from mauvecl.host.stars.source import Source, listed_star
+from mauvecl.host.stars.coverage import continued
+from mauvecl.host.stars.source import Source, check_covers, listed_star
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
@@ -64,68 +64,40 @@ BUDGET_COLUMNS = (
 class Expectation(Drawable, ContentEquality):
     """Means and noise per pixel of an exposure; the arrays are read-only and refer to a single frame.
 
-    Attributes
-    ----------
-    wavelength_nm : ndarray, shape (n_pixel,)
-        Pixel centres.
-    source_electrons, sky_electrons : ndarray, shape (n_pixel,)
-        Mean electrons per frame.
-    dark_dn : ndarray, shape (n_pixel,)
-        Mean dark counts per frame, DN, independent of `dark_unit`.
-    dark_unit : {"DN", "electrons"}
-        Unit in which the dark counts follow a Poisson distribution; their mean in electrons is dark_dn / gain.
-    bias_dn, read_noise_dn, gain_dn_per_electron : ndarray, shape (n_pixel,)
-        Bias (DN), read noise (DN rms per frame) and gain.
-    photon_noise : {"gaussian", "poisson"}
-        Distribution of the photons about their mean; the variance is the same.
-    n_frames : int
-    frame_s : float
-        Length of a frame; the exposure is n_frames * frame_s.
-    element : ndarray of int32, shape (n_pixel,)
-        Index of each pixel's resolution element, ascending from 0: half-open bins from the start of the output range.
-    element_wavelength_nm : ndarray, shape (n_element,)
-        Centres of these bins; the last may hold fewer pixels.
-    adc_max_dn : int
-    saturation_dn : float
-        Raw level at which the detector saturates, DN.
-    name, instrument : str
-    provenance : mapping of str
-        Origin of all inputs: digests, order, sky, history of the source, requested exposure.
-    conditions : mapping of float
-        The instrument's values of the quantities that priors may vary: ``temperature_c``, ``dark_slope_per_c``,
-        ``light_loss``, ``pointing_loss``.
-    messages : tuple of str
-        Remarks for the user, saturation first.
-    signal : {"net", "paper"}
-        Definition of the signal. With ``net`` it is the star alone: the sky is subtracted like bias and dark, and only
-        its noise remains. With ``paper`` it includes the zodiacal light, as in the MauveSim paper. The noise is the
-        same.
-    neighbour_electrons : ndarray, shape (n_pixel,)
-        Mean electrons per frame of other stars in the fibre, zero by default. They are no signal: their mean is
-        subtracted like that of the sky.
+    They have the shape (n_pixel,), apart from `element_wavelength_nm`.
     """
 
-    wavelength_nm: Annotated[Float, Unit("nm")]
-    source_electrons: Float
-    sky_electrons: Float
-    dark_dn: Annotated[Float, Unit("DN")]
+    wavelength_nm: Annotated[Float, Unit("nm")]  #: Centres of the pixels.
+    source_electrons: Float  #: Mean electrons per frame.
+    sky_electrons: Float  #: Mean electrons per frame of the sky.
+    dark_dn: Annotated[Float, Unit("DN")]  #: Mean dark counts per frame, independent of `dark_unit`.
+    #: Unit in which the dark counts follow a Poisson distribution; their mean in electrons is dark_dn / gain.
     dark_unit: Literal["DN", "electrons"]
     bias_dn: Annotated[Float, Unit("DN")]
-    read_noise_dn: Annotated[Float, Unit("DN")]
+    read_noise_dn: Annotated[Float, Unit("DN")]  #: Read noise per frame, rms.
     gain_dn_per_electron: Float
     n_frames: int
-    frame_s: Duration
+    frame_s: Duration  #: Length of a frame; the exposure is n_frames * frame_s.
+    #: Index of each pixel's resolution element, ascending from 0: half-open bins from the start of the output range.
     element: NDArray[np.int32]
+    #: Centres of the resolution elements, shape (n_element,); the last may hold fewer pixels.
     element_wavelength_nm: Annotated[Float, Unit("nm")]
     adc_max_dn: int
-    saturation_dn: Annotated[float, Unit("DN")]
+    saturation_dn: Annotated[float, Unit("DN")]  #: Raw level at which the detector saturates.
     name: str
     instrument: str
+    #: Origin of all inputs: digests, order, sky, history of the source, requested exposure.
     provenance: Mapping[str, str]
+    #: Distribution of the photons about their mean; the variance is the same.
     photon_noise: Literal["gaussian", "poisson"] = "gaussian"
+    #: The instrument's values that priors may vary: temperature_c, dark_slope_per_c, light_loss and pointing_loss.
     conditions: Mapping[str, float] = field(default_factory=dict)
-    messages: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()  #: Remarks for the user, saturation first.
+    #: With ``net`` the signal is the star alone: the sky is subtracted like bias and dark, and only its noise remains.
+    #: With ``paper`` it includes the zodiacal light, as in the MauveSim paper. The noise is the same.
     signal: Signal = "net"
+    #: Mean electrons per frame of other stars in the fibre, zero by default. They are no signal: their mean is
+    #: subtracted like that of the sky.
     neighbour_electrons: Float = field(default_factory=lambda: np.zeros(0))
 
     def to_specutils(self) -> Any:
@@ -363,9 +335,7 @@ class Expectation(Drawable, ContentEquality):
         variances = [n * gain**2 * electrons * passed for electrons in light]
         variances += [n * self.dark_variance_dn2, n * self.read_noise_dn**2, self._noise_dn2]
         noise = {name: np.sqrt(variance) for (name, *_), variance in zip(ORIGINS, variances, strict=True)}
-        columns = [
-            column for column in BUDGET_COLUMNS if column.name != "neighbour_photon" or self.neighbour_electrons.any()
-        ]
+        columns = [c for c in BUDGET_COLUMNS if c.name != "neighbour_photon" or self.neighbour_electrons.any()]
         row = {"wavelength": self.wavelength_nm} | noise
         return table_of(columns, [row], exposure_s=self.exposure_s, name=self.name)
 
@@ -451,7 +421,10 @@ def expect(
     source = listed_star(source) if isinstance(source, str) else source
     instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
     sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)
-    n_frames = _whole_frames(exposure, instrument.frame_s)
+    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
+    n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
+    if n_frames > MAX_FRAMES:
+        raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
     source = _usable(source, instrument)
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
     electrons = _electrons_per_frame(source, instrument, order)
@@ -476,15 +449,6 @@ def expect(
     messages += negative_means_message(source, instrument, electrons, drawn, order)
     messages += _remarks(x, exposure, source, instrument)
     return replace(x, messages=tuple(messages))
-
-
-def _whole_frames(exposure_s: float, frame_s: float) -> int:
-    """Return the number of frames of an exposure, rounded up; raises InputError if they are too many."""
-    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
-    n_frames = max(1, int(np.ceil(exposure_s / frame_s * (1 - 1e-12))))
-    if n_frames > MAX_FRAMES:
-        raise InputError.of("exposure", exposure_s, f"at most {MAX_FRAMES} frames of {frame_s:g} s", unit="s")
-    return n_frames
 
 
 def _electrons_per_frame(light: Source, instrument: Instrument, order: Order) -> Float:

@@ -144,7 +144,8 @@ def _gathering(line: LineSpread, wavelength: Float, by_light: Instrument | None)
     """Yield the terms of the second factor of the matrix, each of shape (n_panel_node, n_wavelength).
 
     An entry is the integral (nm) over a panel of one of its Lagrange polynomials times the hat function of a node, and
-    times the efficiency in the physical order.
+    times the efficiency in the physical order. A term is that of many cells, each within one panel and between two
+    nodes.
     """
     panels = line.panel_edges(np.array(_knots(by_light)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])
@@ -154,34 +155,27 @@ def _gathering(line: LineSpread, wavelength: Float, by_light: Instrument | None)
         return
     inside = [edges[(edges > low) & (edges < high)] for edges in (panels, wavelength)]
     edges = np.unique(np.concatenate([[low], *inside, [high]]))
+    (abscissa, weight), (x, weights) = leggauss(CELL_NODES), leggauss(PANEL_NODES)
+    # Lagrange polynomials of a panel's nodes from Legendre polynomials, without division or cancellation.
+    from_legendre = (np.arange(PANEL_NODES)[:, None] + 0.5) * legvander(x, PANEL_NODES - 1).T * weights
     for start in range(0, edges.size - 1, CHUNK):
-        yield _gather(wavelength, by_light, panels, edges[start : start + CHUNK + 1], shape)
-
-
-def _gather(
-    wavelength: Float, by_light: Instrument | None, panels: Float, edges: Float, shape: tuple[int, int]
-) -> csr_array:
-    """Return the term of `_gathering` for the cells between `edges`, each within one panel and between two nodes."""
-    abscissa, weight = leggauss(CELL_NODES)
-    width = np.diff(edges)
-    middle = edges[:-1] + width / 2
-    panel = np.searchsorted(panels, middle) - 1
-    node = np.searchsorted(wavelength, middle) - 1
-    at = middle[:, None] + width[:, None] / 2 * abscissa  # (n_cell, CELL_NODES)
-    mass = width[:, None] / 2 * weight
-    if by_light:
-        mass = mass * W_PER_NM_IN_FLAM * by_light.electrons_per_joule_cm2(at, held=True)
-    span = (wavelength[node + 1] - wavelength[node])[:, None]
-    right = (at - wavelength[node][:, None]) / span
-    in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]
-    # Lagrange polynomials from Legendre polynomials, without division or cancellation.
-    lagrange = legvander(in_panel, PANEL_NODES - 1) @ _legendre_to_lagrange()
-    rows = np.broadcast_to(panel[:, None] * PANEL_NODES + np.arange(PANEL_NODES), (panel.size, PANEL_NODES))
-    values = [np.einsum("cq,cqk->ck", mass * share, lagrange) for share in (1 - right, right)]
-    columns = [np.broadcast_to((node + side)[:, None], rows.shape) for side in (0, 1)]
-    index = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
-    # Entries with the same index are summed.
-    return csr_array((np.concatenate([v.ravel() for v in values]), index), shape=shape)
+        width = np.diff(edges[start : start + CHUNK + 1])
+        middle = edges[start : start + width.size] + width / 2
+        panel, node = np.searchsorted(panels, middle) - 1, np.searchsorted(wavelength, middle) - 1
+        at = middle[:, None] + width[:, None] / 2 * abscissa  # (n_cell, CELL_NODES)
+        mass = width[:, None] / 2 * weight
+        if by_light:
+            mass = mass * W_PER_NM_IN_FLAM * by_light.electrons_per_joule_cm2(at, held=True)
+        span = (wavelength[node + 1] - wavelength[node])[:, None]
+        right = (at - wavelength[node][:, None]) / span
+        in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]
+        lagrange = legvander(in_panel, PANEL_NODES - 1) @ from_legendre
+        rows = np.broadcast_to(panel[:, None] * PANEL_NODES + np.arange(PANEL_NODES), (panel.size, PANEL_NODES))
+        values = [np.einsum("cq,cqk->ck", mass * share, lagrange) for share in (1 - right, right)]
+        columns = [np.broadcast_to((node + side)[:, None], rows.shape) for side in (0, 1)]
+        index = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
+        # Entries with the same index are summed.
+        yield csr_array((np.concatenate([v.ravel() for v in values]), index), shape=shape)
 
 
 def _read_only(matrix: csr_array) -> csr_array:
@@ -189,14 +183,6 @@ def _read_only(matrix: csr_array) -> csr_array:
     matrix.sum_duplicates()
     matrix.data.setflags(write=False)
     return matrix
-
-
-@lru_cache(maxsize=1)
-def _legendre_to_lagrange() -> Float:
-    """Return the matrix from Legendre to Lagrange polynomials of a panel's nodes, shape (degree, node)."""
-    x, weight = leggauss(PANEL_NODES)
-    degree = np.arange(PANEL_NODES)
-    return np.asarray((degree[:, None] + 0.5) * legvander(x, PANEL_NODES - 1).T * weight)
 
 
 def _knots(by_light: Instrument | None) -> tuple[float, ...]:
@@ -218,19 +204,6 @@ MAX_SIGMA_BELOW_ZERO = 3.0
 ROUNDING = 1e-12
 
 
-def standard_error_per_second(source: Source, instrument: Instrument, order: Order) -> Float:
-    """Return the standard error of each pixel's mean due to the noise of the points, electrons/s, shape (n_pixel,).
-
-    A pixel weights the points by its response r and their spacing d. Its variance, the sum of (r d sigma)^2, is
-    approximated by mean(r) times the sum of r d (d sigma^2), where the mean is weighted by r. The approximation holds
-    where the noise changes slowly.
-    """
-    nm = source.wavelength_nm
-    variance = np.gradient(nm) * point_noise(source.flux_flam) ** 2
-    mean = LineSpread.of(instrument).mean_density * electrons_per_second(instrument, nm, np.ones_like(nm), order)
-    return np.sqrt(mean * electrons_per_second(instrument, nm, variance, order))
-
-
 def negative_means_message(
     source: Source, instrument: Instrument, electrons: Float, drawn: Float, order: Order
 ) -> tuple[str, ...]:
@@ -242,9 +215,16 @@ def negative_means_message(
     below = electrons < -ROUNDING * max(float(electrons.max()), 0.0)
     if not below.any() or not (source.flux_flam < 0.0).any():
         return ()
-    own = standard_error_per_second(source, instrument, order) * instrument.frame_s
+    # A pixel weights the points by its response r and their spacing d. The variance of its mean, the sum of
+    # (r d sigma)^2, is approximated by mean(r), weighted by r, times the sum of r d (d sigma^2), which holds where the
+    # noise changes slowly. The mean of r is the integral of the square of the line spread function over a pixel.
+    nm, line = source.wavelength_nm, LineSpread.of(instrument)
+    offset = np.linspace(-line.reach, line.reach, 4001)
+    density = float(np.trapezoid((line.landing(offset) / line.pixel) ** 2, offset))
+    variance = density * electrons_per_second(instrument, nm, np.ones_like(nm), order)
+    variance *= electrons_per_second(instrument, nm, np.gradient(nm) * point_noise(source.flux_flam) ** 2, order)
     # A negative mean below the exposure's noise does not matter.
-    error = np.hypot(own, drawn)
+    error = np.hypot(np.sqrt(variance) * instrument.frame_s, drawn)
     worst = int(np.argmin(electrons + MAX_SIGMA_BELOW_ZERO * error))
     nm = instrument.wavelength_nm
     if electrons[worst] < -MAX_SIGMA_BELOW_ZERO * error[worst]:

@@ -110,13 +110,6 @@ Lookup = Literal["bilinear", "nearest"]
 class Sky:
     """Zodiacal light of uniform surface brightness.
 
-    Attributes
-    ----------
-    surface_brightness : float or None
-        V mag arcsec^-2 (Vega); None means no sky.
-    description : str
-        Origin of the value, for reports.
-
     Examples
     --------
     >>> from mauvecl import Sky
@@ -124,8 +117,8 @@ class Sky:
     22.96
     """
 
-    surface_brightness: SkyBrightness | None
-    description: str
+    surface_brightness: SkyBrightness | None  #: V mag arcsec^-2 (Vega); None means no sky.
+    description: str  #: Origin of the value, for reports.
 
     @classmethod
     def none(cls) -> Sky:

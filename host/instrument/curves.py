@@ -38,7 +38,7 @@ def _opened(path: str | Path, what: str) -> Iterator[tuple[Numbers, str]]:
 
 
 @dataclass(frozen=True)
-class Curve:
+class SpectralCurve:
     """A quantity against wavelength, linear between knots."""
 
     wavelength_nm: tuple[float, ...]  # knots, strictly increasing; a single knot makes the curve flat
@@ -58,12 +58,12 @@ class Curve:
             raise InputError.of("value", value[bad][0], "finite and at least 0", where=where)
 
     @classmethod
-    def flat(cls, value: float, source: str = "A: assumed, no source given") -> Curve:
+    def flat(cls, value: float, source: str = "A: assumed, no source given") -> SpectralCurve:
         """Return a curve with the same value at every wavelength."""
         return cls((0.0,), (value,), source)
 
     @classmethod
-    def read(cls, path: str | Path) -> Curve:
+    def read(cls, path: str | Path) -> SpectralCurve:
         """Read an ECSV table of two columns with units: wavelength, and the value (A/W, per cent or dimensionless).
 
         The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
@@ -81,10 +81,6 @@ class Curve:
     def at(self, wavelength_nm: ArrayLike) -> Float:
         """Return the values at wavelengths in nm, shape of `wavelength_nm`; the end values hold beyond the knots."""
         return np.asarray(np.interp(np.asarray(wavelength_nm, np.float64), self.wavelength_nm, self.value))
-
-    def covers(self, low_nm: float, high_nm: float) -> bool:
-        """Return whether the knots reach from one wavelength to the other; a flat curve always does."""
-        return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
 
 
 def _converted(table: Numbers, name: str, *units: u.UnitBase) -> Float:
@@ -114,25 +110,14 @@ COLUMNS = {
 @validated
 @dataclass(frozen=True, eq=False)
 class PixelMap(ContentEquality):
-    """Properties of each pixel of the whole array; None keeps the instrument's value.
+    """Properties of each pixel of the whole array, shape (n_pixel,) each; None keeps the instrument's value."""
 
-    Attributes
-    ----------
-    response, dark, gain : ndarray, shape (n_pixel,), optional
-        Factors on the electrons per photon, the dark current and the DN per electron. A hot pixel has a large factor
-        on its dark current.
-    bias_dn, read_noise_dn : ndarray, shape (n_pixel,), optional
-        DN and DN rms per frame, which replace the instrument's values.
-    source : str
-        "tag: source" of the values.
-    """
-
-    response: Float | None = None
-    dark: Float | None = None
-    gain: Float | None = None
-    bias_dn: Annotated[Float, Unit("DN")] | None = None
-    read_noise_dn: Annotated[Float, Unit("DN")] | None = None
-    source: str = "A: assumed, no source given"
+    response: Float | None = None  #: Factor on the electrons per photon.
+    dark: Float | None = None  #: Factor on the dark current; a hot pixel has a large one.
+    gain: Float | None = None  #: Factor on the DN per electron.
+    bias_dn: Annotated[Float, Unit("DN")] | None = None  #: Replaces the instrument's value.
+    read_noise_dn: Annotated[Float, Unit("DN")] | None = None  #: Replaces the instrument's value; rms per frame.
+    source: str = "A: assumed, no source given"  #: Tag and source of the values.
 
     def __post_init__(self) -> None:
         sizes = set()
@@ -252,25 +237,16 @@ CALIBRATED = {
 @validated
 @dataclass(frozen=True, eq=False)
 class ThroughputErrors(ContentEquality):
-    """Covariance of the logarithm of the throughput: the sum of the outer products of modes.
+    """Covariance of the logarithm of the throughput: the sum of the outer products of modes."""
 
-    Attributes
-    ----------
-    wavelength_nm : ndarray, shape (n,)
-        Ascending; modes are linear between these wavelengths and constant beyond them.
-    modes : ndarray, shape (n_mode, n)
-        Changes of the natural logarithm of the throughput for amplitudes of one standard deviation, those that matter
-        most first.
-    source : str
-        "tag: source" of the values.
-    values : mapping of tuple
-        Changes of the natural logarithm of other values in the first modes, by name: `CALIBRATED`. Counts determine the
-        product of gain and throughput, for instance, so that an error of the gain changes both.
-    """
-
+    #: Ascending, shape (n,); modes are linear between these wavelengths and constant beyond them.
     wavelength_nm: Annotated[Float, Unit("nm")]
+    #: Changes of the natural logarithm of the throughput for amplitudes of one standard deviation, shape (n_mode, n);
+    #: those that matter most first.
     modes: Float
-    source: str = "A: assumed, no source given"
+    source: str = "A: assumed, no source given"  #: Tag and source of the values.
+    #: Changes of the natural logarithm of other values in the first modes, by name: `CALIBRATED`. Counts determine the
+    #: product of gain and throughput, for instance, so that an error of the gain changes both.
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

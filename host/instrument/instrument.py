@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from pydantic_core import PydanticCustomError
 from scipy.special import ndtr
 
 from mauvecl.host.instrument import FORMERLY_MAUVE, instrument_path, shipped_names
-from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
+from mauvecl.host.instrument.curves import MAX_PIXELS, PixelMap, SpectralCurve, ThroughputErrors
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
@@ -38,13 +37,12 @@ FILE_VERSION = 2
 MAX_EXTENDED = 16
 
 
-def read_entries(
-    path: Path, files: Mapping[str, type[Curve | PixelMap | ThroughputErrors]]
-) -> dict[str, tuple[Any, str]]:
-    """Return the values and sources of a file, merged over those of the file that it extends.
+#: Class of a value that an instrument file may give as a path.
+Kind = type[SpectralCurve | PixelMap | ThroughputErrors]
 
-    Values of the classes in `files` may be paths, relative to their file.
-    """
+
+def _read_entries(path: Path) -> dict[str, tuple[Any, str]]:
+    """Return the values and sources of a file, merged over those of the file that it extends."""
     entries: dict[str, tuple[Any, str]] = {}
     for _ in range(MAX_EXTENDED):
         content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
@@ -54,7 +52,7 @@ def read_entries(
         if "sources" in content:
             fault = f"{path.name}: unknown key 'sources'; give each value's source in the value's own table"
             raise InputError(fault, key="sources")
-        entries = {name: _entry(name, entry, path, files.get(name)) for name, entry in content.items()} | entries
+        entries = {name: _entry(name, entry, path) for name, entry in content.items()} | entries
         if extended is None:
             return entries
         if version is None and extended == "mauve":
@@ -69,11 +67,9 @@ def read_entries(
     raise InputError(fault, key="extends")
 
 
-def _entry(
-    name: str, entry: Any, path: Path, kind: type[Curve | PixelMap | ThroughputErrors] | None
-) -> tuple[Any, str]:
+def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
     """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path."""
-    source = f"A: assumed, no source in {path.name}"
+    kind, source = FILES.get(name), f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
         if unknown or "value" not in entry:
@@ -87,8 +83,8 @@ def _entry(
     if kind is not None and isinstance(entry, str):
         read = kind.read(path.parent / entry)
         return read, read.source
-    if kind is Curve and isinstance(entry, int | float) and not isinstance(entry, bool):
-        return Curve.flat(float(entry), source), source
+    if kind is SpectralCurve and isinstance(entry, int | float) and not isinstance(entry, bool):
+        return SpectralCurve.flat(float(entry), source), source
     return entry, source
 
 
@@ -107,17 +103,17 @@ def _as_curve(value: Any, unit: str) -> Any:
         expected = f"a curve, a path or {word_of(unit)}"
         raise PydanticCustomError("expected", "Input should be {expected}", {"expected": expected}) from None
     if isinstance(plain, int | float) and not isinstance(plain, bool):
-        return Curve.flat(float(plain))
-    return _read_path(plain, Curve)
+        return SpectralCurve.flat(float(plain))
+    return _read_path(plain, SpectralCurve)
 
 
-def _read_path(value: Any, kind: type[Curve | PixelMap | ThroughputErrors]) -> Any:
+def _read_path(value: Any, kind: Kind) -> Any:
     """Read a path as an object of a class; return other values unchanged."""
     return kind.read(value) if isinstance(value, str | Path) else value
 
 
-Efficiency = Annotated[Curve, BeforeValidator(partial(_as_curve, unit=""))]
-Responsivity = Annotated[Curve, BeforeValidator(partial(_as_curve, unit="A / W"))]
+Efficiency = Annotated[SpectralCurve, BeforeValidator(partial(_as_curve, unit=""))]
+Responsivity = Annotated[SpectralCurve, BeforeValidator(partial(_as_curve, unit="A / W"))]
 Loss = Annotated[float, Range(0, 1, open_high=True)]
 Whole = Annotated[int, BeforeValidator(whole)]
 Count = Annotated[Whole, Range(0, 20)]
@@ -245,7 +241,7 @@ class Instrument(Section):
         changed = Instrument.build({**self._values(), **changes}, self.name)
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
         for name, given in changes.items():
-            if isinstance(given, str | Path) and isinstance(curve := getattr(changed, name), Curve):
+            if isinstance(given, str | Path) and isinstance(curve := getattr(changed, name), SpectralCurve):
                 marks[name] = curve.source
         sources = {**self.sources, **changes.get("sources", {}), **marks}
         return changed.model_copy(update={"sources": sources})
@@ -294,11 +290,11 @@ class Instrument(Section):
             if largest > 1:
                 raise InputError.of(name, largest, "a fraction between 0 and 1")
         for name in CURVES:
-            curve: Curve = getattr(self, name)
-            if not curve.covers(low, high):
-                covered = f"{curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm"
-                fault = f"{name} must cover at least the output range {low:g}-{high:g} nm, but covers {covered}"
-                raise InputError(fault, key=name)
+            curve: SpectralCurve = getattr(self, name)
+            first, last = curve.wavelength_nm[0], curve.wavelength_nm[-1]
+            if len(curve.value) > 1 and (first > low or last < high):
+                needed = f"at least the output range {low:g}-{high:g} nm"
+                raise InputError(f"{name} must cover {needed}, but covers {first:g}-{last:g} nm", key=name)
         if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
             fault = f"quantum_efficiency_a_per_w must correspond to at most 1 electron per photon, not {most:.3g}"
             raise InputError(fault, key="quantum_efficiency_a_per_w")
@@ -396,6 +392,10 @@ class Instrument(Section):
 
     def _optics(self, wavelength_nm: Float) -> Float:
         losses = (1 - self.coupling_loss) ** self.couplings * (1 - self.light_loss) * (1 - self.pointing_loss)
+        calibration = 1.0 if self.throughput_factor is None else self.throughput_factor.at(wavelength_nm)
+        if self.throughput_errors is not None and self.throughput_amplitudes:
+            modes = self.throughput_errors.at(wavelength_nm)[: len(self.throughput_amplitudes)]
+            calibration = calibration * np.exp(np.tensordot(self.throughput_amplitudes, modes, 1))
         return np.asarray(
             losses
             * self.grating_efficiency.at(wavelength_nm)
@@ -404,16 +404,8 @@ class Instrument(Section):
             * self.spectrometer_mirror_reflectivity.at(wavelength_nm) ** self.spectrometer_mirrors
             * self.collection_lens_efficiency.at(wavelength_nm)
             * self.window_efficiency.at(wavelength_nm)
-            * self._calibrated(wavelength_nm)
+            * calibration
         )
-
-    def _calibrated(self, wavelength_nm: Float) -> Float | float:
-        """Return the factor of the calibration on the throughput."""
-        factor = 1.0 if self.throughput_factor is None else self.throughput_factor.at(wavelength_nm)
-        if self.throughput_errors is None or not self.throughput_amplitudes:
-            return factor
-        modes = self.throughput_errors.at(wavelength_nm)[: len(self.throughput_amplitudes)]
-        return np.asarray(factor * np.exp(np.tensordot(self.throughput_amplitudes, modes, 1)))
 
     def quantum_efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the electrons per photon that reaches the detector.
@@ -474,7 +466,7 @@ class Instrument(Section):
     def digest(self) -> str:
         """SHA-256 of all values that affect a measurement, so without names and sources."""
         values = {
-            name: (value.wavelength_nm, value.value) if isinstance(value, Curve) else value
+            name: (value.wavelength_nm, value.value) if isinstance(value, SpectralCurve) else value
             for name, value in self._values().items()
             # Files without a calibration keep the digest that they had before there was one.
             if name not in LABELS and not (name.startswith("throughput_") and not value)
@@ -496,7 +488,7 @@ class Instrument(Section):
 
 def _from_file(name: str | Path) -> Instrument:
     path = instrument_path(name, Path())
-    entries = read_entries(path, FILES)
+    entries = _read_entries(path)
     values: dict[str, Any] = {name: value for name, (value, _) in entries.items()}
     values["sources"] = {name: source for name, (_, source) in entries.items() if name not in LABELS}
     return Instrument.build(values, path.name)
@@ -507,10 +499,11 @@ _embedded = cache(_from_file)
 #: Fields that do not affect a measurement.
 LABELS = ("name", "notice", "sources")
 #: Names of the curves, and of those that are fractions.
-CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is Curve)
+CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is SpectralCurve)
 OPTICS = tuple(name for name in CURVES if name != "quantum_efficiency_a_per_w")
 #: Readers of the values that instrument files may give as paths.
-FILES: dict[str, type[Curve | PixelMap | ThroughputErrors]] = dict.fromkeys((*CURVES, "throughput_factor"), Curve) | {
+FILES: dict[str, Kind] = {
+    **dict.fromkeys((*CURVES, "throughput_factor"), SpectralCurve),
     "pixel_map": PixelMap,
     "throughput_errors": ThroughputErrors,
 }
@@ -545,12 +538,6 @@ class LineSpread:
     def reach(self) -> float:
         """Largest distance of a line from a pixel's centre at which light reaches the pixel."""
         return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
-
-    @property
-    def mean_density(self) -> float:
-        """Integral of the square of the line spread function averaged over a pixel, nm^-1."""
-        offset = np.linspace(-self.reach, self.reach, 4001)
-        return float(np.trapezoid((self.landing(offset) / self.pixel) ** 2, offset))
 
     def landing(self, offset_nm: Float) -> Float:
         """Return the fraction of a line's light that falls on a pixel whose centre is `offset_nm` from the line."""

@@ -1,4 +1,4 @@
-"""Orbits of the satellite, the limits of its observations, and its targets."""
+"""Orbits of the satellite, its positions and those of Sun and Moon at the times of a plan, and its targets."""
 
 from __future__ import annotations
 
@@ -11,25 +11,13 @@ from functools import cached_property, lru_cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import erfa
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.exposure.sky import parse_position
-from mauvecl.host.orbit.geometry import (
-    GRAVITY,
-    J2,
-    RADIUS_KM,
-    Bodies,
-    TimeGrid,
-    Vectors,
-    direction,
-    subsatellite_point,
-    to_j2000,
-    unit,
-    utc_text,
-)
+from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.stars.library import by_key, library_text, name_key, near_names
 from mauvecl.host.tables.files import parse_ecsv, read_text
 from mauvecl.host.tables.names import EXPECTED_POSITION, is_missing_position
@@ -37,10 +25,140 @@ from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import records
 from mauvecl.schema.errors import InputError, printable, shortened
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.physical import DAY_S, Duration
 
 if TYPE_CHECKING:
     from astropy.table import Table
+    from astropy.time import Time
+
+#: Equatorial radius, km, gravitational parameter, km^3 s^-2, and oblateness of WGS 72, as SGP4 uses (Hoots & Roehrich
+#: 1980).
+RADIUS_KM, GRAVITY, J2 = 6378.135, 398_600.8, 1.082616e-3
+#: Equatorial radius of WGS 84, km: radius of the sphere that defines the limb.
+LIMB_KM = 6378.137
+#: Radius of the Sun, km (IAU 2015 resolution B3).
+SUN_KM = 695_700.0
+
+Floats = NDArray[np.float64]
+Vectors = NDArray[np.float64]
+
+
+def unit(vectors: Vectors) -> Vectors:
+    """Normalise vectors, shape (..., 3)."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+#: Largest number of steps of a plan: eight years of minutes.
+MAX_STEPS = 4_300_000
+
+
+@validated
+@dataclass(frozen=True)
+class TimeGrid:
+    """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second).
+
+    Raises InputError if the start is outside 1990-2100 or the number of steps is outside 1 to `MAX_STEPS`.
+    """
+
+    start: str  # ISO 8601, UTC
+    days: Annotated[float, Unit("d"), Range(0, open_low=True)]  # length of the plan
+    step_s: Duration = 60.0  # length of a step; conditions are evaluated at its middle
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.n <= MAX_STEPS:
+            raise InputError(
+                f"{self.days:g} days in steps of {self.step_s:g} s must be 1 to {MAX_STEPS} steps, not "
+                f"{self.days * DAY_S / self.step_s:.3g}",
+                key="step_s",
+            )
+        _ = self.first  # raises InputError for an invalid start
+
+    @property
+    def n(self) -> int:
+        """Number of steps; the last may be shorter than the others."""
+        return int(np.ceil(self.days * DAY_S / self.step_s - 1e-9))
+
+    @cached_property
+    def first(self) -> tuple[float, float]:
+        """Julian date of the start, UTC: the preceding midnight and the fraction of the day."""
+        with offline():
+            time = parse_time(self.start, "start")
+            day, rest = float(time.utc.jd1), float(time.utc.jd2)
+        midnight = np.floor(day - 0.5) + 0.5
+        fraction = (day - midnight) + rest
+        # Astropy's second part lies within half a day on either side.
+        midnight += np.floor(fraction)
+        return float(midnight), float(fraction - np.floor(fraction))
+
+    @cached_property
+    def seconds(self) -> Floats:
+        """Middles of the steps, s since the start, shape (n,)."""
+        middles = np.asarray((np.arange(self.n, dtype=np.float64) + 0.5) * float(self.step_s))
+        middles.setflags(write=False)
+        return middles
+
+    @property
+    def julian(self) -> tuple[Floats, Floats]:
+        """Julian dates, UTC: the midnight before the start and the days since, shape (n,) each."""
+        midnight, fraction = self.first
+        return np.full(self.n, midnight, np.float64), np.asarray(fraction + self.seconds / DAY_S)
+
+    def iso(self, seconds: float, digits: int = 0) -> str:
+        """Return a time since the start in ISO 8601, UTC."""
+        return utc_text(sum(self.first) + seconds / DAY_S, digits)
+
+
+def utc_text(julian: float, digits: int = 0) -> str:
+    """Return a Julian date in ISO 8601, UTC, accurate to a tenth of a millisecond."""
+    # Neither numpy's calendar nor these Julian dates count leap seconds.
+    micro = round((julian - 2_440_587.5) * DAY_S * 10**digits) * 10 ** (6 - digits)
+    text = str(np.datetime64(micro, "us"))
+    return text[:19] if digits == 0 else text[: 20 + digits]
+
+
+#: Days between computed positions. Cubic splines interpolate to 0.1 arcsec for the Sun and 1 arcsec for the Moon
+#: (tested).
+SUN_STEP_D, MOON_STEP_D = 0.5, 1 / 12
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Geocentric positions of Sun and Moon in the frame of star catalogues (J2000)."""
+
+    # Unit vectors, shape (n, 3); the parallax at the satellite is below 10 arcsec.
+    sun: Vectors
+    sun_km: Floats  # distance, shape (n,)
+    # Shape (n, 3). The parallax reaches a degree: subtract the satellite's position to get its view.
+    moon_km: Vectors
+    ecliptic_pole: Floats  # north pole at the middle of the plan, shape (3,)
+
+    @classmethod
+    def at(cls, times: TimeGrid) -> Bodies:
+        """Compute the positions at the times of a plan."""
+        from scipy.interpolate import CubicSpline
+
+        midnight, days = times.first[0], times.julian[1]
+        with offline():
+            from astropy.coordinates import GeocentricTrueEcliptic, SkyCoord, get_body, get_sun
+            from astropy.time import Time
+
+            def at(days: Floats) -> Time:
+                return Time(np.full(days.shape, midnight), days, format="jd", scale="utc")
+
+            def between(step_d: float, body: str) -> Vectors:
+                low = days[0] - step_d
+                # One more node at either end, where a cubic spline is least accurate.
+                nodes = low + step_d * np.arange(int(np.ceil((days[-1] - low) / step_d)) + 3)
+                times = at(nodes)
+                body_there = get_sun(times) if body == "sun" else get_body(body, times)
+                return np.asarray(CubicSpline(nodes, body_there.cartesian.xyz.to_value("km").T)(days))
+
+            sun, moon = between(SUN_STEP_D, "sun"), between(MOON_STEP_D, "moon")
+            middle = at(days[[days.size // 2]])[0]
+            pole = SkyCoord(lon=0, lat=90, unit="deg", frame=GeocentricTrueEcliptic(equinox=middle, obstime=middle))
+            north = unit(pole.gcrs.cartesian.xyz.value)
+        return cls(unit(sun), np.linalg.norm(sun, axis=1), moon, north)
 
 
 #: NORAD catalogue number of Mauve.
@@ -57,7 +175,13 @@ class Elements:
 
     def __post_init__(self) -> None:
         for number, line in enumerate((self.first, self.second), 1):
-            _check(line, number)
+            if len(line) < 69 or not line.isascii() or not line.startswith(f"{number} "):
+                raise InputError.of("elements", line, f"line {number} with 69 characters")
+            # Digits plus 1 per minus sign, modulo 10.
+            checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
+            if line[68] != str(checksum):
+                fault = f"orbital elements {shortened(line)} must end in the checksum {checksum}, not {line[68]!r}"
+                raise InputError(f"{fault}; one is wrong", key="elements")
         if self.first[2:7] != self.second[2:7]:
             both = f"{self.first[2:7]!r} and {self.second[2:7]!r}"
             fault = f"both lines of the orbital elements must be of one satellite, but are of {both}"
@@ -67,22 +191,18 @@ class Elements:
             raise InputError(f"{fault}, but SGP4 refuses them (error {self.satellite.error})", key="elements")
 
     @classmethod
-    def read(cls, path: str | Path) -> Elements:
+    def read(cls, path: str | Path | None = None) -> Elements:
         """Read the newest set of Mauve in a file, or of its only satellite; titles and comments are ignored.
 
-        Raises InputError if the file holds no set or those of several other satellites, or a line's checksum is wrong.
+        Without a path it is the public set that the package contains. Raises InputError if the file holds no set or
+        those of several other satellites, or a line's checksum is wrong.
         """
-        path = Path(path)
-        return cls._of(read_text(path, "orbit file"), f"file {path.name}", shortened(str(path)))
-
-    @classmethod
-    def embedded(cls) -> Elements:
-        """Return the public elements of Mauve that the package contains."""
-        text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
-        return cls._of(text, "public catalogue, object 66756, embedded", "the embedded elements")
-
-    @classmethod
-    def _of(cls, text: str, source: str, named: str) -> Elements:
+        if path is None:
+            text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
+            source, named = "public catalogue, object 66756, embedded", "the embedded elements"
+        else:
+            path = Path(path)
+            text, source, named = read_text(path, "orbit file"), f"file {path.name}", shortened(str(path))
         lines = [line.rstrip() for line in text.splitlines()]
         sets = [
             (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
@@ -128,24 +248,6 @@ class Elements:
         """Semi-major axis, from the mean motion by Kepler's third law."""
         return float((GRAVITY / (2 * np.pi / self.period_s) ** 2) ** (1 / 3))
 
-    @property
-    def latitude_rate_deg_per_day(self) -> float:
-        """Rate of the mean argument of latitude: mean motion plus the secular drift of the perigee due to J2."""
-        semi_latus_km = self.axis_km * (1 - self.satellite.ecco**2)
-        oblate = 2 * np.pi / self.period_s * J2 * (RADIUS_KM / semi_latus_km) ** 2
-        perigee = 0.75 * oblate * (5 * np.cos(self.satellite.inclo) ** 2 - 1)
-        return 360.0 * self.revolutions_per_day + float(np.degrees(perigee)) * DAY_S
-
-
-def _check(line: str, number: int) -> None:
-    """Raise InputError unless a line has the right form and checksum (digits plus 1 per minus sign, modulo 10)."""
-    if len(line) < 69 or not line.isascii() or not line.startswith(f"{number} "):
-        raise InputError.of("elements", line, f"line {number} with 69 characters")
-    checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
-    if line[68] != str(checksum):
-        fault = f"orbital elements {shortened(line)} must end in the checksum {checksum}, not {line[68]!r}"
-        raise InputError(f"{fault}; one is wrong", key="elements")
-
 
 Kind = Literal["auto", "tle", "mean"]
 #: Days from the epoch beyond which reports state the possible error of SGP4.
@@ -166,22 +268,18 @@ DRAG_SHARE = 0.5
 class Orbit:
     """The satellite's orbit and its propagation.
 
-    Attributes
-    ----------
-    elements : Elements
-    kind : {"auto", "tle", "mean"}
-        ``tle`` propagates the elements with SGP4. ``mean`` is a circular Sun-synchronous orbit through the elements,
-        whose node keeps its local time for years. ``auto`` uses SGP4 up to `MEAN_FROM_D` days from the epoch, and the
-        mean orbit beyond.
+    The kind ``tle`` propagates the elements with SGP4. ``mean`` is a circular Sun-synchronous orbit through the
+    elements, whose node keeps its local time for years. ``auto`` uses SGP4 up to `MEAN_FROM_D` days from the epoch, and
+    the mean orbit beyond.
     """
 
-    elements: Elements = field(default_factory=Elements.embedded)
+    elements: Elements = field(default_factory=Elements.read)
     kind: Kind = "auto"
 
     @classmethod
     def load(cls, file: str | Path | None = None, kind: Kind = "auto") -> Orbit:
         """Read an orbit from a file of two-line elements; the default is the embedded set."""
-        return cls(Elements.embedded() if file is None else Elements.read(file), kind)
+        return cls(Elements.read(file), kind)
 
     def resolved(self, times: TimeGrid) -> Literal["tle", "mean"]:
         """Return the kind of propagation that a plan uses."""
@@ -237,32 +335,30 @@ class Orbit:
         """
         return _track(self, times)
 
-    def states(
-        self, midnight: NDArray[np.float64], days: NDArray[np.float64], kind: Literal["tle", "mean"]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def states(self, midnight: Floats, days: Floats, kind: Literal["tle", "mean"]) -> tuple[Vectors, Vectors]:
         """Return positions (km) and velocities (km/s) in SGP4's frame by SGP4 or in the mean orbit, shape (n, 3) each.
 
         `midnight` and `days` are parts of the Julian dates, UTC, of shape (n,). Raises InputError if SGP4 fails at one
         of the times.
         """
-        if kind == "mean":
-            return self._mean(midnight, days)
-        error, position, velocity = self.elements.satellite.sgp4_array(midnight, days)
-        if np.any(error):
-            first = int(np.argmax(error != 0))
-            end = f"{utc_text(float(midnight[first] + days[first]))} (SGP4 error {int(error[first])})"
-            fault = f"orbital elements of epoch {self.elements.epoch} cannot be followed to {end}"
-            raise InputError(f"{fault}: give newer ones, or use the mean orbit", key="elements")
-        return np.asarray(position), np.asarray(velocity)
-
-    def _mean(
-        self, midnight: NDArray[np.float64], days: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions and velocities in a circular orbit whose node keeps its local mean time."""
-        e, since = self.elements, (midnight - self.elements.epoch_jd) + days
-        node = e.satellite.nodeo + 2 * np.pi / 365.2421897 * since
-        along = e.satellite.argpo + e.satellite.mo + np.radians(e.latitude_rate_deg_per_day) * since
-        c, s = np.cos(e.satellite.inclo), np.sin(e.satellite.inclo)
+        e, record = self.elements, self.elements.satellite
+        if kind == "tle":
+            error, position, velocity = record.sgp4_array(midnight, days)
+            if np.any(error):
+                first = int(np.argmax(error != 0))
+                end = f"{utc_text(float(midnight[first] + days[first]))} (SGP4 error {int(error[first])})"
+                fault = f"orbital elements of epoch {e.epoch} cannot be followed to {end}"
+                raise InputError(f"{fault}: give newer ones, or use the mean orbit", key="elements")
+            return np.asarray(position), np.asarray(velocity)
+        # The mean argument of latitude turns with the mean motion and the secular drift of the perigee due to J2, and
+        # the node with the mean Sun.
+        oblate = 2 * np.pi / e.period_s * J2 * (RADIUS_KM / (e.axis_km * (1 - record.ecco**2))) ** 2
+        perigee = 0.75 * oblate * (5 * np.cos(record.inclo) ** 2 - 1)
+        rate_deg = 360.0 * e.revolutions_per_day + float(np.degrees(perigee)) * DAY_S
+        since = (midnight - e.epoch_jd) + days
+        node = record.nodeo + 2 * np.pi / 365.2421897 * since
+        along = record.argpo + record.mo + np.radians(rate_deg) * since
+        c, s = np.cos(record.inclo), np.sin(record.inclo)
         ascending = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=1)
         north = np.stack([-c * np.sin(node), c * np.cos(node), np.full_like(node, s)], axis=1)
         cosine, sine = np.cos(along)[:, None], np.sin(along)[:, None]
@@ -283,12 +379,29 @@ class Track:
     orbit: Orbit
     times: TimeGrid
     # Position and velocity in SGP4's frame (true equator, mean equinox of date), shape (n, 3).
-    of_date_km: NDArray[np.float64]
-    velocity_km_s: NDArray[np.float64]
+    of_date_km: Floats
+    velocity_km_s: Floats
 
     @cached_property
-    def _to_j2000(self) -> NDArray[np.float64]:
-        return to_j2000(self.times.first[0], self.times.julian[1])
+    def _to_j2000(self) -> Floats:
+        """Matrices from SGP4's frame (true equator, mean equinox of date) to J2000, shape (n, 3, 3).
+
+        Precession and nutation of 1976 and 1980 (Vallado et al. 2006, AIAA 2006-6753) are computed once a day and
+        interpolated linearly.
+        """
+        midnight, days = self.times.first[0], self.times.julian[1]
+        low = np.floor(days.min())
+        nodes = np.arange(low, np.ceil(days.max()) + 2)
+        terrestrial = nodes + 69.2 / DAY_S
+        of_date = erfa.pnm80(midnight, terrestrial)
+        # Equation of the equinoxes: from the mean to the true equinox of date.
+        turn = -np.asarray(erfa.eqeq94(midnight, terrestrial))
+        zero, one = np.zeros_like(turn), np.ones_like(turn)
+        spin = np.array([[np.cos(turn), np.sin(turn), zero], [-np.sin(turn), np.cos(turn), zero], [zero, zero, one]])
+        at_nodes = np.einsum("nji,jkn->nik", of_date, spin)
+        place = np.clip((days - low).astype(int), 0, nodes.size - 2)
+        part = (days - low - place)[:, None, None]
+        return np.asarray((1 - part) * at_nodes[place] + part * at_nodes[place + 1])
 
     @cached_property
     def position_km(self) -> Vectors:
@@ -301,9 +414,14 @@ class Track:
         return unit(np.einsum("nij,nj->ni", self._to_j2000, np.cross(self.of_date_km, self.velocity_km_s)))
 
     @cached_property
-    def subsatellite_deg(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def subsatellite_deg(self) -> tuple[Floats, Floats]:
         """Geodetic longitude (-180 to 180) and latitude of the sub-satellite point, shape (n,) each."""
-        return subsatellite_point(self.of_date_km, *self.times.julian)
+        # The angle from SGP4's frame to the Earth-fixed frame.
+        theta = erfa.gmst82(*self.times.julian)
+        x, y, z = self.of_date_km.T
+        fixed = np.stack([np.cos(theta) * x + np.sin(theta) * y, -np.sin(theta) * x + np.cos(theta) * y, z], axis=1)
+        longitude, latitude, _ = erfa.gc2gd(1, fixed * 1e3)
+        return np.degrees(longitude), np.degrees(latitude)
 
     @cached_property
     def bodies(self) -> Bodies:
@@ -311,12 +429,29 @@ class Track:
         return Bodies.at(self.times)
 
     @property
-    def beta_deg(self) -> NDArray[np.float64]:
+    def limb_angle_rad(self) -> Floats:
+        """Angular radius of the Earth, a sphere of its equatorial radius, at the satellite, shape (n,)."""
+        return np.asarray(np.arcsin(LIMB_KM / np.linalg.norm(self.position_km, axis=-1)))
+
+    @property
+    def sunlight(self) -> Floats:
+        """Fraction of the Sun's disk that the Earth does not hide, 0 to 1, shape (n,).
+
+        The fraction is linear in angle between the two contacts of the penumbra, which are eight seconds apart.
+        """
+        distance = np.linalg.norm(self.position_km, axis=1)
+        cosine = -np.einsum("ni,ni->n", self.position_km, self.bodies.sun) / distance
+        disk = np.arcsin(SUN_KM / self.bodies.sun_km)
+        seen = np.arccos(np.clip(cosine, -1, 1)) - self.limb_angle_rad + disk
+        return np.asarray(np.clip(seen / (2 * disk), 0, 1))
+
+    @property
+    def beta_deg(self) -> Floats:
         """Angle of the Sun from the orbital plane, positive towards the angular momentum, shape (n,)."""
         return np.asarray(np.degrees(np.arcsin(np.einsum("ni,ni->n", self.normal, self.bodies.sun))))
 
     @property
-    def local_time_h(self) -> NDArray[np.float64]:
+    def local_time_h(self) -> Floats:
         """Local mean solar time of the descending node, hours, shape (n,)."""
         momentum = np.cross(self.of_date_km, self.velocity_km_s)
         ascending = np.arctan2(momentum[:, 0], -momentum[:, 1])
@@ -372,9 +507,10 @@ class Target:
         return cls(name or text.strip(), float(place.ra.deg), float(place.dec.deg), "given")
 
     @property
-    def direction(self) -> NDArray[np.float64]:
+    def direction(self) -> Floats:
         """Unit vector, ICRS, shape (3,)."""
-        return direction(self.ra_deg, self.dec_deg)
+        a, d = np.radians([self.ra_deg, self.dec_deg])
+        return np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
 
 
 def target_table() -> Table:

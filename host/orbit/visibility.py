@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.exposure.sky import zodiacal_brightness
-from mauvecl.host.orbit import Limits, geometry
-from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
-from mauvecl.host.orbit.orbit import Orbit, Track
+from mauvecl.host.orbit import Limits
+from mauvecl.host.orbit.orbit import Bodies, Floats, Orbit, TimeGrid, Track, Vectors, unit
 from mauvecl.host.tables.files import parse_ecsv
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share
 
+Flags = NDArray[np.bool_]
+
 
 @cache
-def _proton_map(above_mev: int) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+def _proton_map(above_mev: int) -> Callable[[Floats], Floats]:
     """Return the map of AP8 at solar maximum, at an altitude of 510 km (see `tools/build_flux_map.py`)."""
     from scipy.interpolate import RegularGridInterpolator
 
@@ -40,7 +41,7 @@ def _proton_map(above_mev: int) -> Callable[[NDArray[np.float64]], NDArray[np.fl
     return RegularGridInterpolator((latitude, longitude), flux)
 
 
-def proton_flux(track: Track, *, above_mev: Literal[10, 30]) -> NDArray[np.float64]:
+def proton_flux(track: Track, *, above_mev: Literal[10, 30]) -> Floats:
     """Return the omnidirectional flux of trapped protons above an energy along a track, cm^-2 s^-1, shape (n,)."""
     longitude, latitude = track.subsatellite_deg
     return np.asarray(_proton_map(above_mev)(np.stack([latitude, longitude], axis=-1)))
@@ -53,21 +54,13 @@ class Thermal:
 
     The model is an assumption. With the defaults the temperature varies by 3 deg C in every orbit, within the 13 to
     21 deg C of the payload's documents.
-
-    Attributes
-    ----------
-    sunlit_c, shadow_c : float
-        Equilibrium temperatures in sunlight and in shadow, deg C.
-    time_constant_s : float
     """
 
-    sunlit_c: DetectorTemperature = 21.0
-    shadow_c: DetectorTemperature = 13.0
+    sunlit_c: DetectorTemperature = 21.0  #: Equilibrium temperature in sunlight.
+    shadow_c: DetectorTemperature = 13.0  #: Equilibrium temperature in shadow.
     time_constant_s: Duration = 3000.0
 
-    def temperature_c(
-        self, sunlight: NDArray[np.float64], step_s: float, start_c: float | None = None
-    ) -> NDArray[np.float64]:
+    def temperature_c(self, sunlight: Floats, step_s: float, start_c: float | None = None) -> Floats:
         """Return the temperature at the end of each step, deg C, shape (n,).
 
         Parameters
@@ -91,21 +84,14 @@ class Thermal:
 @validated
 @dataclass(frozen=True)
 class Particles:
-    """Particles that hit the detector: cosmic rays, and trapped protons that penetrate the shielding (assumption).
+    """Particles that hit the detector: cosmic rays, and trapped protons that penetrate the shielding (assumption)."""
 
-    Attributes
-    ----------
-    cosmic_per_cm2_s : float
-        Rate of cosmic rays outside the South Atlantic Anomaly.
-    share : float
-        Fraction of the omnidirectional flux of trapped protons above 30 MeV that reaches the detector: a quarter of it
-        crosses either face of a thin plate.
-    """
-
-    cosmic_per_cm2_s: NotNegative = 1.0
+    cosmic_per_cm2_s: NotNegative = 1.0  #: Rate of cosmic rays outside the South Atlantic Anomaly.
+    #: Fraction of the omnidirectional flux of trapped protons above 30 MeV that reaches the detector: a quarter of it
+    #: crosses either face of a thin plate.
     share: Share = 0.5
 
-    def rate_per_cm2_s(self, track: Track) -> NDArray[np.float64]:
+    def rate_per_cm2_s(self, track: Track) -> Floats:
         """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""
         return np.asarray(self.cosmic_per_cm2_s + self.share * proton_flux(track, above_mev=30))
 
@@ -118,12 +104,12 @@ PARTICLES_SOURCE = (
 )
 
 
-def elongation_deg(sun: Vectors, target: NDArray[np.float64]) -> NDArray[np.float64]:
+def elongation_deg(sun: Vectors, target: Floats) -> Floats:
     """Return the angle between target and Sun, shape (n,), from unit vectors of shapes (3,) and (n, 3)."""
     return np.asarray(np.degrees(np.arccos(np.clip(sun @ target, -1, 1))))
 
 
-def zodiacal_light(bodies: Bodies, target: NDArray[np.float64]) -> NDArray[np.float64]:
+def zodiacal_light(bodies: Bodies, target: Floats) -> Floats:
     """Return the zodiacal light behind a target, V mag arcsec^-2, shape (n,).
 
     The value is NaN near the Sun, where the table has none. One time per day samples a year well enough.
@@ -152,12 +138,12 @@ CHUNK = 1 << 16
 class Windows:
     """Intervals in which one target is visible; arrays of shape (n_window,)."""
 
-    start_s: NDArray[np.float64]  # since the start of the plan, as stop_s
-    stop_s: NDArray[np.float64]
-    in_shadow_s: NDArray[np.float64]  # part of the window in the Earth's shadow
+    start_s: Floats  # since the start of the plan, as stop_s
+    stop_s: Floats
+    in_shadow_s: Floats  # part of the window in the Earth's shadow
 
     @property
-    def length_s(self) -> NDArray[np.float64]:
+    def length_s(self) -> Floats:
         """Length of each window."""
         return self.stop_s - self.start_s
 
@@ -175,7 +161,7 @@ class Visibility:
     target: Vectors  # unit vectors, shape (k, 3)
     limits: Limits
     seen: Flags  # shape (n, k), without windows that are too short
-    kept_by: dict[str, NDArray[np.float64]]  # fraction of time that each limit alone allows, shape (k,)
+    kept_by: dict[str, Floats]  # fraction of time that each limit alone allows, shape (k,)
 
     @classmethod
     def of(cls, track: Track, target: Vectors, limits: Limits | None = None) -> Visibility:
@@ -192,7 +178,10 @@ class Visibility:
                 count += np.broadcast_to(flags, (part.stop - part.start, k)).sum(axis=0)
             kept_by[name] = count / n
         if limits.shortest_s > 0:
-            _drop_short(seen, track.times.step_s, limits.shortest_s)
+            for column in seen.T:
+                for first, last in true_runs(column):
+                    if (last - first) * track.times.step_s < limits.shortest_s:
+                        column[first:last] = False
         # The track's own grid holds its times as arrays.
         return cls(track.orbit, replace(track.times), target, limits, seen, kept_by)
 
@@ -203,16 +192,16 @@ class Visibility:
 
     @cached_property
     def shadow(self) -> Flags:
-        """True where the satellite is in the Earth's shadow, shape (n,)."""
-        return in_shadow(self.track)
+        """True where the satellite is in the Earth's shadow, which hides more than half of the Sun, shape (n,)."""
+        return np.asarray(self.track.sunlight < 0.5)
 
     @cached_property
-    def share(self) -> NDArray[np.float64]:
+    def share(self) -> Floats:
         """Fraction of the time in which each target is visible, without the duty cycle, shape (k,)."""
         return np.asarray(self.seen.mean(axis=0))
 
     @property
-    def hours(self) -> NDArray[np.float64]:
+    def hours(self) -> Floats:
         """Exposure time of each target with the duty cycle, shape (k,)."""
         return np.asarray(self.share * self.track.times.n * self.track.times.step_s / 3600 * self.limits.duty_cycle)
 
@@ -223,13 +212,13 @@ class Visibility:
         step = np.float64(self.track.times.step_s)
         return Windows(first * step, last * step, (dark[last] - dark[first]) * step)
 
-    def by_day(self, k: int) -> NDArray[np.float64]:
+    def by_day(self, k: int) -> Floats:
         """Return the hours of exposure on each UTC day from the day of the start, shape (n_day,)."""
         _, days = self.track.times.julian
         number = np.floor(days).astype(int)
         return np.asarray(np.bincount(number, self.seen[:, k]) * self._step_h)
 
-    def by_month(self) -> tuple[list[str], NDArray[np.float64]]:
+    def by_month(self) -> tuple[list[str], Floats]:
         """Return the calendar months (UTC), such as "2027-01", and the hours of exposure, shape (n_month, k)."""
         times = self.track.times
         day = np.datetime64(times.iso(0.0)[:10], "D") + np.floor(times.julian[1]).astype(int)
@@ -237,7 +226,7 @@ class Visibility:
         hours = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
         return [str(month) for month in months], hours
 
-    def by_orbit(self, k: int) -> NDArray[np.float64]:
+    def by_orbit(self, k: int) -> Floats:
         """Return the minutes of exposure between ascending nodes, shape (n_orbit,).
 
         The first and last orbit may be incomplete.
@@ -251,22 +240,17 @@ class Visibility:
         return self.track.times.step_s / 3600 * self.limits.duty_cycle
 
 
-def in_shadow(track: Track) -> Flags:
-    """Return whether more than half of the Sun's disk is hidden, shape (n,)."""
-    return np.asarray(geometry.sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km) < 0.5)
-
-
 def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
     """Return the limits in force by name."""
     at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
     stars = target.T.astype(np.float32)
 
-    def far_from(directions: Vectors, angle_rad: NDArray[np.float64] | float) -> Flags:
+    def far_from(directions: Vectors, angle_rad: Floats | float) -> Flags:
         """Return whether targets are at least an angle from directions, unit vectors of shape (n, 3)."""
         return np.asarray(directions.astype(np.float32) @ stars <= np.float32(np.cos(angle_rad)))
 
     if limits.earth_limb_deg is not None:
-        limb = geometry.limb_angle_rad(at)[:, None] + np.radians(limits.earth_limb_deg)
+        limb = track.limb_angle_rad[:, None] + np.radians(limits.earth_limb_deg)
         rules["earth_limb"] = lambda part: far_from(-unit(at[part]), limb[part])
     if limits.sun_deg is not None:
         sun = np.radians(limits.sun_deg)
@@ -283,20 +267,31 @@ def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
         cone = np.float32(np.cos(np.radians(limits.normal_cone_deg)))
         rules["normal_cone"] = lambda part: np.abs(track.normal[part].astype(np.float32) @ stars) >= cone
     if limits.eclipse != "any":
-        allowed = in_shadow(track) == (limits.eclipse == "only")
+        allowed = (track.sunlight < 0.5) == (limits.eclipse == "only")
         rules["eclipse"] = lambda part: allowed[part, None]
     if limits.anomaly or limits.proton_flux is not None:
         if limits.anomaly:
-            outside = ~geometry.in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
+            outside = ~_in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
         else:
             outside = proton_flux(track, above_mev=10) <= (limits.proton_flux or 0.0)
         rules["anomaly"] = lambda part: outside[part, None]
     return rules
 
 
-def _drop_short(seen: Flags, step_s: float, shortest_s: float) -> None:
-    """Clear intervals shorter than `shortest_s` in each column, in place."""
-    for column in seen.T:
-        for first, last in true_runs(column):
-            if (last - first) * step_s < shortest_s:
-                column[first:last] = False
+def _in_polygon(longitude_deg: Floats, latitude_deg: Floats, corners: Vectors) -> Flags:
+    """Return whether positions lie inside a polygon in the plane of longitude and latitude, deg, shape (n,).
+
+    Longitudes may exceed 180 deg, and the polygon, of shape (m, 2) with its corners in order, may cross longitude 180.
+    """
+    # Longitudes are relative to the first corner.
+    x = (longitude_deg - corners[0, 0] + 180) % 360 - 180
+    around = np.concatenate([[0.0], np.cumsum((np.diff(corners[:, 0]) + 180) % 360 - 180)])
+    inside = np.zeros(np.shape(x), bool)
+    for turn in (-360.0, 0.0, 360.0):
+        xs, ys = around + turn, corners[:, 1]
+        for x1, y1, x2, y2 in zip(xs, ys, np.roll(xs, -1), np.roll(ys, -1), strict=True):
+            if y1 == y2:
+                continue
+            crosses = (y1 > latitude_deg) != (y2 > latitude_deg)
+            inside ^= crosses & (x < x1 + (latitude_deg - y1) / (y2 - y1) * (x2 - x1))
+    return inside

@@ -14,18 +14,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import urljoin, urlsplit
 
 from mauvecl.host import VERSION
-from mauvecl.host.stars.coverage import check_covers
 from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept
-from mauvecl.host.stars.source import Source
+from mauvecl.host.stars.source import Source, check_covers
 from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, write_whole
 from mauvecl.schema.errors import InputError
 
-if TYPE_CHECKING:
-    from astropy.table import Table
+#: Unit of the fluxes of kept stars.
+FLUX = "erg / (s cm2 Angstrom)"
 
 
 def add(
@@ -56,34 +54,19 @@ def add(
     wavelength_unit, flux_unit, extend : str, optional
         As for `Source.read`.
     """
-    given = path
-    path, _ = without_columns(path)
-    content = read_bytes(path, "spectrum file")
-    source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
+    from astropy.table import Table
+
+    file, _ = without_columns(path)
+    content = read_bytes(file, "spectrum file")
+    source = Source.read(path, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
     check_covers(source)
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
-    table = _kept_table(source)
-    digest = hashlib.sha256(content).hexdigest()
-    table.meta = {"name": name, "origin": origin or f"file {path.name}", "file_sha256": digest} | table.meta
-    text = io.StringIO()
-    table.write(text, format="ascii.ecsv")
-    try:
-        write_whole(place, text.getvalue().encode(), shared=True)
-    except InputError as error:
-        raise error.within("star folder (MAUVECL_DATA_DIR sets another)") from error
-    star = find(name)
-    assert star is not None
-    return star
-
-
-def _kept_table(source: Source) -> Table:
-    """Return a spectrum and what is known of it as a table."""
-    from astropy.table import Table
-
-    table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
-    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-    table.meta |= {
+    table = Table([source.wavelength_nm, source.flux_flam], names=("wavelength", "flux"), units=("nm", FLUX))
+    table.meta = {
+        "name": name,
+        "origin": origin or f"file {file.name}",
+        "file_sha256": hashlib.sha256(content).hexdigest(),
         "spectrum_sha256": source.digest,
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "dereddened": any("dereddened" in note for note in source.notes),
@@ -93,7 +76,15 @@ def _kept_table(source: Source) -> Table:
     }
     if source.measured_nm is not None:
         table.meta["measured_nm"] = list(source.measured_nm)
-    return table
+    text = io.StringIO()
+    table.write(text, format="ascii.ecsv")
+    try:
+        write_whole(place, text.getvalue().encode(), shared=True)
+    except InputError as error:
+        raise error.within("star folder (MAUVECL_DATA_DIR sets another)") from error
+    star = find(name)
+    assert star is not None
+    return star
 
 
 def _place_of(name: str, *, replace: bool) -> Path:
@@ -209,7 +200,15 @@ def fetch(
     extend : str, optional
         Library spectrum that continues the star's beyond its end.
     """
-    star, chosen = _star_and_collections(name, base)
+    word, colon, star = (part.strip() for part in name.partition(":"))
+    chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
+    if not chosen:
+        raise InputError.of("collection", word, f"one of {', '.join(c.name for c in COLLECTIONS)}")
+    if base is not None and not colon:
+        raise InputError(f"with another address, {name!r} must name its collection too, as in ngsl:{name}", key="name")
+    star = star if colon else word
+    if not _file_name(star):
+        raise InputError(f"star {name!r} has an empty name; give a name such as ngsl:HD 37202", key="name")
     for collection in chosen:
         try:
             address = _folder(base or collection.base)
@@ -230,20 +229,6 @@ def fetch(
     fault = f"no star {star!r} is in {' or '.join(collection.title for collection in chosen)}"
     remedy = "give the name that it has there, such as HD 37202, or bring the file: mauvecl library add"
     raise InputError(f"{fault}; {remedy}", key="name")
-
-
-def _star_and_collections(name: str, base: str | None) -> tuple[str, list[Collection]]:
-    """Return a star's own name, and the collections in which it is searched for."""
-    word, colon, star = (part.strip() for part in name.partition(":"))
-    chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
-    if not chosen:
-        raise InputError.of("collection", word, f"one of {', '.join(c.name for c in COLLECTIONS)}")
-    if base is not None and not colon:
-        raise InputError(f"with another address, {name!r} must name its collection too, as in ngsl:{name}", key="name")
-    star = star if colon else word
-    if not _file_name(star):
-        raise InputError(f"star {name!r} has an empty name; give a name such as ngsl:HD 37202", key="name")
-    return star, chosen
 
 
 def _folder(address: str) -> str:

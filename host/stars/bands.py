@@ -44,29 +44,17 @@ class Band:
     name: str
     system: Literal["Vega", "AB"]  # magnitude system of catalogues in this band
     vega: float  # Vega's magnitude in that system; NaN for AB
-    zero_point: str  # source of the zero point
-    origin: str  # source of the curve
     wavelength_nm: Float  # shape (n,)
     throughput: Float  # relative response per photon, shape (n,)
 
 
+@cache
 def band(name: str) -> Band:
     """Return a band, given its name or alias in any case."""
-    return _load(known_band(name))
-
-
-@cache
-def _load(name: str) -> Band:
+    name = known_band(name)
     table = spectrum_table(f"{name.lower().replace(' ', '_')}.ecsv", "bands")
-    return Band(
-        name=name,
-        system=table.meta["system"],
-        vega=float(table.meta.get("vega", np.nan)),
-        zero_point=table.meta["zero_point"],
-        origin=table.meta["origin"],
-        wavelength_nm=table["wavelength"],
-        throughput=table["throughput"],
-    )
+    vega = float(table.meta.get("vega", np.nan))
+    return Band(name, table.meta["system"], vega, table["wavelength"], table["throughput"])
 
 
 def scale(name: str, system: System = "catalogue") -> str:
@@ -92,7 +80,11 @@ def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: S
     if not star > 0.0:
         raise InputError(f"the spectrum must have light in the band {chosen.name}, but has none", key="band")
     if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
-        return _ab_magnitude(star, grid, chosen)
+        # The mean flux per wavelength, converted at the pivot wavelength.
+        at, through = chosen.wavelength_nm * ANGSTROM, chosen.throughput
+        pivot = float(np.sqrt(np.trapezoid(through * at, at) / np.trapezoid(through / at, at)))
+        mean = HC * star / float(np.trapezoid(grid * _interpolate(grid, at, through), grid))
+        return -2.5 * math.log10(mean * pivot**2 / c.to_value(u.AA / u.s) / AB_ZERO)
     vega = math.log10(photons(*_vega(), chosen.name))
     return 2.5 * (vega - math.log10(star)) + (chosen.vega if system == "catalogue" else 0.0)
 
@@ -152,11 +144,3 @@ def _interpolate(grid: Float, at: Float, values: Float) -> Float:
     after = np.clip(np.searchsorted(at, grid, side="right"), 1, at.size - 1)
     share = np.clip((grid - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
     return np.asarray(values[after - 1] * (1.0 - share) + values[after] * share)
-
-
-def _ab_magnitude(star: float, grid: Float, chosen: Band) -> float:
-    """Return the AB magnitude of a photon rate: its mean flux per wavelength, converted at the pivot wavelength."""
-    at, through = chosen.wavelength_nm * ANGSTROM, chosen.throughput
-    pivot = float(np.sqrt(np.trapezoid(through * at, at) / np.trapezoid(through / at, at)))
-    mean = HC * star / float(np.trapezoid(grid * _interpolate(grid, at, through), grid))
-    return -2.5 * math.log10(mean * pivot**2 / c.to_value(u.AA / u.s) / AB_ZERO)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,35 +70,6 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
-class Spectrum(Protocol):
-    """Spectrum of a star that has a name, as a `Source` is."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def wavelength_nm(self) -> Float: ...
-    @property
-    def flux_flam(self) -> Float: ...
-    @property
-    def measured_nm(self) -> tuple[float, float] | None: ...
-
-
-def check_covers(source: Spectrum, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
-    """Raise InputError if the measured range of a source does not cover that of the pixels."""
-    low, high = source.measured_nm or source.wavelength_nm[[0, -1]]
-    if low > needed_nm[0] or high < needed_nm[1]:
-        needed = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm"
-        fault = f"spectrum {source.name} must span {needed}, not {low:g}-{high:g} nm"
-        raise InputError(f"{fault}: `extend` continues it by a library spectrum", key="extend")
-
-
-def coverage(wavelength: Float) -> str:
-    """Return the message on the wavelengths that a spectrum covers before it is continued."""
-    part = measured_part(wavelength)
-    share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
-    return f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}"
-
-
 def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
     """Cut ends outside 200-700 nm at their innermost undefined point, and return a note."""
     bad = ~np.isfinite(flux)
@@ -164,13 +134,6 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
     return tuple(messages)
 
 
-@cache
-def _nominal_line() -> LineSpread:
-    from mauvecl.host.instrument.instrument import Instrument, LineSpread
-
-    return LineSpread.of(Instrument.load("mauve"))
-
-
 def continued(
     name: str,
     wavelength: Float,
@@ -190,6 +153,10 @@ def continued(
     span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
     if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
         return wavelength, flux, ()
+    if line is None:
+        from mauvecl.host.instrument.instrument import Instrument, LineSpread
+
+        line = LineSpread.of(Instrument.load("mauve"))
     messages = []
     edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
     brightest = max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
@@ -201,7 +168,7 @@ def continued(
         level = max(float(flux[near].mean()), 0.0)
         # Light in the outermost pixel from beyond the end.
         beyond = sign * (end - needed_nm[side])
-        share = float((line or _nominal_line()).below(np.array([beyond]))[0]) * level / brightest
+        share = float(line.below(np.array([beyond]))[0]) * level / brightest
         if dark_only and (beyond > 0 or share > MAX_CONTINUED):
             continue
         if share > MAX_CONTINUED:
@@ -239,13 +206,14 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, other: Spectrum, *, ultraviolet: tuple[str, ...] = ()
+    name: str, wavelength: Float, flux: Float, other: tuple[str, Float, Float], *, ultraviolet: tuple[str, ...] = ()
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue a spectrum by a longer one, scaled at the join, and return messages.
+    """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
 
     The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
     InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
     """
+    longer, nm, others = other
     messages = []
     # Consecutive zeros at an end are missing data.
     light = np.flatnonzero(flux != 0.0)
@@ -255,34 +223,31 @@ def extended(
     check_measured(name, wavelength)
     for blue in (True, False):
         end = float(wavelength[0] if blue else wavelength[-1])
-        more = other.wavelength_nm < end if blue else other.wavelength_nm > end
+        more = nm < end if blue else nm > end
         if not more.any():
             continue
-        join, scale = _join(name, wavelength, flux, other, blue)
+        join, scale = _join(f"spectrum {name} and its extension {longer}", (wavelength, flux), (nm, others), blue)
         messages.append(
-            f"{'below' if blue else 'above'} {end:g} nm it is continued by {other.name}, scaled by {scale:.4g} to "
+            f"{'below' if blue else 'above'} {end:g} nm it is continued by {longer}, scaled by {scale:.4g} to "
             f"agree at {join[0]:g}-{join[1]:g} nm"
         )
         if blue:
-            messages += [f"in {other.name}, {message}" for message in ultraviolet]
-        wavelength = attached(wavelength, other.wavelength_nm[more], blue)
-        flux = attached(flux, other.flux_flam[more] * scale, blue)
-    return wavelength, flux, tuple(messages) or (f"its extension {other.name} reaches no farther and is not used",)
+            messages += [f"in {longer}, {message}" for message in ultraviolet]
+        wavelength, flux = attached(wavelength, nm[more], blue), attached(flux, others[more] * scale, blue)
+    return wavelength, flux, tuple(messages) or (f"its extension {longer} reaches no farther and is not used",)
 
 
-def _join(name: str, wavelength: Float, flux: Float, other: Spectrum, blue: bool) -> tuple[Float, float]:
+def _join(both: str, first: tuple[Float, Float], second: tuple[Float, Float], blue: bool) -> tuple[Float, float]:
     """Return the range in which two spectra are compared, widened by the noise of the first, and their ratio there."""
-    both = f"spectrum {name} and its extension {other.name}"
-    low, high = max(wavelength[0], other.wavelength_nm[0]), min(wavelength[-1], other.wavelength_nm[-1])
+    low, high = max(first[0][0], second[0][0]), min(first[0][-1], second[0][-1])
     if not low < high:
-        spans = (f"{nm[0]:g}-{nm[-1]:g} nm" for nm in (wavelength, other.wavelength_nm))
+        spans = (f"{nm[0]:g}-{nm[-1]:g} nm" for nm, _ in (first, second))
         raise InputError(f"{both} must overlap, but span {' and '.join(spans)}", key="extend")
-    noise = point_noise(flux)
+    noise = point_noise(first[1])
     for width in JOIN_NM * 2.0 ** np.arange(6):
         join = np.clip([low, low + width] if blue else [high - width, high], low, high)
-        pairs = ((wavelength, flux), (other.wavelength_nm, other.flux_flam))
-        own, others = (float(means(nm, light, join)[0]) for nm, light in pairs)
-        near = (wavelength >= join[0]) & (wavelength <= join[1])
+        own, others = (float(means(nm, light, join)[0]) for nm, light in (first, second))
+        near = (first[0] >= join[0]) & (first[0] <= join[1])
         error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
         if own > MIN_JOIN_SNR * error and others > 0.0 and np.isfinite(own / others):
             return join, own / others

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import html
 from dataclasses import dataclass, replace
@@ -14,22 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import ContentEquality, set_read_only
-from mauvecl.host.spectra.units import SPAN_NM
+from mauvecl.host.spectra.units import NEEDED_NM, SPAN_NM, measured_part
 from mauvecl.host.stars import bands
 from mauvecl.host.stars.coverage import (
     check_flux,
     check_measured,
     check_points,
     continued,
-    coverage,
     extended,
     means,
     remarks,
     supplemented,
     without_undefined_ends,
 )
-from mauvecl.host.stars.flare import Geometry, with_flare
-from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum, blackbody
+from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbody, with_flare
 from mauvecl.host.stars.library import (
     ModelStar,
     OwnStar,
@@ -66,30 +65,6 @@ PIVOT_NM = 550.0
 class Source(Drawable, ContentEquality):
     """A stellar spectrum at the telescope; raises InputError if the arrays do not hold one.
 
-    Attributes
-    ----------
-    wavelength_nm : ndarray, shape (n,)
-        Vacuum wavelengths, strictly increasing, that cover at least a third of 200-700 nm; `expect` requires the range
-        of the instrument's pixels.
-    flux_flam : ndarray, shape (n,)
-        Flux density, erg s-1 cm-2 A-1, finite, linear between points. Negative values are measured noise.
-    name, origin : str
-        The origin includes the citation.
-    notes : tuple of str
-        Remarks for reports.
-    history : tuple of str
-        Operations applied to the spectrum.
-    scale : str
-        Explanation of the magnitude to which the spectrum was scaled; empty if it was not.
-    messages : tuple of str
-        Assumptions, continuations and merged orders, which every answer reports.
-    measured_nm : tuple of float, optional
-        Range without the parts that were continued at the level of the ends; the whole range by default.
-    unscaled : str
-        Reason why the flux is not that at the telescope, so that a magnitude is needed; empty otherwise.
-    temperature_k : float, optional
-        Temperature of the photosphere, which flares with ``geometry="replaces"`` need; None if unknown.
-
     Examples
     --------
     >>> from mauvecl import Source
@@ -100,16 +75,21 @@ class Source(Drawable, ContentEquality):
     ('scaled to V = 7.4', 'flare of 24 % in Kepler at 10000 K, added')
     """
 
+    #: Vacuum wavelengths, strictly increasing, shape (n,), that cover at least a third of 200-700 nm; `expect` requires
+    #: the range of the instrument's pixels.
     wavelength_nm: Annotated[NDArray[np.float64], Unit("nm")]
+    #: Flux density, erg s-1 cm-2 A-1, finite, linear between points. Negative values are measured noise.
     flux_flam: NDArray[np.float64]
     name: str
-    origin: str
-    notes: tuple[str, ...] = ()
-    history: tuple[str, ...] = ()
-    scale: str = ""
-    messages: tuple[str, ...] = ()
+    origin: str  #: Includes the citation.
+    notes: tuple[str, ...] = ()  #: Remarks for reports.
+    history: tuple[str, ...] = ()  #: Operations applied to the spectrum.
+    scale: str = ""  #: Explanation of the magnitude to which the spectrum was scaled; empty if it was not.
+    messages: tuple[str, ...] = ()  #: Assumptions, continuations and merged orders, which every answer reports.
+    #: Range without the parts that were continued at the level of the ends; None for the whole range.
     measured_nm: Annotated[tuple[float, float], Unit("nm")] | None = None
-    unscaled: str = ""
+    unscaled: str = ""  #: Reason why the flux is not that at the telescope, so that a magnitude is needed.
+    #: Temperature of the photosphere, which flares with ``geometry="replaces"`` need; None if unknown.
     temperature_k: Temperature | None = None
 
     def __post_init__(self) -> None:
@@ -195,7 +175,11 @@ class Source(Drawable, ContentEquality):
             Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit, ignore_checksum=ignore_checksum
         )
         star = cls._made(read, extend)
-        return replace(star, unscaled=star.unscaled or star._too_bright())
+        with contextlib.suppress(InputError):
+            v = star.magnitude("V")
+            if not star.unscaled and v <= BRIGHTEST_V and not SUN_V[0] < v < SUN_V[1]:
+                return replace(star, unscaled=f"its flux makes V = {v:.1f}, brighter than any star in the sky")
+        return star
 
     @classmethod
     def _made(cls, given: ReadSpectrum, extend: str | Source | None) -> Self:
@@ -206,12 +190,16 @@ class Source(Drawable, ContentEquality):
         wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
         messages = given.messages
         if given.axis_unit or extend is not None:
-            messages += (coverage(wavelength),)
+            part = measured_part(wavelength)
+            share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+            messages += (f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}",)
         messages += remarks(wavelength, flux)
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
             ultraviolet = other.messages if isinstance(extend, str) else ()
-            wavelength, flux, added = extended(name, wavelength, flux, other, ultraviolet=ultraviolet)
+            wavelength, flux, added = extended(
+                name, wavelength, flux, (other.name, other.wavelength_nm, other.flux_flam), ultraviolet=ultraviolet
+            )
             messages += added
         check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
@@ -220,15 +208,6 @@ class Source(Drawable, ContentEquality):
             wavelength, flux, name, given.origin, (*given.notes, *cut), messages=(*messages, *added),
             measured_nm=measured if added else None, unscaled=given.unscaled,
         )  # fmt: skip
-
-    def _too_bright(self) -> str:
-        """Return why the flux cannot be that of a star at the telescope, or an empty string."""
-        try:
-            v = self.magnitude("V")
-        except InputError:
-            return ""
-        sunlike = SUN_V[0] < v < SUN_V[1]
-        return "" if v > BRIGHTEST_V or sunlike else f"its flux makes V = {v:.1f}, brighter than any star in the sky"
 
     def binned(self, width_nm: BinWidth) -> Self:
         """Return the spectrum averaged over bins from its first wavelength on, which reduces noise.
@@ -437,6 +416,15 @@ class Source(Drawable, ContentEquality):
         flux = self.flux_flam[inside] * model.extinguish(self.wavelength_nm[inside] * u.nm, Ebv=ebv)
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)
+
+
+def check_covers(source: Source, needed_nm: tuple[float, float] = NEEDED_NM, of: str = "") -> None:
+    """Raise InputError if the measured range of a source does not cover that of the pixels."""
+    low, high = source.measured_nm or source.wavelength_nm[[0, -1]]
+    if low > needed_nm[0] or high < needed_nm[1]:
+        needed = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm"
+        fault = f"spectrum {source.name} must span {needed}, not {low:g}-{high:g} nm"
+        raise InputError(f"{fault}: `extend` continues it by a library spectrum", key="extend")
 
 
 def listed_star(name: str) -> Source:

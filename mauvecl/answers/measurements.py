@@ -15,7 +15,7 @@ from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, ReducedSums, usa
 from mauvecl.fits.profile import Profile
 from mauvecl.fits.spectrum import Forecast, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
 from mauvecl.host.arrays import true_runs
-from mauvecl.host.stars import flare_spectra as spectra
+from mauvecl.host.stars import flare as spectra
 from mauvecl.host.stars.bands import photons
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.flares.frames import Components, StareExpectation
     from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.stars.flare_spectra import FlareSpectrum
+    from mauvecl.host.stars.flare import FlareSpectrum
     from mauvecl.host.stars.source import Source
     from mauvecl.study.cases import Case
     from mauvecl.study.star import Star

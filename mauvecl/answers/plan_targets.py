@@ -15,7 +15,6 @@ from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
 from mauvecl.flares.settings import Curve
-from mauvecl.host.orbit.geometry import sunlight
 from mauvecl.host.orbit.orbit import Target, Track
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 from mauvecl.host.stars.library import nearest_spectrum
@@ -45,8 +44,7 @@ Float = NDArray[np.float64]
 
 def conditions_along(track: Track) -> tuple[Float, Float]:
     """Return the detector's temperature (deg C) and particle hits (cm-2 s-1) along an orbit, by the assumed models."""
-    light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
-    return Thermal().temperature_c(light, track.times.step_s), Particles().rate_per_cm2_s(track)
+    return Thermal().temperature_c(track.sunlight, track.times.step_s), Particles().rate_per_cm2_s(track)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,7 @@ from mauvecl.answers.answer import Answer, TableOf, first_of, metadata_of
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import true_runs
-from mauvecl.host.orbit.geometry import Bodies, TimeGrid
-from mauvecl.host.orbit.orbit import Target
+from mauvecl.host.orbit.orbit import Bodies, Target, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
 from mauvecl.schema.columns import Column, View, percent, table_of
 from mauvecl.schema.physical import DAY_S

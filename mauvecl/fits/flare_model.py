@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.host.exposure.response import Order, response_matrix
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare_spectra import (
+from mauvecl.host.stars.flare import (
     BALMER_EDGE_NM,
     ELECTRON_TEMPERATURE_K,
     PARSEC_CM,

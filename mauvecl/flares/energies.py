@@ -31,8 +31,17 @@ from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.host.arrays import set_read_only
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare import Geometry, added_light, check_scales
-from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM, Blackbody, FlareSpectrum, blackbody
+from mauvecl.host.stars.flare import (
+    PARSEC_CM,
+    STEFAN_BOLTZMANN,
+    SUN_CM,
+    Blackbody,
+    FlareSpectrum,
+    Geometry,
+    added_light,
+    blackbody,
+    check_scales,
+)
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated

@@ -15,8 +15,7 @@ from mauvecl.flares.settings import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.host.arrays import set_read_only
 from mauvecl.host.orbit import Limits
-from mauvecl.host.orbit.geometry import TimeGrid, sunlight
-from mauvecl.host.orbit.orbit import Orbit, Target, Track
+from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid, Track
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import STARE_CHANGES, Changing
@@ -622,9 +621,5 @@ def _temperature(orbit: Orbit, track: Track, thermal: Thermal) -> Float:
     past = TimeGrid(times.iso(-settling_s, 3), settling_s / DAY_S, PAST_STEP_S)
     # The same kind of orbit as that of the plan.
     before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
-    first = float(thermal.temperature_c(_light(before), PAST_STEP_S)[-1])
-    return thermal.temperature_c(_light(track), times.step_s, first)
-
-
-def _light(track: Track) -> Float:
-    return sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
+    first = float(thermal.temperature_c(before.sunlight, PAST_STEP_S)[-1])
+    return thermal.temperature_c(track.sunlight, times.step_s, first)

@@ -308,7 +308,7 @@ class MeasureQuestion(Section):
 
     def _check_values(self) -> None:
         if self.lines:
-            from mauvecl.host.stars.flare_spectra import EmissionLine
+            from mauvecl.host.stars.flare import EmissionLine
 
             for name in self.lines:
                 EmissionLine.named(name)

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.flares.energies import Rates
-    from mauvecl.host.orbit.geometry import TimeGrid
-    from mauvecl.host.orbit.orbit import Orbit, Target
+    from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid
     from mauvecl.host.tables.table import Rows
     from mauvecl.search.completeness import DurationLaw
 
@@ -90,7 +89,7 @@ class OrbitQuestion(Section):
 
     def times(self) -> TimeGrid:
         """Return the time grid."""
-        from mauvecl.host.orbit.geometry import TimeGrid
+        from mauvecl.host.orbit.orbit import TimeGrid
 
         return TimeGrid(self.start, self.days, self.step_s)
 

@@ -18,7 +18,7 @@ from mauvecl.schema.section import Section, check_all, check_needs, check_one, r
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.neighbours import Neighbours
-    from mauvecl.host.stars.flare_spectra import FlareSpectrum
+    from mauvecl.host.stars.flare import FlareSpectrum
     from mauvecl.host.stars.source import Source
 
 #: Keys that only apply to a star from a file.
@@ -178,8 +178,7 @@ class Star(Section):
         """Read the star's neighbours, or return None if it has none."""
         if self.neighbours is None:
             return None
-        from mauvecl.host.exposure.neighbour_tables import read_neighbours
-        from mauvecl.host.exposure.neighbours import Neighbours
+        from mauvecl.host.exposure.neighbours import Neighbours, read_neighbours
 
         stars, notes = read_neighbours(self.neighbours, self.neighbours_of)
         return Neighbours(stars, self.neighbour_share, notes)
@@ -342,7 +341,7 @@ class FlareLight(Section):
 
     def at_temperature(self, temperature_k: float) -> FlareSpectrum:
         """Return the spectrum at a temperature, which a spectrum from a file ignores."""
-        from mauvecl.host.stars import flare_spectra as spectra
+        from mauvecl.host.stars import flare as spectra
 
         light: FlareSpectrum = spectra.Blackbody(temperature_k)
         if self.file is not None:

@@ -118,7 +118,7 @@ def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> li
 
 def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
-    from mauvecl.host.orbit.geometry import TimeGrid
+    from mauvecl.host.orbit.orbit import TimeGrid
 
     if not stare.along_orbit:
         return []

@@ -119,7 +119,7 @@ def typed_points(text: str) -> tuple[tuple[float, float], ...]:
 
 def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     """Parse emission lines such as "Mg II = 0.03, Balmer = 0.1"."""
-    from mauvecl.host.stars.flare_spectra import EmissionLine
+    from mauvecl.host.stars.flare import EmissionLine
 
     pairs = [pair.partition("=") for pair in text.split(",") if text.strip()]
     share = Number(range_of(LineFraction))
@@ -192,7 +192,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 
 def neighbours(text: str) -> str | None:
     """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
-    from mauvecl.host.exposure.neighbour_tables import FILES
+    from mauvecl.host.exposure.neighbours import FILES
 
     if not text.strip():
         return None

@@ -33,7 +33,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 
 from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
-from mauvecl.host.exposure.neighbour_tables import KNOWN
+from mauvecl.host.exposure.neighbours import KNOWN
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.study.plan import TARGET_COLUMNS

@@ -23,7 +23,7 @@ import numpy as np
 
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.spectra.formats import read_spectrum
-from mauvecl.host.stars.flare_spectra import ObservedFlare
+from mauvecl.host.stars.flare import ObservedFlare
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import as_text, parsing, toml
 from mauvecl.observations.frame_files import read_frames

@@ -6,51 +6,32 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
+from scenes import instrument, quiescent, source
 
-from mauvecl import Expectation, Instrument, Sky, Source, expect
+from mauvecl import Expectation, Sky, expect
 
-
-@pytest.fixture(scope="module")
-def sunlike() -> Source:
-    return Source.from_library("G2V").at_magnitude(7.4)
-
-
-@pytest.fixture(scope="module")
-def quiet(sunlike: Source, mauve: Instrument) -> Expectation:
-    return expect(sunlike, mauve, exposure=50 * u.s, sky=Sky.of_brightness(22.1))
+SUN, QUIET, MAUVE = source("G2V", 7.4), quiescent("G2V", 7.4), instrument()
 
 
 def kinds(x: Expectation) -> list[str]:
     return [one.kind for one in x.messages if hasattr(one, "kind")]
 
 
-# DN/s/pixel, computed independently; Pickles spectra as the library's, so that 10 % is for the grids alone.
-@pytest.mark.parametrize(
-    ("name", "magnitude", "rates"),
-    [
+def test_rates_equal_the_published_ones() -> None:
+    """Compare DN/s/pixel of independent work with Pickles' spectra, so that 10 % is for the grids alone."""
+    for name, magnitude, rates in (
         ("G2V", 7.4, {250: 0.4, 300: 5.1, 400: 16.8, 500: 23.7, 600: 20.1, 699.7: 13.8}),
         ("B2IV", 3.03, {200.2: 2989, 250: 5373, 300: 6064, 400: 3657, 500: 1741, 600: 851, 699.7: 406}),
-    ],
-)
-def test_rates_equal_the_published_ones(
-    mauve: Instrument, name: str, magnitude: float, rates: dict[float, float]
-) -> None:
-    x = expect(Source.from_library(name).at_magnitude(magnitude), mauve, exposure=5)
-    for nm, rate in rates.items():
-        assert np.interp(nm, x.wavelength_nm, x.net_source_dn / x.exposure_s) == pytest.approx(rate, rel=0.1)
-
-
-def test_zodiacal_light_is_there_by_default(sunlike: Source, mauve: Instrument, quiet: Expectation) -> None:
-    rate = quiet.sky_electrons * quiet.gain_dn_per_electron / quiet.frame_s
-    assert rate.max() == pytest.approx(0.2, abs=0.05)
-    np.testing.assert_array_equal(expect(sunlike, mauve, exposure=50).sky_electrons, quiet.sky_electrons)
-    assert not expect(sunlike, mauve, exposure=50, sky=Sky.none()).sky_electrons.any()
+    ):
+        x = expect(source(name, magnitude), MAUVE, exposure=5)
+        found = np.interp(list(rates), x.wavelength_nm, x.net_source_dn / x.exposure_s)
+        np.testing.assert_allclose(found, list(rates.values()), rtol=0.1)
 
 
 @pytest.mark.parametrize("signal", ["net", "paper"])
-def test_closed_form_signal_to_noise(quiet: Expectation, signal: Any) -> None:
+def test_closed_form_signal_to_noise(signal: Any) -> None:
     # One pixel by hand: 10 frames, noise added in quadrature; the paper counts the zodiacal light as signal.
-    p, x = 900, replace(quiet, signal=signal)
+    p, x = 900, replace(QUIET, signal=signal)
     star, sky = 10 * x.source_electrons[p], 10 * x.sky_electrons[p]
     assert sky > 0.005 * star
     counted = 0.5957818 * (star + sky if signal == "paper" else star)
@@ -63,9 +44,9 @@ def test_closed_form_signal_to_noise(quiet: Expectation, signal: Any) -> None:
     assert x.mean_raw_dn[p] == pytest.approx(light / 10 + 445.5337 * 5 + 600, rel=1e-6)
 
 
-def test_sky_alone_has_no_net_signal(sunlike: Source, mauve: Instrument) -> None:
+def test_sky_alone_has_no_net_signal() -> None:
     """A star without light has an S/N of 0 for any sky, except in the convention of the paper."""
-    star = [expect(sunlike, mauve, exposure=50, sky=Sky.of_brightness(v)) for v in (22.1, 15.0)]
+    star = [expect(SUN, MAUVE, exposure=50, sky=Sky.of_brightness(v)) for v in (22.1, 15.0)]
     for x in star:
         nothing = replace(x, source_electrons=np.zeros_like(x.source_electrons))
         assert np.abs(nothing.snr()).max() < 1e-12
@@ -73,7 +54,7 @@ def test_sky_alone_has_no_net_signal(sunlike: Source, mauve: Instrument) -> None
         assert replace(nothing, signal="paper").snr().min() > 0
         np.testing.assert_allclose(x.signal_dn, x.net_source_dn, rtol=1e-9)
     assert (star[1].snr() < star[0].snr()).all(), "a brighter sky is noise"
-    assert "paper signal" in kinds(expect(sunlike, mauve, exposure=50, sky=22.1, signal="paper"))
+    assert "paper signal" in kinds(expect(SUN, MAUVE, exposure=50, sky=22.1, signal="paper"))
     assert "paper signal" not in kinds(star[0])
 
 
@@ -81,29 +62,25 @@ def test_sky_alone_has_no_net_signal(sunlike: Source, mauve: Instrument) -> None
     (50, 5, 10, False), (47.0, 5, 10, True), (0.001, 5, 1, True), (5, 5, 1, False), (5.001, 5, 2, True),
     (2 * u.min, 5, 24, False), (1 * u.day, 5, 17280, False), (np.float32(10), 5, 2, False), (0.1 + 0.2, 0.1, 3, False),
 ])  # fmt: skip
-def test_exposures_are_whole_frames(
-    sunlike: Source, mauve: Instrument, exposure: Any, frame_s: float, frames: int, rounded: bool
-) -> None:
-    x = expect(sunlike, mauve.with_(frame_s=frame_s), exposure=exposure)
+def test_exposures_are_whole_frames(exposure: Any, frame_s: float, frames: int, rounded: bool) -> None:
+    x = expect(SUN, MAUVE.with_(frame_s=frame_s), exposure=exposure)
     assert x.n_frames == frames
     assert x.exposure_s == pytest.approx(frame_s * frames, rel=1e-15)
     assert ("rounded up" in kinds(x)) is rounded
 
 
-# The ADC's end is the published 12.5 kDN/s; the detector's typical 2.0 V comes before it.
-@pytest.mark.parametrize(("saturation_v", "rate_dn_per_s"), [(2.2, 12_541), (2.0, 11_350)])
-def test_rate_that_saturates_a_frame(
-    sunlike: Source, mauve: Instrument, saturation_v: float, rate_dn_per_s: float
-) -> None:
-    x = expect(sunlike, mauve.with_(saturation_v=saturation_v), exposure=5)
-    electrons = np.full(1643, rate_dn_per_s * 5 / mauve.gain_dn_per_electron)
-    assert not replace(x, source_electrons=electrons * 0.999).saturated.any()
-    assert replace(x, source_electrons=electrons * 1.001).saturated.all()
+def test_rate_that_saturates_a_frame() -> None:
+    """The ADC's end is the published 12.5 kDN/s; the detector's typical 2.0 V comes before it."""
+    for saturation_v, rate_dn_per_s in ((2.2, 12_541), (2.0, 11_350)):
+        x = expect(SUN, MAUVE.with_(saturation_v=saturation_v), exposure=5)
+        electrons = np.full(1643, rate_dn_per_s * 5 / MAUVE.gain_dn_per_electron)
+        assert not replace(x, source_electrons=electrons * 0.999).saturated.any()
+        assert replace(x, source_electrons=electrons * 1.001).saturated.all()
 
 
-def test_saturation_is_the_first_message(mauve: Instrument, quiet: Expectation) -> None:
-    star = Source.from_library("B2IV").at_magnitude(1.5)
-    x = expect(star, mauve, exposure=7)
+def test_saturation_is_the_first_message() -> None:
+    star = source("B2IV", 1.5)
+    x = expect(star, MAUVE, exposure=7)
     assert kinds(x) == ["saturated", "rounded up"]
     hit = x.wavelength_nm[x.saturated]
     for words in (f"{hit[0]:.1f}-", f"-{hit[-1]:.1f} nm", f"{x.saturated.sum()} of 1643 pixels"):
@@ -111,23 +88,24 @@ def test_saturation_is_the_first_message(mauve: Instrument, quiet: Expectation) 
     # A frame of the reported length is safe, and one a little longer is not.
     safe = float(x.messages[0].split("longest safe frame is ")[1].split(" s")[0])
     assert safe == pytest.approx(x.longest_safe_frame_s, abs=1e-3)
-    assert not expect(star, mauve.with_(frame_s=safe), exposure=1).saturated.any()
-    assert expect(star, mauve.with_(frame_s=safe + 0.002), exposure=1).saturated.any()
-    assert not quiet.saturated.any()
-    assert "saturated" not in kinds(quiet)
-    assert quiet.longest_safe_frame_s > 60
+    assert not expect(star, MAUVE.with_(frame_s=safe), exposure=1).saturated.any()
+    assert expect(star, MAUVE.with_(frame_s=safe + 0.002), exposure=1).saturated.any()
+    assert not QUIET.saturated.any()
+    assert "saturated" not in kinds(QUIET)
+    assert QUIET.longest_safe_frame_s > 60
 
 
-def test_provenance_names_the_inputs(quiet: Expectation, sunlike: Source, mauve: Instrument) -> None:
-    assert (quiet.name, quiet.instrument) == (sunlike.name, "mauvesim")
-    wanted = {"source digest": sunlike.digest, "instrument digest": mauve.digest, "order": "paper",
+def test_sky_is_there_by_default_and_provenance_names_the_inputs() -> None:
+    rate = QUIET.sky_electrons * QUIET.gain_dn_per_electron / QUIET.frame_s
+    assert rate.max() == pytest.approx(0.2, abs=0.05)
+    np.testing.assert_array_equal(expect(SUN, MAUVE, exposure=50, sky=22.1).sky_electrons, QUIET.sky_electrons)
+    assert not expect(SUN, MAUVE, exposure=50, sky=Sky.none()).sky_electrons.any()
+    assert (QUIET.name, QUIET.instrument) == (SUN.name, "mauvesim")
+    wanted = {"source digest": SUN.digest, "instrument digest": MAUVE.digest, "order": "paper",
               "requested exposure": "50 s"}  # fmt: skip
-    assert wanted.items() <= dict(quiet.provenance).items()
-    assert "22.10" in quiet.provenance["sky"]
-    assert all(isinstance(value, str) for value in quiet.provenance.values())
-
-
-def test_arrays_are_read_only(quiet: Expectation, sunlike: Source) -> None:
-    for array in (quiet.dark_dn, sunlike.flux_flam):
+    assert wanted.items() <= dict(QUIET.provenance).items()
+    assert "22.10" in QUIET.provenance["sky"]
+    assert all(isinstance(value, str) for value in QUIET.provenance.values())
+    for array in (QUIET.dark_dn, SUN.flux_flam):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0.0
