@@ -425,7 +425,10 @@ def expect(
     n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
         raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
-    source = _usable(source, instrument)
+    needed_nm = (instrument.output_min_nm, instrument.output_max_nm)
+    check_covers(source, needed_nm, f"{instrument.name}'s output range ")
+    check_level(source, source.name, "magnitude")
+    source = continued_to_reach(source, instrument)
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
     electrons = _electrons_per_frame(source, instrument, order)
     nothing = np.zeros(electrons.shape)
@@ -508,14 +511,6 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
             "it is reddened again (ebv)."
         )
     yield from filter(None, (instrument.notice, source.scale))
-
-
-def _usable(source: Source, instrument: Instrument) -> Source:
-    """Return a source with continued ends; raises InputError unless it covers the output range and has a scale."""
-    needed_nm = (instrument.output_min_nm, instrument.output_max_nm)
-    check_covers(source, needed_nm, f"{instrument.name}'s output range ")
-    check_level(source, source.name, "magnitude")
-    return continued_to_reach(source, instrument)
 
 
 def continued_to_reach(source: Source, instrument: Instrument) -> Source:

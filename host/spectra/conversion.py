@@ -302,7 +302,13 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     messages += said
     segments = []
     for values, flux in raw.segments:
-        nm, kept = _in_nm(axis(values), np.where(np.isin(flux, marks), np.nan, flux))
+        kept = np.where(np.isin(flux, marks), np.nan, flux)
+        nm = np.asarray(axis(values).to_value(u.nm, u.spectral()), np.float64)
+        bad = np.flatnonzero(~np.isfinite(nm))
+        if bad.size and (bad.size == nm.size or np.isfinite(kept[bad]).any()):
+            raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
+        # A row without wavelength or flux is not a point.
+        nm, kept = np.delete(nm, bad), np.delete(kept, bad)
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
         flam = np.asarray(light(kept).to_value(FLAM, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
         segments.append((nm[order], flam[order]))
@@ -400,16 +406,6 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
     else:
         return
     raise InputError(fault, key="flux_unit")
-
-
-def _in_nm(wavelength: u.Quantity, flux: Float) -> tuple[Float, Float]:
-    """Return wavelengths in nm, and the fluxes of points with a wavelength."""
-    nm = np.asarray(wavelength.to_value(u.nm, u.spectral()), np.float64)
-    bad = np.flatnonzero(~np.isfinite(nm))
-    if bad.size and (bad.size == nm.size or np.isfinite(flux[bad]).any()):
-        raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
-    # A row without wavelength or flux is not a point.
-    return np.delete(nm, bad), np.delete(flux, bad)
 
 
 def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:

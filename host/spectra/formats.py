@@ -12,7 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, convert
 from mauvecl.host.spectra.units import stated_units
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
 from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, text_at, unit_at
-from mauvecl.host.tables.opening import Form, open_content, text_in, votables
+from mauvecl.host.tables.opening import open_content, text_in, votables
 from mauvecl.host.tables.table import MemoryTable, Values, number_in
 from mauvecl.host.tables.text_tables import (
     PROSE,
@@ -410,7 +410,6 @@ def read_spectrum(
     place, asked = without_columns(path)
     check_size(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
-    units = (wavelength_unit is None, flux_unit is None)
     try:
         # Overflows become infinities, which the check of points rejects.
         with (
@@ -419,30 +418,28 @@ def read_spectrum(
             np.errstate(all="ignore"),
         ):
             # The name without the extensions of compression and format.
-            stem = re.sub(r"\.(gz|bz2|xz)$", "", place.name, flags=re.I).rsplit(".", 1)[0][:80]
-            tables = _tables(form, content, stem or place.name, f"file {shown}", asked, units, not ignore_checksum)
+            name = re.sub(r"\.(gz|bz2|xz)$", "", place.name, flags=re.I).rsplit(".", 1)[0][:80] or place.name
+            origin = f"file {shown}"
+            if form == "FITS":
+                hdus = open_fits(content, check=not ignore_checksum)
+                with reading("it", WHOLE):
+                    tables = _Reader(hdus, name, origin, asked).tables()
+            elif form == "VOTable":
+                tables = [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
+                          for number, one in enumerate(votables(content.read(), "it"), 1)]  # fmt: skip
+            else:
+                text = text_in(form, content.read(), "it")
+                if form == "ECSV" or is_described(text):
+                    table = MemoryTable(text_table(text, "it", commas=False), "it")
+                    own = table.header.get("name")
+                    name = own.strip()[:80] if isinstance(own, str) and own.strip() else name
+                    tables = [_in_memory(table, name, origin)]
+                else:
+                    no_units = wavelength_unit is None, flux_unit is None
+                    tables = [table_of_text(text, name, f"text {origin}", asked, *no_units)]
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
         raise error.within(shown) from error
-
-
-def _tables(
-    form: Form, file: IO[bytes], name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
-) -> list[SpectrumTable]:
-    if form == "FITS":
-        hdus = open_fits(file, check=check)
-        with reading("it", WHOLE):
-            return _Reader(hdus, name, origin, asked).tables()
-    if form == "VOTable":
-        tables = enumerate(votables(file.read(), "it"), 1)
-        return [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
-                for number, one in tables]  # fmt: skip
-    text = text_in(form, file.read(), "it")
-    if form == "ECSV" or is_described(text):
-        table = MemoryTable(text_table(text, "it", commas=False), "it")
-        own = table.header.get("name")
-        return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]
-    return [table_of_text(text, name, f"text {origin}", asked, *units)]
 
 
 def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> SpectrumTable:

@@ -477,7 +477,8 @@ def with_flare(
     checked(Amplitude, "flare amplitude", amplitude)
     light = added_light(nm, flux_flam, spectrum, band, geometry, photosphere_k)
     star, hot, ratio = light.star, light.flare, light.ratio
-    grid, quiescent = _on_grid(nm, flux_flam, spectrum)
+    grid = spectrum.grid(nm)
+    quiescent = np.interp(grid, nm, flux_flam)
     body = spectrum.flux(grid)
     if spectrum.fixed_lines:
         lines = spectrum.flux_at_telescope(grid)
@@ -493,12 +494,6 @@ def with_flare(
         fault = f"flare amplitude must be at most {ratio - 1.0:.3g} at {spectrum.describe()}, not {amplitude:g}"
         raise InputError(f"{fault}, which needs {filling:.2f} of the star's disc", key="flare_amplitude")
     return grid, quiescent * (1.0 - filling) + filling * ratio * star / hot * body
-
-
-def _on_grid(nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
-    """Return wavelengths that resolve both star and flare, and the star's flux there."""
-    grid = spectrum.grid(nm)
-    return grid, flux_flam if grid is nm else np.interp(grid, nm, flux_flam)
 
 
 @dataclass(frozen=True)
@@ -534,8 +529,8 @@ def added_light(
 
     `with_flare` adds it times the amplitude, whose largest value it checks.
     """
-    grid, quiescent = _on_grid(nm, flux_flam, spectrum)
-    star = photons(grid, quiescent, band)
+    grid = spectrum.grid(nm)
+    star = photons(grid, np.interp(grid, nm, flux_flam), band)
     if not star > 0.0:
         raise InputError(f"the star must have light in the band {band}, but has none", key="band")
     hot = photons(grid, spectrum.flux(grid), band)

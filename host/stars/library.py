@@ -137,21 +137,19 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
 def remove(name: str) -> None:
     """Delete a kept star; raises InputError for an unknown name."""
     wanted = name.strip().casefold()
-    names = {path: _named(path) for path in sorted(folder().glob("*.ecsv"))}
-    found = [path for path, own in names.items() if own == wanted]
-    # A damaged file has no name but that of the file.
-    stem = re.sub(r"[^a-z0-9.+-]", "_", wanted)
-    found += [path for path, own in names.items() if own is None and path.stem.casefold() == stem]
-    if not found:
+    found, damaged = [], []
+    for path in sorted(folder().glob("*.ecsv")):
+        star = None
+        with contextlib.suppress(InputError):
+            star = _described(path)
+        if star is not None and star.name.casefold() == wanted:
+            found.append(path)
+        # A damaged file has no name but that of the file.
+        elif star is None and path.stem.casefold() == re.sub(r"[^a-z0-9.+-]", "_", wanted):
+            damaged.append(path)
+    if not found and not damaged:
         raise InputError.of("name", name, f"one of: {', '.join(star.name for star in kept()) or 'no star is kept'}")
-    found[0].unlink()
-
-
-def _named(path: Path) -> str | None:
-    with contextlib.suppress(InputError):
-        if (star := _described(path)) is not None:
-            return star.name.casefold()
-    return None
+    [*found, *damaged][0].unlink()
 
 
 #: Abbreviations of Greek letters in catalogues.
