@@ -35,35 +35,54 @@ class LargeTable(TableFile):
 
     def __init__(self, pieces: Iterator[Any], what: str, file: IO[bytes]) -> None:
         first = MemoryTable(next(pieces), what)
+        # One row has the names and units.
+        self.table, self.n_rows, self.file = MemoryTable(first.table[:1], what), 0, file
         super().__init__(what, first.header, first.names, first.remarks)
-        self.units = {name: first.find(name).unit for name in first.names}
-        row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
-        n_rows, tables = 0, itertools.chain([first], (MemoryTable(piece, what) for piece in pieces))
+        self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
+        tables = itertools.chain([first], (MemoryTable(piece, what) for piece in pieces))
         del first
         for table in tables:
-            rows = np.zeros(len(table.table), row)
+            rows = np.zeros(len(table.table), self.row)
             for name in self.names:
-                rows[name] = self._cells(table.find(name), n_rows, row[name].kind == "f")
-            rows.tofile(file)
-            n_rows += len(rows)
-        self.rows = np.memmap(file, row, "r", shape=(n_rows,))
+                rows[name] = self._cells(table.find(name), self.row[name].kind == "f")
+            rows.tofile(self.file)
+            self.n_rows += len(rows)
 
-    def _cells(self, column: Values, first: int, are_numbers: bool) -> Any:
-        """Return the rows of a column from the `first` on as numbers or short texts."""
+    def _cells(self, column: Values, are_numbers: bool) -> Any:
+        """Return the next rows of a column as numbers or short texts."""
         if are_numbers:
             # Messages count rows from the start of the file.
             held = replace(column, read=lambda start, stop: column.cells)
-            return held.rows(first, first + column.n_rows)
+            return held.rows(self.n_rows, self.n_rows + column.n_rows)
         texts = column.texts() or [str(one) for one in column.numbers().tolist()]
         if any(len(text) > CELL for text in texts):
             fault = f"{self.what}: {column.name!r} must hold numbers or dates"
             raise InputError(f"{fault}, but a cell has more than {CELL} characters", key=column.name)
         return texts
 
+    def _rows(self, start: int, stop: int) -> Any:
+        self.file.seek(start * self.row.itemsize)
+        return np.fromfile(self.file, self.row, max(0, stop - start))
+
     def named(self, name: str) -> Values | None:
         """Return a column."""
         found = matched(name, self.names, self.what)
-        return None if found is None else Values.of(name, self.rows[found], self.units[found], self.what)
+        if found is None:
+            return None
+        # A copy, since a column of a piece would keep the whole piece.
+        return Values(name, (self.n_rows,), lambda start, stop: self._rows(start, stop)[found].copy(),
+                      self.table.find(name).unit, self.what, self.row.itemsize)  # fmt: skip
+
+    def _side_by_side(self, pattern: str) -> Values | None:
+        found, names = super()._side_by_side(pattern), self.matching(pattern)
+        if found is None or any(self.row[name].kind != "f" for name in names):
+            return found
+
+        def read(start: int, stop: int) -> Any:
+            rows = self._rows(start, stop)
+            return np.column_stack([rows[name] for name in names])
+
+        return replace(found, read=read, row_bytes=self.row.itemsize)
 
 
 def _numbers(values: Values) -> bool:
