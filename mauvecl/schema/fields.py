@@ -285,7 +285,9 @@ class OrNone:
         return or_error(schema, f"{expected or 'a number'}, or none")
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
-        return {"anyOf": [handler(schema), {"const": "none"}]}
+        inner = handler(schema)
+        about = {"description": inner.pop("description")} if "description" in inner else {}
+        return about | {"anyOf": [inner, {"const": "none"}]}
 
 
 def _or_text(schema: dict[str, Any]) -> dict[str, Any]:
