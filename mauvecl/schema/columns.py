@@ -10,7 +10,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from itertools import islice
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -157,24 +157,15 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
     Columns that a table lacks are masked.
     """
-    every = list(parts)
-    tables = [table for _, table in every]
+    from astropy.table import hstack, vstack
+
+    rows, tables = zip(*parts, strict=True)
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-
-    def values(part: tuple[object, Table], name: str) -> Any:
-        return getattr(part[1][name], "value", part[1][name]) if name in part[1].colnames else None
-
-    def taken(name: str) -> Column:
-        having = [table[name] for table in tables if name in table.colnames]
-        (unit, *others) = dict.fromkeys(str(column.unit or "") for column in having)
-        if others:
-            raise ValueError(f"column {name} has several units")
-        kind = None if len(having) == len(tables) else having[0].dtype.type
-        text = having[0].info.description or ""
-        return Column(name, lambda part: values(part, name), unit, text, kind=kind)
-
-    names = dict.fromkeys(name for table in tables for name in table.colnames)
-    return table_of([*(column.of(itemgetter(0)) for column in first), *map(taken, names)], every, **shared | meta)
+    places = [table_of(first, [row] * len(table)) for row, table in zip(rows, tables, strict=True)]
+    both = [hstack([place, table]) if first else table for place, table in zip(places, tables, strict=True)]
+    whole = vstack(both, metadata_conflicts="silent")
+    whole.meta = shared | meta
+    return whole
 
 
 def records(table: Table) -> list[dict[str, Any]]:
@@ -266,7 +257,7 @@ class Drawable:
     @property
     def pictures(self) -> dict[str, Callable[..., Any]]:
         """Every picture by the name of its file; each is called with a `path`, with axes `ax`, or with neither."""
-        pictures: dict[str, Callable[..., Any]] = _charts().pictures_of(self)
+        pictures: dict[str, Callable[..., Any]] = import_module("mauvecl.charts.chart").pictures_of(self)
         return pictures
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
@@ -275,14 +266,3 @@ class Drawable:
 
     def _draw(self, path: str | Path | None, ax: Any, **options: Any) -> Any:
         return next(iter(self.pictures.values()))(path, ax=ax, **options)
-
-
-def documents_of(thing: Drawable) -> dict[str, Callable[[], bytes]]:
-    """Return the functions that make the registered documents of an object, by file name."""
-    documents: dict[str, Callable[[], bytes]] = _charts().documents_of(thing)
-    return documents
-
-
-def _charts() -> Any:
-    """Return the registry of pictures, which lies above everything that is drawn."""
-    return import_module("mauvecl.charts.chart")
