@@ -298,7 +298,7 @@ OTHERS: dict[str, Callable[..., None]] = {
 }
 #: Help text of every command, in the order of `--help`: verbs, raw spectra, mauvecl itself.
 HELP = {
-    **{name: text_of(COMMANDS[name].help) for name in (*VERBS, "realise")},
+    **{name: text_of(COMMANDS[name].verb.help or COMMANDS[name].run.__doc__) for name in (*VERBS, "realise")},
     **{name: text_of(function.__doc__) for name, function in OTHERS.items()},
     "library": text_of(library.__doc__),
 }
