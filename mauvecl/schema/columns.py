@@ -157,15 +157,14 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
     Columns that a table lacks are masked.
     """
-    from astropy.table import hstack, vstack
+    from astropy.table import QTable, hstack, vstack
 
     rows, tables = zip(*parts, strict=True)
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-    places = [table_of(first, [row] * len(table)) for row, table in zip(rows, tables, strict=True)]
+    places = [table_of(first, [row])[[0] * len(table)] for row, table in zip(rows, tables, strict=True)]
     both = [hstack([place, table]) if first else table for place, table in zip(places, tables, strict=True)]
-    whole = vstack(both, metadata_conflicts="silent")
-    whole.meta = shared | meta
-    return whole
+    # A single table is not copied by astropy.
+    return QTable(vstack(both, metadata_conflicts="silent"), meta=shared | meta)
 
 
 def records(table: Table) -> list[dict[str, Any]]:
