@@ -10,7 +10,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from itertools import islice
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -157,14 +157,24 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
     Columns that a table lacks are masked.
     """
-    from astropy.table import QTable, hstack, vstack
-
-    rows, tables = zip(*parts, strict=True)
+    every = list(parts)
+    tables = [table for _, table in every]
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-    places = [table_of(first, [row])[[0] * len(table)] for row, table in zip(rows, tables, strict=True)]
-    both = [hstack([place, table]) if first else table for place, table in zip(places, tables, strict=True)]
-    # A single table is not copied by astropy.
-    return QTable(vstack(both, metadata_conflicts="silent"), meta=shared | meta)
+
+    def values(part: tuple[object, Table], name: str) -> Any:
+        return getattr(part[1][name], "value", part[1][name]) if name in part[1].colnames else None
+
+    def taken(name: str) -> Column:
+        having = [table[name] for table in tables if name in table.colnames]
+        (unit, *others) = dict.fromkeys(str(column.unit or "") for column in having)
+        if others:
+            raise ValueError(f"column {name} has several units")
+        kind = None if len(having) == len(tables) else having[0].dtype.type
+        text = having[0].info.description or ""
+        return Column(name, lambda part: values(part, name), unit, text, kind=kind)
+
+    names = dict.fromkeys(name for table in tables for name in table.colnames)
+    return table_of([*(column.of(itemgetter(0)) for column in first), *map(taken, names)], every, **shared | meta)
 
 
 def records(table: Table) -> list[dict[str, Any]]:
