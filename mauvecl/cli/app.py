@@ -330,7 +330,7 @@ class _Group(TyperGroup):
 
     def __init__(self, **how: Any) -> None:
         super().__init__(**how)
-        self.commands = _Commands(dict.fromkeys(HELP))  # type: ignore[assignment]
+        self.commands = _Commands(dict.fromkeys(HELP))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the commands in groups, and then the flags."""
