@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
-from pydantic import model_serializer, model_validator
+from pydantic import model_serializer
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit, as_typed
-from mauvecl.schema.section import Section, read_declinations
+from mauvecl.schema.fields import Flag, OrNone, Range, Unit, as_typed
+from mauvecl.schema.section import Section, read_declinations, setting
 
 #: Angle between two directions; None for no limit.
 Separation = Annotated[float | None, Unit("deg"), Range(0, 180), OrNone()]
@@ -20,52 +20,41 @@ class Limits(Section):
     None means no limit; study files say "none".
     """
 
-    earth_limb_deg: Annotated[
-        Annotated[float | None, Unit("deg"), Range(0, 90), OrNone()],
-        Help("Smallest angle from the Earth's limb", "or none"),
-        Flag("--earth-limb", kind=str),
-    ] = 25.0
-    sun_deg: Annotated[Separation, Help("Smallest angle from the Sun", "or none"), Flag("--sun", kind=str)] = 46.0
-    moon_deg: Annotated[Separation, Help("Smallest angle from the Moon", "or none"), Flag("--moon", kind=str)] = 25.0
-    declination_deg: Annotated[
-        tuple[float, float] | None,
-        Unit("deg"),
-        OrNone(),
-        Help("Field of regard, low:high", "or none", default="-46.4:31.8"),
-        Flag("--declination", kind=str, read=read_declinations),
-    ] = (-46.4, 31.8)
-    normal_cone_deg: Annotated[
-        Separation, Help("Field of regard as a double cone about the orbit's normal", "or none", default="none")
-    ] = None
-    eclipse: Annotated[
-        Literal["any", "only", "never"],
-        Help("Observing in the Earth's shadow", choices="any, only (in the shadow) or never"),
-        Flag("--eclipse"),
-    ] = "any"
-    proton_flux: Annotated[
-        Annotated[float | None, Unit("1 / (cm2 s)"), Range(0, open_low=True), OrNone()],
-        Help("Largest flux of protons above 10 MeV", "or none"),
-        Flag("--protons", kind=str),
-    ] = 10.0
-    anomaly: Annotated[
-        tuple[tuple[float, float], ...],
-        Unit("deg"),
-        Help("Polygon of longitude and latitude in deg that replaces the map of protons"),
-    ] = ()
-    shortest_s: Annotated[float, Unit("s"), Range(0), Help("Length below which windows are dropped")] = 0.0
-    duty_cycle: Annotated[
-        float, Range(0, 1, open_low=True), Help("Fraction of a window in which the star is exposed")
-    ] = 1.0
+    earth_limb_deg: Annotated[float | None, Unit("deg"), Range(0, 90), OrNone()] = setting(
+        25.0, "Smallest angle from the Earth's limb; or none", flag=Flag("--earth-limb", kind=str)
+    )
+    sun_deg: Separation = setting(46.0, "Smallest angle from the Sun; or none", flag=Flag("--sun", kind=str))
+    moon_deg: Separation = setting(25.0, "Smallest angle from the Moon; or none", flag=Flag("--moon", kind=str))
+    declination_deg: Annotated[tuple[float, float] | None, Unit("deg"), OrNone()] = setting(
+        (-46.4, 31.8),
+        "Field of regard, low:high; or none",
+        flag=Flag("--declination", kind=str, read=read_declinations),
+        usual="-46.4:31.8",
+    )
+    normal_cone_deg: Separation = setting(
+        None, "Field of regard as a double cone about the orbit's normal; or none", usual="none"
+    )
+    eclipse: Literal["any", "only", "never"] = setting(
+        "any", "Observing in the Earth's shadow", flag="--eclipse", choices="any, only (in the shadow) or never"
+    )
+    proton_flux: Annotated[float | None, Unit("1 / (cm2 s)"), Range(0, open_low=True), OrNone()] = setting(
+        10.0, "Largest flux of protons above 10 MeV; or none", flag=Flag("--protons", kind=str)
+    )
+    anomaly: Annotated[tuple[tuple[float, float], ...], Unit("deg")] = setting(
+        (), "Polygon of longitude and latitude in deg that replaces the map of protons"
+    )
+    shortest_s: Annotated[float, Unit("s"), Range(0)] = setting(0.0, "Length below which windows are dropped")
+    duty_cycle: Annotated[float, Range(0, 1, open_low=True)] = setting(
+        1.0, "Fraction of a window in which the star is exposed"
+    )
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_values(self) -> None:
         if self.declination_deg is not None:
             low, high = self.declination_deg
             if not -90 <= low < high <= 90:
                 raise InputError.of("declination_deg", (low, high), "two rising values within -90 to 90")
         if 0 < len(self.anomaly) < 3:
             raise InputError.of("anomaly", self.anomaly, "a polygon of at least 3 corners")
-        return self
 
     @model_serializer(mode="plain")
     def _with_none_as_text(self) -> dict[str, Any]:

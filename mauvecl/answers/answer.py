@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
 from html import escape
+from importlib import import_module
 from importlib.metadata import version
 from operator import attrgetter
 from pathlib import Path
@@ -24,7 +25,7 @@ from mauvecl.host.exposure.neighbours import rate_of
 from mauvecl.host.instrument import shipped_names
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, Drawable, View, documents_of, percent, records, stacked, table_of
+from mauvecl.schema.columns import Column, Drawable, View, percent, records, stacked, table_of
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import assumptions_of, cases, full_label, place_columns
 from mauvecl.study.study import read_embedded_study
@@ -297,7 +298,8 @@ class Answer(Drawable, ContentEquality):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Functions that make the content of documents, by full file name."""
-        return documents_of(self)
+        documents: dict[str, Callable[[], bytes]] = import_module("mauvecl.charts.chart").documents_of(self)
+        return documents
 
     @property
     def files(self) -> dict[str, Table]:

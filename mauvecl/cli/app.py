@@ -11,8 +11,8 @@ import re
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Iterator, Mapping
-from functools import cache
+from collections import UserDict
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -298,40 +298,31 @@ OTHERS: dict[str, Callable[..., None]] = {
 }
 #: Help text of every command, in the order of `--help`: verbs, raw spectra, mauvecl itself.
 HELP = {
-    **{name: text_of(COMMANDS[name].help) for name in (*VERBS, "realise")},
+    **{name: text_of(COMMANDS[name].verb.help or COMMANDS[name].run.__doc__) for name in (*VERBS, "realise")},
     **{name: text_of(function.__doc__) for name, function in OTHERS.items()},
     "library": text_of(library.__doc__),
 }
 
 
-@cache
-def _command(name: str) -> Any:
-    """Build a command, with its flags."""
-    if name == "library":
-        one = library_app
-        for inner in one.registered_commands:
-            inner.help = text_of(inner.callback and inner.callback.__doc__)
-    else:
-        one = typer.Typer(add_completion=False, rich_markup_mode=None)
-        function = COMMANDS[name].build() if name in COMMANDS else OTHERS[name]
-        one.command(name, help=HELP[name], cls=CommandWithHelp)(function)
-    command = get_command(one)
-    if name in COMMANDS:
-        command.common = frozenset((*COMMON, *COMMANDS[name].verb.common))  # type: ignore[attr-defined]
-    return command
-
-
-class _Commands(Mapping[str, Any]):
-    """All commands by name; each is built when it is looked up."""
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(HELP)
-
-    def __len__(self) -> int:
-        return len(HELP)
+class _Commands(UserDict[str, Any]):
+    """All commands by name; each is built, with its flags, when it is first looked up."""
 
     def __getitem__(self, name: str) -> Any:
-        return _command(name)
+        if self.data[name] is not None:
+            return self.data[name]
+        if name == "library":
+            one = library_app
+            for inner in one.registered_commands:
+                inner.help = text_of(inner.callback and inner.callback.__doc__)
+        else:
+            one = typer.Typer(add_completion=False, rich_markup_mode=None)
+            function = COMMANDS[name].build() if name in COMMANDS else OTHERS[name]
+            one.command(name, help=HELP[name], cls=CommandWithHelp)(function)
+        command: Any = get_command(one)
+        if name in COMMANDS:
+            command.common = frozenset((*COMMON, *COMMANDS[name].verb.common))
+        self.data[name] = command
+        return command
 
 
 class _Group(TyperGroup):
@@ -339,7 +330,7 @@ class _Group(TyperGroup):
 
     def __init__(self, **how: Any) -> None:
         super().__init__(**how)
-        self.commands = _Commands()  # type: ignore[assignment]
+        self.commands = _Commands(dict.fromkeys(HELP))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the commands in groups, and then the flags."""

@@ -37,11 +37,6 @@ class Command:
     pictures: bool = True
     writes: str = ""  # default output, if it is not a folder of tables
 
-    @property
-    def help(self) -> str:
-        """Help text, by default the docstring of the function."""
-        return self.verb.help or inspect.getdoc(self.run) or ""
-
     def build(self) -> Callable[..., None]:
         """Return the function that typer calls."""
         from mauvecl.study.study import keys_of

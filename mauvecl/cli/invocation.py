@@ -99,10 +99,6 @@ def _size(size: float) -> str:
     return f"{size:.3g} PiB"
 
 
-class Terminated(KeyboardInterrupt):
-    """SIGTERM, sent at the time limit of a batch job or at shutdown."""
-
-
 @dataclass(eq=False)
 class Session(Options):
     """Session of one call of a verb; in its `with` block, only this process writes to the output folder."""
@@ -304,16 +300,19 @@ def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
 @contextmanager
 def report_interrupts(message: Callable[[], str]) -> Iterator[None]:
     """Stop the work in order at Ctrl-C and SIGTERM, with a message on kept results; exit codes 130 and 143."""
+    terminated = False
 
     def terminate(*_: object) -> None:
-        raise Terminated
+        # Sent at the time limit of a batch job or at shutdown.
+        nonlocal terminated
+        terminated = True
+        raise KeyboardInterrupt
 
     main = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGTERM, terminate) if main else None
     try:
         yield
-    except KeyboardInterrupt as stop:
-        terminated = isinstance(stop, Terminated)
+    except KeyboardInterrupt:
         print(f"mauvecl: {'terminated' if terminated else 'interrupted'}; {message()}", file=sys.stderr)
         sys.exit(143 if terminated else 130)
     finally:

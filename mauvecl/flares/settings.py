@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Help, Range, Unit
 from mauvecl.schema.physical import Duration, Temperature
-from mauvecl.schema.section import Section
+from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:
     import numpy as np
@@ -104,14 +104,13 @@ class Curve(Section):
     Between points the value is linear in time; before the first and after the last it is constant.
     """
 
-    amplitude: Annotated[Annotated[float, Range()] | None, Help("Half the range of a sinusoid")] = None
-    period_s: Annotated[Duration | None, Help("Period of the sinusoid", default="the orbit's")] = None
-    phase: Annotated[float, Unit("rad"), Range(), Help("Phase of the sinusoid at the start of the stare")] = 0.0
-    points: Annotated[tuple[tuple[float, float], ...] | None, Help("Times in s, and values")] = None
-    file: Annotated[Path | None, Help("File with two columns, time in s and value")] = None
+    amplitude: Annotated[float, Range()] | None = setting(None, "Half the range of a sinusoid")
+    period_s: Duration | None = setting(None, "Period of the sinusoid", usual="the orbit's")
+    phase: Annotated[float, Unit("rad"), Range()] = setting(0.0, "Phase of the sinusoid at the start of the stare")
+    points: tuple[tuple[float, float], ...] | None = setting(None, "Times in s, and values")
+    file: Path | None = setting(None, "File with two columns, time in s and value")
 
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _check_values(self) -> None:
         if (self.amplitude is not None) + (self.points is not None) + (self.file is not None) != 1:
             raise InputError(
                 "a curve needs one of amplitude, points and file, but has none or several", key="amplitude"
@@ -120,7 +119,6 @@ class Curve(Section):
             raise InputError("a curve has period_s or phase, which need an amplitude as well", key="amplitude")
         if self.points is not None:
             _check_points(self.points)
-        return self
 
     @cached_property
     def _time_and_value(self) -> tuple[Float, Float]:

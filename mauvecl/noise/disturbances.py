@@ -15,9 +15,9 @@ from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonS
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Help, Range, Unit, Widget, is_quantity, without_unit
+from mauvecl.schema.fields import Range, Unit, is_quantity, without_unit
 from mauvecl.schema.physical import Duration
-from mauvecl.schema.section import Section
+from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:
     import numpy as np
@@ -182,44 +182,32 @@ class PointingDrifts(Section):
     #: For messages and tables of assumptions.
     source: ClassVar[str] = "assumption: rate, depth and duration of drifts are not published"
 
-    # Drifts per hour of good pointing.
-    rate_per_h: Annotated[
-        float,
-        Unit("1 / h"),
-        Range(0, 3600, open_low=True),
-        Help("Drifts per hour of good pointing", "an assumption"),
-        Widget(
-            label="Pointing losses",
-            hint="Drifts of the star out of the fibre, each ended by a new acquisition, per hour of good pointing. "
-            "Nothing: none. How often they happen is not published.",
-            name="pointing_rate",
-            first="",
-            unit="per hour",
-            most=60.0,
-        ),
-    ] = 0.5
-    # Mean duration of a drift.
-    duration_s: Annotated[
-        Duration,
-        Help("Mean duration of a drift", "exponential; an assumption"),
-        Widget(
-            label="Duration of a loss",
-            hint="Mean time from the start of a drift to the new acquisition; an assumption.",
-            name="pointing_duration",
-        ),
-    ] = 300.0
-    # Largest share of the light lost at the end of a drift; the shares are uniform between zero and this.
-    depth: Annotated[
-        float,
-        Range(0, 1, open_low=True),
-        Help("Largest share of the light lost at the end of a drift", "uniform from 0; an assumption"),
-        Widget(
-            label="Depth of a loss",
-            hint="Largest share of the light that is lost at the end of a drift; an assumption.",
-            name="pointing_depth",
-            unit="%",
-        ),
-    ] = 0.5
+    rate_per_h: Annotated[float, Unit("1 / h"), Range(0, 3600, open_low=True)] = setting(
+        0.5,
+        "Drifts per hour of good pointing; an assumption",
+        label="Pointing losses",
+        hint="Drifts of the star out of the fibre, each ended by a new acquisition, per hour of good pointing. "
+        "Nothing: none. How often they happen is not published.",
+        name="pointing_rate",
+        first="",
+        unit="per hour",
+        most=60.0,
+    )
+    duration_s: Duration = setting(
+        300.0,
+        "Mean duration of a drift; exponential; an assumption",
+        label="Duration of a loss",
+        hint="Mean time from the start of a drift to the new acquisition; an assumption.",
+        name="pointing_duration",
+    )
+    depth: Annotated[float, Range(0, 1, open_low=True)] = setting(
+        0.5,
+        "Largest share of the light lost at the end of a drift; uniform from 0; an assumption",
+        label="Depth of a loss",
+        hint="Largest share of the light that is lost at the end of a drift; an assumption.",
+        name="pointing_depth",
+        unit="%",
+    )
 
 
 #: Largest distance of a cut from the mean in standard deviations; beyond it, the logarithm of the tail loses precision.

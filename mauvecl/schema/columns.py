@@ -266,7 +266,7 @@ class Drawable:
     @property
     def pictures(self) -> dict[str, Callable[..., Any]]:
         """Every picture by the name of its file; each is called with a `path`, with axes `ax`, or with neither."""
-        pictures: dict[str, Callable[..., Any]] = _charts().pictures_of(self)
+        pictures: dict[str, Callable[..., Any]] = import_module("mauvecl.charts.chart").pictures_of(self)
         return pictures
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
@@ -275,14 +275,3 @@ class Drawable:
 
     def _draw(self, path: str | Path | None, ax: Any, **options: Any) -> Any:
         return next(iter(self.pictures.values()))(path, ax=ax, **options)
-
-
-def documents_of(thing: Drawable) -> dict[str, Callable[[], bytes]]:
-    """Return the functions that make the registered documents of an object, by file name."""
-    documents: dict[str, Callable[[], bytes]] = _charts().documents_of(thing)
-    return documents
-
-
-def _charts() -> Any:
-    """Return the registry of pictures, which lies above everything that is drawn."""
-    return import_module("mauvecl.charts.chart")

@@ -285,7 +285,9 @@ class OrNone:
         return or_error(schema, f"{expected or 'a number'}, or none")
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
-        return {"anyOf": [handler(schema), {"const": "none"}]}
+        inner = handler(schema)
+        about = {"description": inner.pop("description")} if "description" in inner else {}
+        return about | {"anyOf": [inner, {"const": "none"}]}
 
 
 def _or_text(schema: dict[str, Any]) -> dict[str, Any]:
@@ -441,12 +443,6 @@ def range_of(kind: Any) -> Range:
     return first(kind, Range) or Range()
 
 
-@cache
-def unit_of(kind: Any) -> str:
-    """Return the unit of an annotation such as `physical.Magnitude`, empty if it has none."""
-    return (first(kind, Unit) or Unit("")).name
-
-
 def checked(kind: Any, what: str, value: Any) -> float:
     """Return a number in the unit and range of an annotation such as `physical.Magnitude`."""
-    return number(what, value, unit_of(kind), range_of(kind))
+    return number(what, value, (first(kind, Unit) or Unit("")).name, range_of(kind))

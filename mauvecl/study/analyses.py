@@ -11,7 +11,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Wavelength
 from mauvecl.schema.section import Section, check_needs, check_one, read_ranges, read_words, setting
-from mauvecl.study.star import Star
+from mauvecl.study.star import Star, unit_of_file
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
@@ -128,26 +128,8 @@ class ChangeQuestion(Section):
         group="Added spectrum",
         name="change_band",
     )
-    wavelength_unit: str | None = setting(
-        None,
-        "Unit of the wavelengths of that spectrum",
-        flag="--change-wavelength-unit",
-        label="Added: unit of wavelengths",
-        hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
-        group="Added spectrum",
-        name="change_wavelength_unit",
-        suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
-    )
-    flux_unit: str | None = setting(
-        None,
-        "Unit of the fluxes of that spectrum",
-        flag="--change-flux-unit",
-        label="Added: unit of fluxes",
-        hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
-        group="Added spectrum",
-        name="change_flux_unit",
-        suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
-    )
+    wavelength_unit: str | None = unit_of_file("wavelength", "change", "that spectrum", "Added", "Added spectrum")
+    flux_unit: str | None = unit_of_file("flux", "change", "that spectrum", "Added", "Added spectrum")
     extend: str | None = setting(
         None,
         "Library spectrum that continues that spectrum beyond its end",

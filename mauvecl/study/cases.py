@@ -88,11 +88,8 @@ def _flare(study: Study, swept: set[str]) -> str:
 
 def _orbit(study: Study) -> str:
     limits = study.orbit.limits
-    kept = [
-        f"{name} {value:g} deg"
-        for name, value in (("Earth's limb", limits.earth_limb_deg), ("Sun", limits.sun_deg), ("Moon", limits.moon_deg))
-        if value is not None
-    ]
+    least = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
+    kept = [f"{name} {value:g} deg" for name, value in least.items() if value is not None]
     source = "embedded elements" if study.orbit.tle is None else study.orbit.tle.name
     return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"
 

@@ -21,12 +21,32 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.flare import FlareSpectrum
     from mauvecl.host.stars.source import Source
 
+#: Units of a spectrum file: what has them, examples in a sentence, and suggestions.
+UNITS = {
+    "wavelength": ("wavelengths", "Angstrom or Angstrom air", ("nm", "Angstrom", "um", "nm air", "Angstrom air")),
+    "flux": ("fluxes", "W m-2 nm-1 or Jy", ("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy")),
+}
 #: Keys that only apply to a star from a file.
 FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend", "ignore_checksum")
 #: Keys that describe one star and are dropped when another star replaces it.
 STAR_KEYS = (
     *FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k", "neighbours", "neighbours_of"
 )  # fmt: skip
+
+
+def unit_of_file(of: Literal["wavelength", "flux"], what: str, whose: str, label: str, group: str) -> Any:
+    """Return the key of a unit of spectra next to a star's; `what` begins its flag, and `whose` ends its help."""
+    many, such, units = UNITS[of]
+    return setting(
+        None,
+        f"Unit of the {many} of {whose}",
+        flag=f"--{what}-{of}-unit",
+        label=f"{label}: unit of {many}",
+        hint=f"Such as {such}. Nothing: what the file says.",
+        group=group,
+        name=f"{what}_{of}_unit",
+        suggestions=units,
+    )
 
 
 class Star(Section):
@@ -290,26 +310,8 @@ class FlareLight(Section):
         place=1,
         kind="file",
     )
-    wavelength_unit: str | None = setting(
-        None,
-        "Unit of the wavelengths of the flare's files",
-        flag="--flare-wavelength-unit",
-        label="Flare: unit of wavelengths",
-        hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
-        group="Own flare",
-        name="flare_wavelength_unit",
-        suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
-    )
-    flux_unit: str | None = setting(
-        None,
-        "Unit of the fluxes of the flare's files",
-        flag="--flare-flux-unit",
-        label="Flare: unit of fluxes",
-        hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
-        group="Own flare",
-        name="flare_flux_unit",
-        suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
-    )
+    wavelength_unit: str | None = unit_of_file("wavelength", "flare", "the flare's files", "Flare", "Own flare")
+    flux_unit: str | None = unit_of_file("flux", "flare", "the flare's files", "Flare", "Own flare")
     continue_at_k: physical.Temperature | None = setting(
         None,
         "Temperature of a blackbody that continues the flare's file beyond its ends",
