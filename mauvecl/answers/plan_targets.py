@@ -162,11 +162,10 @@ def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | 
     if rates.definition == "light":
         return rates.in_band(BOLOMETRIC, flare=flare.light()), ""
     band, distance_pc = rates.amplitude_band, case.star.distance_pc
-    measured = case.with_sections(flare=flare.model_copy(update={"band": band}))
-    scale = energy_scale(measured.study, measured.source, "bolometric", flare.temperature_k)
-    assert scale is not None
     assert distance_pc is not None
-    return rates.of_light(scale.erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
+    measured = case.with_sections(flare=flare.model_copy(update={"band": band}))
+    erg_per_s = replace(observation, case=measured).scale.erg_per_s
+    return rates.of_light(erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
 
 
 def star_of(text: PlanTarget, simbad: bool) -> Star:

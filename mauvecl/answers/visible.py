@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -51,17 +52,9 @@ def calendar_bytes(entries: Iterable[tuple[str, str, str, str]]) -> bytes:
                   f"DTEND{ends}", f"SUMMARY:{title.translate(ESCAPES)}", f"DESCRIPTION:{text.translate(ESCAPES)}",
                   "TRANSP:TRANSPARENT", "END:VEVENT"]  # fmt: skip
     lines.append("END:VCALENDAR")
-    return "".join(f"{_folded(line)}\r\n" for line in lines).encode()
-
-
-def _folded(line: str) -> str:
-    """Fold a line to at most 75 bytes; continuation lines begin with a space."""
-    parts = [""]
-    for character in line:
-        if len((parts[-1] + character).encode()) > (75 if len(parts) == 1 else 74):
-            parts.append("")
-        parts[-1] += character
-    return "\r\n ".join(parts)
+    # Lines have at most 75 bytes; the rest of a longer one follows after a space. No character is cut.
+    folded = (re.findall(rb"(?:^.{1,75}|.{1,74})(?![\x80-\xbf])", line.encode()) for line in lines)
+    return b"".join(b"\r\n ".join(parts) + b"\r\n" for parts in folded)
 
 
 Float = NDArray[np.float64]
