@@ -139,14 +139,10 @@ def errors_of_throughput(observation: TargetObservation, rates: Rates | None) ->
     calibrated = throughput_cases(observation.case)
     if not calibrated or not observation.signal_per_frame > 0 or not observation.window_s > 0:
         return None
-
-    def logarithms(case: Case) -> tuple[float, float]:
-        its = closed_form(replace(observation, case=case))
-        number = np.nan if rates is None else recovered_per_day(rates, its)
-        return float(np.log(its.energy_at(0.5))), float(np.log(number))
-
-    moved = np.array([logarithms(case) for case in calibrated]) - logarithms(observation.case)
-    energy, number = np.sqrt((moved**2).sum(axis=0))
+    answers = [closed_form(replace(observation, case=case)) for case in (observation.case, *calibrated)]
+    values = [(its.energy_at(0.5), np.nan if rates is None else recovered_per_day(rates, its)) for its in answers]
+    nominal, *moved = np.log(values)
+    energy, number = np.sqrt(((np.array(moved) - nominal) ** 2).sum(axis=0))
     return float(energy), float(number)
 
 
