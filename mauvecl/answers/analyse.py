@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -52,22 +52,19 @@ def blended_stars(cases: Sequence[Case]) -> list[tuple[str, float, float]]:
             key="star",
         )
     (case,) = cases
-    check_scales(case.study.flare.light())
-    near, quiet = case.neighbours, case.quiet
+    flare, near, quiet = case.study.flare, case.neighbours, case.quiet
+    check_scales(flare.light())
     assert near is not None
     total = float((quiet.source_electrons + quiet.neighbour_electrons).sum())
-    return [(case.label, 0.0, _electrons(case, case.source) / total)] + [
-        (neighbour.name, neighbour.separation_arcsec, near.share * _electrons(case, neighbour.source) / total)
-        for neighbour in near.within(case.instrument)
-    ]
-
-
-def _electrons(case: Case, source: Source) -> float:
-    """Return the electrons per frame that a flare of unit amplitude adds to a star if all of its light enters."""
-    f = case.study.flare
-    flaring = source.flaring(1.0, spectrum=f.light(), band=f.band)
-    with_it, without = case.expect(flaring, source)
-    return float((with_it.source_electrons - without.source_electrons).sum())
+    # The observed star, and its neighbours as if all of their light entered.
+    stars = [(case.label, 0.0, 1.0, case.source)]
+    stars += [(star.name, star.separation_arcsec, near.share, star.source) for star in near.within(case.instrument)]
+    rises = []
+    for name, separation_arcsec, share, source in stars:
+        flaring, without = case.expect(source.flaring(1.0, spectrum=flare.light(), band=flare.band), source)
+        added = float((flaring.source_electrons - without.source_electrons).sum())
+        rises.append((name, separation_arcsec, share * added / total))
+    return rises
 
 
 #: Columns of flares on the stars in the fibre that would look like an observed event.
@@ -84,10 +81,6 @@ COLUMNS = (
 
 #: Name of the bolometric energy among measured quantities.
 ENERGY = "energy bolometric"
-NO_SPECTRA = "no spectra of the instrument are given"
-NO_DISTANCE = (
-    "the distance of the star is not known: name the star that was observed, and its distance (star.distance_pc)"
-)
 #: V magnitude of the star that replaces one that is not named: far from saturation.
 ANY_MAGNITUDE = 12.0
 
@@ -109,14 +102,17 @@ class EventRow:
     def measured(self) -> Measurement | str:
         """The flare fitted to its spectrum, or the reason why none is."""
         spectra = self.analysis.spectra
-        return NO_SPECTRA if spectra is None else spectra.measured[self.number]
+        return "no spectra of the instrument are given" if spectra is None else spectra.measured[self.number]
 
     @property
     def unmeasured(self) -> str:
         """Why temperature or energy are not measured; empty if they are."""
         if isinstance(self.measured, str):
             return self.measured
-        return "" if ENERGY in self.measured.names else NO_DISTANCE
+        if ENERGY in self.measured.names:
+            return ""
+        need = "name the star that was observed, and its distance (star.distance_pc)"
+        return f"the distance of the star is not known: {need}"
 
     def quantity(self, name: str) -> tuple[float, float, float]:
         """Return estimate and 68 % interval of a measured quantity; NaN if it is not measured."""
@@ -535,29 +531,23 @@ def analyse(
     if study.has_neighbours:
         # Errors of the star or its neighbours are reported before the search.
         blended_stars(cases(study, swept=False))
-    analysis = analyse_frames(
-        frames, wanted=search.rate, shape=search.shape, seed=study.run.seed,
-        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
-        temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
-    )  # fmt: skip
-    return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
-
-
-def _in_frames(progress: Progress, total: int) -> Callable[[float], None] | None:
-    """Return a function of the share that is done, which reports it in whole frames whenever their number rises."""
-    if progress is None:
-        return None
-    last = -1
+    total, last = frames.n_frames, -1
 
     def report(share: float) -> None:
+        """Report the share of the work in whole frames, whenever their number rises."""
         nonlocal last
         done = round(share * total)
-        if done > last:
+        if progress is not None and done > last:
             last = done
             progress(done, total)
 
     report(0.0)
-    return report
+    analysis = analyse_frames(
+        frames, wanted=search.rate, shape=search.shape, seed=study.run.seed,
+        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
+        temperature_k=study.flare.temperature_k, report=report,
+    )  # fmt: skip
+    return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
 
 
 def frame_model(study: Study, frames: Frames) -> FrameModel | str:

@@ -259,8 +259,8 @@ class CalibrateAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         exposure, sky = self.nominal.frame_s, self.study.sky.sky()
-        stars = [observation.star for observation in self.stars]
-        return [expect(star, self.nominal, exposure=exposure, sky=sky) for star in stars if star is not None]
+        stars = filter(None, (observation.star for observation in self.observations))
+        return [expect(star, self.nominal, exposure=exposure, sky=sky) for star in stars]
 
     @property
     def source(self) -> str:
@@ -313,6 +313,13 @@ class CalibrateAnswer(Answer):
         """Tables that the instrument file names: factor and errors of the throughput, and the pixels."""
         nm = self.throughput.wavelength_nm
         knots = np.unique(np.concatenate([nm[:1], np.arange(np.ceil(nm[0]), nm[-1], KNOT_NM), nm[-1:]]))
+        # The throughput of a pixel stays; its wavelength, and with it the nominal throughput, is another one.
+        names = ("pixel_zero_nm", "dispersion_nm_per_pixel")
+        moved = self.nominal.with_(**{name: self.changes[name] for name in names if name in self.changes})
+        pixels = np.arange(moved.pixels)[self.nominal.read_pixels]
+        centres_nm = moved.pixel_zero_nm + moved.dispersion_nm_per_pixel * pixels
+        nominal = self.nominal.throughput(np.clip(centres_nm, *self.nominal.curves_nm))
+        factor = np.interp(knots, centres_nm, self.fitted_throughput / nominal)
         at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
         # The light of these pixels in each of some bands.
         band = at * MODE_BANDS // nm.size
@@ -324,39 +331,25 @@ class CalibrateAnswer(Answer):
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
         values = {name: list(steps) for name, steps in errors.values.items()}
         return {
-            "throughput-factor": QTable(step_nm | {"factor": self._factor(knots)}, meta=origin),
+            "throughput-factor": QTable(step_nm | {"factor": factor}, meta=origin),
             "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
             "pixel-map": QTable(self._pixel_map, meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
 
-    def _factor(self, knots_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return fitted over nominal throughput, interpolated in wavelengths of the fitted instrument."""
-        names = ("pixel_zero_nm", "dispersion_nm_per_pixel")
-        moved = self.nominal.with_(**{name: self.changes[name] for name in names if name in self.changes})
-        pixels = np.arange(moved.pixels)[self.nominal.read_pixels]
-        # The throughput of a pixel stays; its wavelength, and with it the nominal throughput, is another one.
-        centres = moved.pixel_zero_nm + moved.dispersion_nm_per_pixel * pixels
-        nominal = self.nominal.throughput(np.clip(centres, *self.nominal.curves_nm))
-        return np.interp(knots_nm, centres, self.fitted_throughput / nominal)
-
     @property
     def _pixel_map(self) -> dict[str, Any]:
         """Columns of the pixel map: factors on the dark current, values of the given map, and the bias."""
-        nominal, dark, bias = self.nominal, self.dark.level_dn_per_s, self.dark.bias_dn
-
-        def of_all(values: NDArray[np.float64], others: float) -> NDArray[np.float64]:
-            """Return the values of all pixels from those of the read ones."""
-            every = np.full(nominal.pixels, others)
-            every[nominal.read_pixels] = values
-            return every
-
-        columns: dict[str, Any] = {"pixel": np.arange(nominal.pixels), "dark": of_all(dark / dark.mean(), 1.0)}
+        nominal, level, bias = self.nominal, self.dark.level_dn_per_s, self.dark.bias_dn
+        # Pixels that are not read have the mean of the others.
+        dark, every_bias = np.ones(nominal.pixels), np.full(nominal.pixels, bias.mean())
+        dark[nominal.read_pixels], every_bias[nominal.read_pixels] = level / level.mean(), bias
+        columns: dict[str, Any] = {"pixel": np.arange(nominal.pixels), "dark": dark}
         for name in ("response", "gain", "read_noise_dn"):
             given = getattr(nominal.pixel_map, name, None)
             if given is not None:
                 columns[name] = given * u.DN if name.endswith("_dn") else given
         if np.ptp(bias) > 0:
-            columns["bias_dn"] = of_all(bias, float(bias.mean())) * u.DN
+            columns["bias_dn"] = every_bias * u.DN
         return columns
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -483,20 +476,17 @@ def _observations(
         if given is not None and len(given) != len(asked.observations):
             raise InputError.of(name, len(given), f"{len(asked.observations)}, one for each observation")
     nominal = study.observation.load_instrument()
-    read = frames or tuple(
-        read_frames(observation.frames, observation.mapping, raw=True) for observation in asked.observations
-    )
-    sources = stars or tuple(observation.source() for observation in asked.observations)
-    observations = tuple(
-        detector.CalibrationFrames.of(given, nominal, star, source.temperature_c)
-        for given, star, source in zip(read, sources, asked.observations, strict=True)
-    )
-    for k, observation in enumerate(observations):
+    observations = list[detector.CalibrationFrames]()
+    for k, one in enumerate(asked.observations):
+        read = frames[k] if frames else read_frames(one.frames, one.mapping, raw=True)
+        star = stars[k] if stars else one.source()
+        observation = detector.CalibrationFrames.of(read, nominal, star, one.temperature_c)
         if not observation.usable(nominal).any():
             raise InputError.of("observations", observation.name, "frames with a pixel below saturation")
-        if any(np.array_equal(observation.raw_dn, other.raw_dn) for other in observations[:k]):
+        if any(np.array_equal(observation.raw_dn, other.raw_dn) for other in observations):
             raise InputError.of("observations", observation.name, "frames that no other observation has")
-    return nominal, observations
+        observations.append(observation)
+    return nominal, tuple(observations)
 
 
 def _variances(

@@ -37,10 +37,14 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.detection.snr import Arrays
+    from mauvecl.flares.energies import Kind
     from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.stare import Size
 
+    Reduced = Callable[[StaresRequest], Arrays]
+
+Float = NDArray[np.float64]
 #: Default range of injected sizes, in units of the size with a completeness of one half.
 DEFAULT_RANGE = (0.3, 3.0)
 
@@ -77,35 +81,27 @@ class Sizes:
     @classmethod
     def chosen(cls, case: Case) -> Sizes:
         """Return the measure that a case's study chooses; raises InputError for energies of a star of unknown size."""
-        asked, flare_k = case.study.injections.of, case.study.flare.temperature_k
-        bolometric = energy_scale(case.study, case.source, "bolometric", flare_k)
-        if asked is None:
-            asked = "amplitude" if bolometric is None else "energy"
-        if asked == "amplitude":
+        asked, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
+        kind: Kind = "band" if asked == "band_energy" else "bolometric"
+        scale = energy_scale(case.study, case.source, kind, case.study.flare.temperature_k)
+        if asked == "amplitude" or (asked is None and scale is None):
             return cls("amplitude", 0, 1.0)
-        area = shape_of(case.study.search.shape).equivalent_duration
         if asked == "duration":
             return cls("duration", 1, area)
-        kind: Any = "bolometric" if asked == "energy" else "band"
-        scale = energy_scale(case.study, case.source, kind, flare_k)
         if scale is None:
             raise InputError(
                 f"injections.of = {asked!r}, but the size of {case.source.name} is unknown; give the star's "
                 "distance_pc, or radius_rsun and effective_temperature_k",
                 key="injections.of",
             )
-        return cls(asked, 1, area * scale.erg_per_s)
+        return cls(asked or "energy", 1, area * scale.erg_per_s)
 
-    def of_amplitude(self, amplitude: Any, half_width_s: Any) -> Any:
-        """Return the sizes of amplitudes and half-widths, broadcast together."""
-        return amplitude * half_width_s**self.power * self.per_unit
-
-    def amplitude(self, size: Any, half_width_s: Any) -> Any:
-        """Return the amplitudes of sizes and half-widths, broadcast together."""
-        return size / (half_width_s**self.power * self.per_unit)
+    def per_amplitude(self, half_width_s: Float) -> Float:
+        """Return the sizes of flares of unit amplitude."""
+        return half_width_s**self.power * self.per_unit
 
 
-def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
+def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> Float:
     """Return the sizes of injected flares, ascending; by default around a completeness of one half.
 
     `unit_snr` and `threshold` are those of the star's survey.
@@ -115,7 +111,7 @@ def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) 
     frames = widths / case.instrument.frame_s
     # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
     amplitude = threshold / unit_snr / np.sqrt(shape_of(case.study.search.shape).square_integral * frames)
-    half = sizes.of_amplitude(amplitude, widths)
+    half = amplitude * sizes.per_amplitude(widths)
     low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
     high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high
     if not low < high:
@@ -124,8 +120,6 @@ def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) 
         )
     return np.geomspace(low, high, asked.sizes)
 
-
-Float = NDArray[np.float64]
 
 #: Completeness at which limits are given, by the names of their columns.
 POWERS = {"e50": 0.5, "e90": 0.9}
@@ -343,7 +337,8 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
 def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
     """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
     choice, asked, survey = case.study.search, case.study.injections, survey_star(case)
-    found = _false_alarms(case, survey, engine)
+    reduced: Reduced = engine.stares if isinstance(engine, Pool) else engine.reduced
+    found = _false_alarms(case, survey, reduced)
     sizes, threshold = Sizes.chosen(case), found["threshold"].value
     values = injected_sizes(case, sizes, survey.unit_snr, threshold)
     positions = min(asked.positions, asked.count)
@@ -352,12 +347,13 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
         case.study.processes.additive_only,
     )  # fmt: skip
     widths = np.array(injections.half_widths_s)
-    amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
+    per_amplitude = sizes.per_amplitude(widths)[:, None]
+    amplitudes = values / per_amplitude
     fit, fitted = SingleFlareFit(survey.bank, survey.templates), -(-asked.fitted // positions)
     refit = Refit(fit, amplitudes, case.study.flare.temperature_k, fitted)
 
     def at_one_peak(position: int) -> Arrays:
-        return _reduced(engine, injections.request(position, refit if refit.count else None))
+        return reduced(injections.request(position, refit if refit.count else None))
 
     peaks = map_in_order(engine, at_one_peak, range(positions))
     parts = list(reported(peaks, positions, lambda done, total: report(done / total)))
@@ -365,7 +361,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     if any(case.stare.jitters.values()):
         (flare,) = case.one_frame.expect(case.one_frame.flaring(SMALL))
         known = frame_signal(survey.components.quiet, flare, SMALL)
-    critical = sizes.of_amplitude(np.stack([part["critical"].T for part in parts], axis=1), widths[:, None, None])
+    critical = np.stack([part["critical"].T for part in parts], axis=1) * per_amplitude[:, None]
     return StarCompleteness(
         case.label, case.at, survey, sizes, **found, saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
@@ -375,7 +371,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     )  # fmt: skip
 
 
-def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str, Any]:
+def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any]:
     """Return the threshold and the false alarms of a search, in drawn stares and by importance sampling.
 
     The keys are the fields of `StarCompleteness`.
@@ -384,7 +380,7 @@ def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str
     maxima = np.zeros(0)
     if choice.nulls:
         request = survey.largest_value_request(choice.nulls, seed, case.study.processes.additive_only)
-        maxima = np.sort(_reduced(engine, request)["maximum"])
+        maxima = np.sort(reduced(request)["maximum"])
     tail, n = sampled_rate(survey, seed), maxima.size
     counted = n and choice.null == "counted"
     threshold = counted_threshold(maxima, days, choice.rate) if counted else tail.threshold(choice.rate)
@@ -409,7 +405,3 @@ def _false_alarms(case: Case, survey: Survey, engine: Stares | Pool) -> dict[str
         "alarmed": int(np.sum(maxima >= threshold.value)),
         "expected": float(n * -np.expm1(-choice.rate * days)),
     }
-
-
-def _reduced(engine: Stares | Pool, request: StaresRequest) -> Arrays:
-    return engine.stares(request) if isinstance(engine, Pool) else engine.reduced(request)

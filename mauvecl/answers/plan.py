@@ -6,7 +6,7 @@ import calendar
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_co
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
-from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
+from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE, Particles, Thermal
 from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.columns import Column, interval_columns, number, percent, records
@@ -238,7 +238,7 @@ class PlanAnswer(Answer):
         """One frame of each target."""
         return [target.observation.case for target in self.planned]
 
-    @cached_property
+    @property
     def inputs(self) -> list[Expectation]:
         """One frame of each star."""
         return [target.observation.quiet for target in self.planned]
@@ -310,10 +310,17 @@ def plan(
     >>> answer.table["hours"].value.tolist()
     [100.0]
     """
-    closed = completeness is None and study.plan.completeness == "closed form"
-    _refuse(study, closed=closed)
-    if completeness is None:
-        completeness = targets.closed_form if closed else partial(targets.inject_target, engine=engine or Stares())
+    if not study.plan.targets:
+        raise InputError("the plan needs targets, such as `plan.targets='targets.csv'`", key="plan.targets")
+    if study.orbit.targets:
+        raise InputError("both orbit.targets and plan.targets are given; use plan.targets alone", key="orbit.targets")
+    if completeness is None and study.plan.completeness == "closed form":
+        completeness = targets.closed_form
+        for name, _ in study.processes.modulations:
+            raise InputError(
+                f"processes.{name} needs plan.completeness = 'injections', since 'closed form' takes the stare for "
+                "known", key=f"processes.{name}",
+            )  # fmt: skip
     stars: list[Star] = []
     errors: list[InputError] = []
     for text in study.plan.targets:
@@ -326,27 +333,17 @@ def plan(
         raise together(errors)
     if progress is not None:
         progress(0, len(stars))
-    seen, base = visible(study), Case(study)
-    along = targets.conditions_along(seen.visibility.track) if study.plan.along_orbit else None
+    seen, base, along = visible(study), Case(study), None
+    if study.plan.along_orbit:
+        track = seen.visibility.track
+        along = Thermal().temperature_c(track.sunlight, track.times.step_s), Particles().rate_per_cm2_s(track)
     named = enumerate(zip(study.plan.targets, stars, strict=True))
     observed = ((k, targets.observe(base, text, star, seen, k, along)) for k, (text, star) in named)
+    completeness = completeness or partial(targets.inject_target, engine=engine or Stares())
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned_for = partial(_planned, seen, completeness)
     planned = tuple(reported(map_in_order(engine, planned_for, observed), len(stars), progress))
     return PlanAnswer(study, seen, planned)
-
-
-def _refuse(study: Study, *, closed: bool) -> None:
-    """Raise InputError for a study that cannot be planned, or not by the closed form."""
-    if not study.plan.targets:
-        raise InputError("the plan needs targets, such as `plan.targets='targets.csv'`", key="plan.targets")
-    if study.orbit.targets:
-        raise InputError("both orbit.targets and plan.targets are given; use plan.targets alone", key="orbit.targets")
-    for name, _ in study.processes.modulations if closed else ():
-        raise InputError(
-            f"processes.{name} needs plan.completeness = 'injections', since 'closed form' takes the stare for known",
-            key=f"processes.{name}",
-        )
 
 
 def _planned(

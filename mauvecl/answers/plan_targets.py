@@ -1,4 +1,4 @@
-"""Targets of a plan: conditions along their orbits, completeness, and yields."""
+"""Targets of a plan: their observations, completeness, and yields."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
 from mauvecl.flares.settings import Curve
-from mauvecl.host.orbit.orbit import Target, Track
-from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
+from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
@@ -42,36 +41,6 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 
-def conditions_along(track: Track) -> tuple[Float, Float]:
-    """Return the detector's temperature (deg C) and particle hits (cm-2 s-1) along an orbit, by the assumed models."""
-    return Thermal().temperature_c(track.sunlight, track.times.step_s), Particles().rate_per_cm2_s(track)
-
-
-@dataclass(frozen=True, eq=False)
-class Conditions:
-    """Conditions of one target."""
-
-    temperature_c: float  # mean of the detector while the target is visible
-    # Time (s) and deviation from the mean (deg C), for one orbit from the start of a window of median length.
-    swing: tuple[tuple[float, float], ...]
-    hits_per_cm2_s: float  # mean of cosmic rays and trapped protons while the target is visible
-
-    @classmethod
-    def of(cls, along: tuple[Float, Float], visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
-        """Return the conditions of target `k`, or None if it is never visible; `along` as from `conditions_along`."""
-        seen, windows, (temperature_c, hits) = visibility.seen[:, k], visibility.windows(k), along
-        if not seen.any():
-            return None
-        mean = float(temperature_c[seen].mean())
-        step = visibility.track.times.step_s
-        # The first window if several have the median length.
-        typical = int(np.argmin(np.abs(windows.length_s - np.median(windows.length_s))))
-        first = round(float(windows.start_s[typical]) / step)
-        orbit = temperature_c[first : first + int(np.ceil(orbit_s / step))] - mean
-        swing = tuple((float((n + 0.5) * step), float(value)) for n, value in enumerate(orbit))
-        return cls(mean, swing, float(hits[seen].mean()))
-
-
 @dataclass(frozen=True, eq=False)
 class TargetObservation:
     """Target as observed by the satellite."""
@@ -80,7 +49,9 @@ class TargetObservation:
     case: Case  # of one frame, with the sky and the conditions below
     window_s: float  # median length of its windows; 0 if it is never visible
     sky: float | None = None  # zodiacal light, V mag arcsec^-2; None for the study's sky
-    conditions: Conditions | None = None  # along the orbit; None for the study's
+    # Time (s) and deviation of the detector from its mean temperature (deg C), for one orbit from the start of a window
+    # of median length; empty for the study's temperature.
+    swing: tuple[tuple[float, float], ...] = ()
 
     @property
     def quiet(self) -> Expectation:
@@ -139,7 +110,7 @@ class Planned:
 
     def energy_at(self, probability: float) -> float:
         """Return the bolometric energy above which flares are recovered with a probability, erg; infinite if none."""
-        return float("inf") if self.completeness is None else self.completeness.energy_at(probability)
+        return math.inf if self.completeness is None else self.completeness.energy_at(probability)
 
     @property
     def published(self) -> str:
@@ -168,14 +139,10 @@ def errors_of_throughput(observation: TargetObservation, rates: Rates | None) ->
     calibrated = throughput_cases(observation.case)
     if not calibrated or not observation.signal_per_frame > 0 or not observation.window_s > 0:
         return None
-
-    def logarithms(case: Case) -> tuple[float, float]:
-        its = closed_form(replace(observation, case=case))
-        number = np.nan if rates is None else recovered_per_day(rates, its)
-        return float(np.log(its.energy_at(0.5))), float(np.log(number))
-
-    moved = np.array([logarithms(case) for case in calibrated]) - logarithms(observation.case)
-    energy, number = np.sqrt((moved**2).sum(axis=0))
+    answers = [closed_form(replace(observation, case=case)) for case in (observation.case, *calibrated)]
+    values = [(its.energy_at(0.5), np.nan if rates is None else recovered_per_day(rates, its)) for its in answers]
+    nominal, *moved = np.log(values)
+    energy, number = np.sqrt(((np.array(moved) - nominal) ** 2).sum(axis=0))
     return float(energy), float(number)
 
 
@@ -191,11 +158,10 @@ def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | 
     if rates.definition == "light":
         return rates.in_band(BOLOMETRIC, flare=flare.light()), ""
     band, distance_pc = rates.amplitude_band, case.star.distance_pc
-    measured = case.with_sections(flare=flare.model_copy(update={"band": band}))
-    scale = energy_scale(measured.study, measured.source, "bolometric", flare.temperature_k)
-    assert scale is not None
     assert distance_pc is not None
-    return rates.of_light(scale.erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
+    measured = case.with_sections(flare=flare.model_copy(update={"band": band}))
+    erg_per_s = replace(observation, case=measured).scale.erg_per_s
+    return rates.of_light(erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
 
 
 def star_of(text: PlanTarget, simbad: bool) -> Star:
@@ -224,31 +190,39 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
 
 
 def observe(
-    case: Case, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: tuple[Float, Float] | None = None
+    case: Case, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: tuple[Float, Float] | None
 ) -> TargetObservation:
-    """Return the observation of target `k`, with the sky behind it and the conditions along the orbit."""
-    target, study = seen.targets[k], case.study
+    """Return the observation of target `k`, with the sky behind it and the conditions while it is visible.
+
+    `along` has the detector's temperature (deg C) and the particle hits (cm-2 s-1) at each time of the orbit, or is
+    None for those of the study.
+    """
+    target, study, visible = seen.targets[k], case.study, seen.visibility.seen[:, k]
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
-    conditions = None
-    if along is not None:
-        conditions = Conditions.of(along, seen.visibility, k, study.orbit.orbit().elements.period_s)
-    lengths, zodiacal = seen.windows[k].length_s, seen.zodiacal[k]
-    sky: float | None = None
-    window = float(np.median(lengths)) if lengths.size else 0.0
-    known = np.isfinite(zodiacal)
+    windows, zodiacal = seen.windows[k], seen.zodiacal[k]
     changes: dict[str, Any] = {"star": (star,)}
+    sky, window_s, swing = None, 0.0, tuple[tuple[float, float], ...]()
+    known = np.isfinite(zodiacal)
     if known.any():
         # The median over the days on which the target is visible, or over all.
         used = known & (seen.visibility.by_day(k) > 0)
         sky = float(np.median(zodiacal[used if used.any() else known]))
         changes["sky"] = SkyLight(surface_brightness=sky)
-    if conditions is not None:
-        changes["processes"] = study.processes.with_particles(conditions.hits_per_cm2_s)
+    if visible.any():
+        window_s = float(np.median(windows.length_s))
+    if visible.any() and along is not None:
+        temperature_c, hits = along
+        mean_c, step_s = float(temperature_c[visible].mean()), seen.times.step_s
+        # The first window if several have the median length.
+        typical = int(np.argmin(np.abs(windows.length_s - window_s)))
+        first = round(float(windows.start_s[typical]) / step_s)
+        orbit_c = temperature_c[first : first + int(np.ceil(study.orbit.orbit().elements.period_s / step_s))] - mean_c
+        swing = tuple((float((n + 0.5) * step_s), float(value)) for n, value in enumerate(orbit_c))
+        changes["processes"] = study.processes.with_particles(float(hits[visible].mean()))
         if study.observation.temperature_c is None:
-            at = {"temperature_c": conditions.temperature_c}
-            changes["observation"] = study.observation.model_copy(update=at)
-    return TargetObservation(target, case.with_sections(**changes).one_frame, window, sky, conditions)
+            changes["observation"] = study.observation.model_copy(update={"temperature_c": mean_c})
+    return TargetObservation(target, case.with_sections(**changes).one_frame, window_s, sky, swing)
 
 
 #: Orbits of a stare; the baseline window of a search spans several of them.
@@ -262,13 +236,13 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
 
     Each orbit of the stare has one window of the target's median length. The checkpoint of a pool keeps the result.
     """
-    study, conditions = observation.case.study, observation.conditions
+    study = observation.case.study
     orbit_s = study.orbit.orbit().elements.period_s
     gap = max(orbit_s - observation.window_s, 0.0)
     changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (),
                                "along_orbit": False}  # fmt: skip
-    if conditions is not None and study.stare.thermal is None:
-        swing = [(t, value) for t, value in conditions.swing if t < orbit_s]
+    if observation.swing and study.stare.thermal is None:
+        swing = [(t, value) for t, value in observation.swing if t < orbit_s]
         changes["thermal"] = Curve(points=tuple((n * orbit_s + t, value) for n in range(ORBITS) for t, value in swing))
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],

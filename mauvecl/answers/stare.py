@@ -23,7 +23,6 @@ from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, metadata_o
 from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
-from mauvecl.flares.energies import Kind
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.flares.stare import Event, coefficients, temperatures_of
 from mauvecl.host import VERSION
@@ -159,7 +158,7 @@ class StarStare(InCell):
     """A stare at one star in one cell of the sweep."""
 
     staring: StareExpectation
-    flares: tuple[StareFlare, ...]
+    flares: Sequence[StareFlare]
     light: LightCurves
     # Share of all light that each frame lost in pointing drifts, shape (n_frame,); None unless drifts are drawn.
     pointing_loss: Float | None
@@ -174,7 +173,6 @@ class StarStare(InCell):
         return 0 if self.pointing_loss is None else int(np.count_nonzero(self.pointing_loss))
 
 
-KINDS: tuple[Kind, ...] = ("band", "bolometric")
 #: Largest number of frames of light curves in text files; longer ones are in FITS files only.
 MOST_ROWS = 100_000
 #: Largest number of frames: 115 days, with spectra of 1.2 GB.
@@ -439,7 +437,14 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     searched = _search(case, draw, checkpoint) if q.search else {}
     drifting, numbers = staring.stare.pointing is not None, np.array([q.number], np.uint64)
     lost = staring.stare.pointing_losses(numbers, seed)[0] if drifting else None
-    return StarStare(case.label, case.at, staring, _flares(case), light, lost, **searched)
+    kelvin, flares = temperatures_of(case.events), list[StareFlare]()
+    for event in case.events:
+        of = partial(energy_of, case.study, case.source, event, temperatures_k=kelvin)
+        # None, for a star of unknown size, becomes NaN.
+        band, bolometric = np.array([of("band"), of("bolometric")], float).tolist()
+        own = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
+        flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
+    return StarStare(case.label, case.at, staring, flares, light, lost, **searched)
 
 
 def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, Any]:
@@ -504,15 +509,3 @@ def _found_energy(case: Case, event: Event) -> float:
         return float("nan")
     energy = energy_of(case.study, case.source, event, "bolometric")
     return float("nan") if energy is None else energy
-
-
-def _flares(case: Case) -> tuple[StareFlare, ...]:
-    """Return the flares of a case's stare with their energies and S/N."""
-    staring, kelvin, frames = case.stare_expectation, temperatures_of(case.events), case.stare
-    flares = []
-    for event in case.events:
-        energies = [energy_of(case.study, case.source, event, kind, kelvin) for kind in KINDS]
-        band, bolometric = (float("nan") if energy is None else energy for energy in energies)
-        own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
-        flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
-    return tuple(flares)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -29,12 +30,15 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
 
 
-#: Appointment: start and stop in UTC, ISO 8601 to the second, or dates of whole days, including the last; title; text.
-Entry = tuple[str, str, str, str]
+#: Characters that the text of a calendar escapes.
+ESCAPES = str.maketrans({"\\": r"\\", ";": r"\;", ",": r"\,", "\n": r"\n"})
 
 
-def calendar_bytes(entries: Iterable[Entry]) -> bytes:
-    """Return a calendar as the bytes of an .ics file."""
+def calendar_bytes(entries: Iterable[tuple[str, str, str, str]]) -> bytes:
+    """Return a calendar as the bytes of an .ics file, from the start, stop, title and text of its appointments.
+
+    Start and stop are in UTC, ISO 8601 to the second, or dates of whole days, including the last.
+    """
     lines = ["BEGIN:VCALENDAR", "VERSION:2.0", f"PRODID:-//mauvecl//mauvecl {VERSION}//EN", "X-WR-CALNAME:Mauve"]
     for start, stop, title, text in entries:
         unique = hashlib.sha256("\0".join((start, stop, title)).encode()).hexdigest()[:24]
@@ -45,26 +49,12 @@ def calendar_bytes(entries: Iterable[Entry]) -> bytes:
         begins, ends = (f";VALUE=DATE:{time}" if whole else f":{time}Z" for time in times)
         # A fixed time of the entry, so that equal plans give equal files.
         lines += ["BEGIN:VEVENT", f"UID:{unique}@mauvecl", f"DTSTAMP:{times[0][:8]}T000000Z", f"DTSTART{begins}",
-                  f"DTEND{ends}", f"SUMMARY:{_text(title)}", f"DESCRIPTION:{_text(text)}", "TRANSP:TRANSPARENT",
-                  "END:VEVENT"]  # fmt: skip
+                  f"DTEND{ends}", f"SUMMARY:{title.translate(ESCAPES)}", f"DESCRIPTION:{text.translate(ESCAPES)}",
+                  "TRANSP:TRANSPARENT", "END:VEVENT"]  # fmt: skip
     lines.append("END:VCALENDAR")
-    return "".join(f"{_folded(line)}\r\n" for line in lines).encode()
-
-
-def _text(value: str) -> str:
-    for special in ("\\", ";", ","):
-        value = value.replace(special, "\\" + special)
-    return value.replace("\n", "\\n")
-
-
-def _folded(line: str) -> str:
-    """Fold a line to at most 75 bytes; continuation lines begin with a space."""
-    parts = [""]
-    for character in line:
-        if len((parts[-1] + character).encode()) > (75 if len(parts) == 1 else 74):
-            parts.append("")
-        parts[-1] += character
-    return "\r\n ".join(parts)
+    # Lines have at most 75 bytes; the rest of a longer one follows after a space. No character is cut.
+    folded = (re.findall(rb"(?:^.{1,75}|.{1,74})(?![\x80-\xbf])", line.encode()) for line in lines)
+    return b"".join(b"\r\n ".join(parts) + b"\r\n" for parts in folded)
 
 
 Float = NDArray[np.float64]
@@ -260,11 +250,7 @@ class VisibleAnswer(Answer):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Calendar of windows or, if these are not known, of the days on which a target is visible."""
-        return {"visible.ics": partial(calendar_bytes, self.entries())}
-
-    def entries(self) -> list[Entry]:
-        """Return the appointments of the calendar."""
-        times, entries = self.times, list[Entry]()
+        times, entries = self.times, list[tuple[str, str, str, str]]()
         single = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
         for k, target in enumerate(self.targets):
             windows, hours = self.windows[k], self.visibility.by_day(k)
@@ -274,7 +260,7 @@ class VisibleAnswer(Answer):
             for first, last in true_runs(hours >= SEEN_H) if not single else ():
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
                 entries.append((self.days[first], self.days[last - 1], target.name, mean))
-        return entries
+        return {"visible.ics": partial(calendar_bytes, entries)}
 
     @property
     def messages(self) -> list[str]:
