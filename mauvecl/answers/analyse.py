@@ -189,9 +189,8 @@ class EventRow:
 
     @cached_property
     def colour(self) -> tuple[float, float, float]:
-        """Blue over red rise with its error, and the p-value of an event without colour; NaN in a light curve."""
-        seen = self.analysis.colour(self.event)
-        return (np.nan,) * 3 if seen is None else (seen.blue_over_red, seen.blue_over_red_error, seen.p_value)
+        """Colour of the event; see `Analysis.colour`."""
+        return self.analysis.colour(self.event)
 
     @property
     def note(self) -> str:

@@ -31,7 +31,6 @@ from mauvecl.observations.search import (
 )
 from mauvecl.observations.spectra import (
     CAUSES,
-    Colour,
     EventSpectrum,
     SpectralSeries,
     event_colour,
@@ -225,11 +224,11 @@ class Analysis:
         """Return the false alarms per star-day at an event's statistic: by the process, and with measured residuals."""
         return self.modelled.rate(event.value), self.measured.rate(event.value)
 
-    def colour(self, event: ObservedEvent) -> Colour | None:
-        """Return the colour of an event in spectra with errors, against quiescent frames; None without these."""
+    def colour(self, event: ObservedEvent) -> tuple[float, float, float]:
+        """Return blue over red rise with its error, and the p-value of no colour; NaN without spectra with errors."""
         frames = self.frames
         if frames.flux.ndim == 1 or frames.error is None:
-            return None
+            return (np.nan,) * 3
         used = np.flatnonzero(self.level.used)
         inside, quiet = np.zeros((2, frames.n_frames), np.bool_)
         inside[used[event.first : event.last + 1]] = True

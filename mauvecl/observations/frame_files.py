@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,7 +30,7 @@ from mauvecl.host.tables.table import (
     without_indefinite,
 )
 from mauvecl.host.tables.units import is_dated
-from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits, decimal_flags
+from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits
 from mauvecl.observations.mapping import KNOWN, FrameMapping, recognised, times_of
 from mauvecl.observations.stored_frames import (
     FolderFile,
@@ -158,10 +158,9 @@ def reduce_frames(
         _, flux, error, _ = _light(found := Quantities.of(file, how), how)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
-        given = None if weights is None else np.asarray(weights, np.float64)
         quality = _masked(found.quality, QualityBits.of(file.header, how.quality_bits, file.what))
-        lights, pixels = weighted_sums(flux, error, quality, given)
-        return ReducedFrames(tuple(_frames_in(file, how, stem, lambda *_, one=one: one) for one in lights), pixels)
+        lights, pixels = weighted_sums(flux, error, quality, weights)
+        return ReducedFrames(tuple(_frames_in(file, how, stem, light) for light in lights), pixels)
 
 
 @dataclass(frozen=True)
@@ -174,13 +173,9 @@ class ColumnNames:
     def read(cls, path: str | Path) -> ColumnNames:
         """Read the names of a table in a file."""
         place, words = without_columns(path)
-        with _errors_of(path), _opened(place, f"file {place.name!r}", words[0] if words else None) as file:
+        what = f"file {place.name!r}"
+        with parsing(what, FORMATS), _opened(place, what, words[0] if words else None) as file:
             return cls(tuple(file.names))
-
-
-def _errors_of(path: str | Path) -> AbstractContextManager[None]:
-    """Return a context in which exceptions of other libraries become errors of a file."""
-    return parsing(f"file {shortened(Path(path).name)}", FORMATS)
 
 
 @contextmanager
@@ -188,7 +183,7 @@ def _frame_file(
     path: str | Path, mapping: FrameMapping | str | Path | None, check: bool = True
 ) -> Iterator[tuple[TableFile, FrameMapping, str]]:
     """Open a file, folder or store; yield it with the places of its quantities and its name without extension."""
-    with _errors_of(path):
+    with parsing(f"file {shortened(Path(path).name)}", FORMATS):
         place, words = without_columns(path)
         how = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
         name = words[0] if words else None if how is None or how.hdu is None else str(how.hdu)
@@ -257,8 +252,8 @@ class Quantities:
         """
         frames, frame = np.unique(_keys(self.time[0]), return_inverse=True)
         pixels, pixel = np.unique(wavelength.numbers(), return_inverse=True)
-        counts = np.zeros((frames.size, pixels.size), np.int64)
-        np.add.at(counts, (frame, pixel), 1)
+        number = frame * pixels.size + pixel
+        counts = np.bincount(number, minlength=frames.size * pixels.size).reshape(frames.size, pixels.size)
         if (counts != 1).any():
             row, column = np.argwhere(counts != 1)[0]
             raise InputError(
@@ -266,8 +261,7 @@ class Quantities:
                 f"not {counts[row, column]}",
                 key="wavelength",
             )
-        place = np.empty(counts.shape, np.int64)
-        place[frame, pixel] = np.arange(frame.size)
+        place = np.argsort(number).reshape(counts.shape)
 
         def spectra(values: Any) -> Any:
             return values and Values.of(values.name, values.numbers()[place], values.unit, what)
@@ -293,13 +287,20 @@ def _keys(values: Values) -> NDArray[Any]:
 
 
 def _flags(quality: Values | None) -> Values | None:
-    """Return quality flags of which ``True`` and ``False`` in texts, and "bad" and "good", are 1 and 0."""
-    texts = None if quality is None else quality.texts()
+    """Return the flags of frames as numbers, also those of words and those that lightkurve 2 writes into CSV."""
+    if quality is None or len(quality.shape) != 1:
+        return quality
+    texts = [text.lower() for text in quality.texts() or ()]
     # G and B are those of ASAS-SN.
     words = {"true": 1, "false": 0, "bad": 1, "good": 0, "b": 1, "g": 0}
-    if quality is None or not texts or not {text.lower() for text in texts} <= {*words}:
-        return quality
-    return Values.of(quality.name, np.array([words[text.lower()] for text in texts]), what=quality.what)
+    if texts and {*texts} <= {*words}:
+        return Values.of(quality.name, np.array([words[text] for text in texts]), what=quality.what)
+    values, place = np.unique(quality.numbers(), return_inverse=True)
+    digits = {value: f"{value:.0f}" for value in values[np.isfinite(values)].tolist()}
+    if max(digits, default=0.0) >= 2**32 and {*"".join(digits.values())} <= {"0", "1"}:
+        # Those of lightkurve are the digits of binary numbers.
+        values = np.array([float(int(digits[one], 2)) if one in digits else one for one in values.tolist()])
+    return Values.of(quality.name, values[place], what=quality.what)
 
 
 def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
@@ -345,15 +346,10 @@ def _check_rows(file: TableFile, found: Quantities) -> None:
         )
 
 
-def _conditions(
-    file: TableFile, found: Quantities, mapping: FrameMapping, exposure: Float | None
-) -> dict[str, Float | None]:
-    """Return exposure times and temperatures of frames, by columns, the mapping or the header; None if unknown.
-
-    The `exposure` is that between the edges of frames, if the times have these.
-    """
+def _conditions(file: TableFile, found: Quantities, mapping: FrameMapping, exposure: Float | None) -> dict[str, Any]:
+    """Return exposure times, by default between edges, and temperatures, by columns, the mapping or the header."""
     n, nominal = found.time[0].n_rows, file.header.get("CCD-TEMP")
-    temperature: Float | None = None
+    temperature = np.full(n, float(nominal)) if isinstance(nominal, int | float) else None
     try:
         # The header of BRITE's light curves has milliseconds for each image of a stack.
         stated = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
@@ -366,8 +362,6 @@ def _conditions(
     if found.temperature is not None:
         celsius = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit")
         temperature = celsius.numbers().reshape(n)
-    elif isinstance(nominal, int | float):
-        temperature = np.full(n, float(nominal))
     return {"exposure_s": exposure, "temperature_c": temperature}
 
 
@@ -389,18 +383,16 @@ def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float |
     return light, sd, unit, said
 
 
-def _frames_in(
-    file: TableFile, mapping: FrameMapping, stem: str, read: Callable[..., Light] = whole_or_reduced
-) -> Frames:
-    """Build frames from a file and the names of its quantities; `read` returns their light."""
+def _frames_in(file: TableFile, mapping: FrameMapping, stem: str, reduced: Light | None = None) -> Frames:
+    """Build frames from a file and the names of its quantities; with `reduced` light, which is not read again."""
     what, header = file.what, file.header
     found = Quantities.of(file, mapping)
     _check_rows(file, found)
     time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
-    each: dict[str, Any] = {**_conditions(file, found, mapping, between_edges_s)}
+    each = _conditions(file, found, mapping, between_edges_s)
     bits = QualityBits.of(header, mapping.quality_bits, what)
     wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
-    light, sd, flags, unit, more = _read_light(file, found, mapping, bits, read)
+    light, sd, flags, unit, more = _read_light(file, found, mapping, bits, reduced)
     kept = np.isfinite(time)
     if not kept.any():
         raise InputError(f"{what}: at least one row must have a time, but none has", key="time")
@@ -434,13 +426,13 @@ def _frames_in(
 
 
 def _read_light(
-    file: TableFile, found: Quantities, mapping: FrameMapping, bits: QualityBits, read: Callable[..., Light]
+    file: TableFile, found: Quantities, mapping: FrameMapping, bits: QualityBits, reduced: Light | None
 ) -> tuple[Float, Float | None, Float | None, str, tuple[str, ...]]:
-    """Return light, errors, flags, the unit of the light, and remarks; `read` returns the first three."""
+    """Return light, errors, flags, the unit of the light, and remarks."""
     unit, flux, error, remarks = _light(found, mapping)
-    if len(flux.shape) == 2 and flux.shape[1] == 1 and found.wavelength is None:
-        flux, error = _single(flux), None if error is None else _single(error)
-    light, sd, flags, more = read(flux, error, _masked(found.quality, bits))
+    light, sd, flags, more = reduced or whole_or_reduced(flux, error, _masked(found.quality, bits))
+    if found.wavelength is None:
+        light, sd = light.ravel(), None if sd is None else sd.ravel()
     light, sd = without_indefinite(light), None if sd is None else without_indefinite(sd)
     marks, said = marks_in(light, "values")
     light = np.where(np.isin(light, marks), np.nan, light) if marks else light
@@ -456,7 +448,7 @@ def _read_light(
         sd = None
         remarks += (f"{file.what} has a column of errors without a number: it is left out",)
     if found.quality is not None and len(found.quality.shape) == 1:
-        flags = decimal_flags(found.quality.numbers())
+        flags = found.quality.numbers()
     return light, sd, flags, unit, remarks
 
 
@@ -524,16 +516,10 @@ def _vacuum_nm(wavelength: Values, given: str | None, file: TableFile) -> Float:
     plain, medium = unit_and_medium(given or "")
     stated, in_unit = unit_and_medium(wavelength.unit)
     nm = converted(replace(wavelength, unit=stated or ""), plain, "nm", "wavelength_unit")
-    rows = np.atleast_2d(nm.rows(0, 1) if len(nm.shape) == 2 else nm.numbers())[0]
-    if len(nm.shape) == 2:
-        for part in nm.pieces:
-            if not np.allclose(nm.rows(part.start, part.stop), rows, rtol=1e-9, atol=0.0):
-                fault = f"{wavelength.what}: the wavelengths must be the same in every frame, but change"
-                raise InputError(fault, key="wavelength")
+    rows = nm.rows(0, 1)[0] if len(nm.shape) == 2 else nm.numbers().ravel()
+    for part in nm.pieces if len(nm.shape) == 2 else []:
+        if not np.allclose(nm.rows(part.start, part.stop), rows, rtol=1e-9, atol=0.0):
+            fault = f"{wavelength.what}: the wavelengths must be the same in every frame, but change"
+            raise InputError(fault, key="wavelength")
     found, _ = vacuum_wavelengths(rows, wavelength.name, "", medium or in_unit, (file.header,))
     return found
-
-
-def _single(values: Values) -> Values:
-    """Return values of shape (n, 1) as (n,)."""
-    return replace(values, shape=values.shape[:1], read=lambda start, stop: values.rows(start, stop)[:, 0])

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-#: Units of frames of the instrument: counts, with bias and dark current or without, and rates without, as of `stare`.
-COUNT_UNITS, RATE_UNITS = ("adu", "DN"), ("adu / s", "DN / s")
 #: Share of bias and dark current below which the median of a pixel cannot include them.
 LEAST_OF_OFFSET = 0.5
 #: Largest distance of a wavelength from that of the instrument, as a share of the step between pixels.
@@ -52,12 +50,13 @@ class FrameModel:
         `flux_per_dn` is the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each of its pixels. Raises
         InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
-        unit, counts = _plain(frames.unit), ("adu", "adu/s")
+        # Counts with bias and dark current or without, and rates without, as of `stare`; "adu s-1" is "adu/s".
+        unit = frames.unit.lower().replace(" ", "").replace("s-1", "/s").replace("dn", "adu")
+        counts = ("adu", "adu/s")
         assert frames.wavelength_nm is not None
         flux = None if unit in counts else _per_flam(frames.unit, frames.wavelength_nm)
         if unit not in counts and flux is None:
-            accepted = f"one of {', '.join((*COUNT_UNITS, *RATE_UNITS))}, or a flux density"
-            raise InputError.of("unit", frames.unit, accepted)
+            raise InputError.of("unit", frames.unit, "one of adu, DN, adu / s, DN / s, or a flux density")
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
             ends = f"{frames.exposure_s.min():g} to {frames.exposure_s.max():g} s"
@@ -166,11 +165,6 @@ def _per_flam(unit: str, wavelength_nm: Float) -> Float | None:
         return np.asarray(one.to_value(u.Unit(unit), u.spectral_density(wavelength_nm * u.nm)))
     except (ValueError, TypeError):
         return None
-
-
-def _plain(unit: str) -> str:
-    """Return a unit without spaces, in small letters; "adu s-1" is "adu/s"."""
-    return unit.lower().replace(" ", "").replace("s-1", "/s").replace("dn", "adu")
 
 
 def _matched(wanted: Float, given: Float) -> NDArray[np.intp] | None:

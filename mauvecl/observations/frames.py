@@ -41,8 +41,7 @@ TESS = {
 NAMES: Mapping[str, Mapping[int, str]] = {"Kepler": KEPLER, "TESS": TESS}
 #: Bits that exclude a frame by default: the default masks of lightkurve 2.6; of that for TESS without ImpulsiveOutlier,
 #: which can mark flares and is noted.
-DEFAULTS = {"Kepler": 1_130_799, "TESS": 17_087 & ~512}
-NOTED = {"TESS": 512}
+DEFAULTS, NOTED = {"Kepler": 1_130_799, "TESS": 17_087 & ~512}, {"TESS": 512}
 ALL_BITS = 2**62 - 1
 
 
@@ -96,15 +95,6 @@ class QualityBits:
         return (f"{frames} of {name} with the quality flag {bits} {verb} kept, because it can mark flares",)
 
 
-def decimal_flags(flags: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return flags as numbers; those that lightkurve 2 writes into CSV are the digits of binary numbers."""
-    values, place = np.unique(flags, return_inverse=True)
-    texts = {value: f"{value:.0f}" for value in values[np.isfinite(values)].tolist()}
-    if max(texts, default=0.0) < 2**32 or set("".join(texts.values())) - {"0", "1"}:
-        return flags
-    return np.array([float(int(texts[one], 2)) if one in texts else one for one in values.tolist()])[place]
-
-
 Float = NDArray[np.float64]
 
 #: Smallest number of frames from which level and noise can be estimated.
@@ -134,16 +124,13 @@ class Reason(IntFlag):
     @classmethod
     def words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
         """Return the reasons of frames in words."""
-
-        @cache
-        def words(value: int) -> str:
-            return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
-
-        return np.array([*map(words, values.tolist())], np.str_)
+        found, place = np.unique(values, return_inverse=True)
+        names = {one: str(one.name).lower().replace("_", " ") for one in cls}
+        return np.array([", ".join(names[one] for one in cls if value & one) for value in found], np.str_)[place]
 
 
-def _check_light(name: str, time: Float, light: Float) -> None:
-    """Raise InputError for times or fluxes of a wrong shape, number or size."""
+def _cadence_of(name: str, time: Float, light: Float) -> float:
+    """Return the median step of times; raise InputError for frames of a wrong shape or size, too near or too far."""
     n = time.size
     if time.ndim != 1 or light.ndim not in (1, 2) or len(light) != n:
         raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
@@ -154,18 +141,13 @@ def _check_light(name: str, time: Float, light: Float) -> None:
     if not np.isfinite(time).all():
         raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
                    "finite times")  # fmt: skip
-
-
-def _cadence_of(name: str, time: Float) -> float:
-    """Return the median step of ascending times; raise InputError for frames that overlap or are too far apart."""
-    step = np.diff(time)
+    step = np.diff(np.sort(time))
     cadence = float(np.median(step))
     if not cadence > 0 or (step < MIN_STEP * cadence).any():
         least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
         least = least if cadence > 0 else "a different time for each frame"
         raise _bad(name, "time", f"{step.min():g} s from one frame to the next", least)
-    span = float(time[-1] - time[0])
-    if not span <= MAX_SPAN * cadence:
+    if not (span := float(np.ptp(time))) <= MAX_SPAN * cadence:
         most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
         raise _bad(name, "time", f"{span:g} s from the first frame to the last", most)
     return cadence
@@ -222,9 +204,8 @@ class Frames:
             Other attributes.
         """
         time, light = np.asarray(time_s, np.float64), np.asarray(flux, np.float64)
-        _check_light(name, time, light)
+        cadence = _cadence_of(name, time, light)
         n, order = time.size, np.argsort(time, kind="stable")
-        cadence = _cadence_of(name, time[order])
         if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
             raise _bad(name, "quality", "a value that is not finite", "whole numbers")
         if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
@@ -232,15 +213,12 @@ class Frames:
         exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-        each: dict[str, Any] = {"error": None, "temperature_c": None}
-        for key, given, shape in (
-            ("error", error, light.shape),
-            ("temperature_c", how.pop("temperature_c", None), (n,)),
-            ("quality", np.zeros(n) if quality is None else quality, (n,)),
-        ):
+        each: dict[str, Any] = {"error": error, "temperature_c": how.pop("temperature_c", None),
+                                "quality": np.zeros(n) if quality is None else quality}  # fmt: skip
+        for key, given in each.items():
             if given is not None:
                 values = np.asarray(given, np.int64 if key == "quality" else np.float64)
-                if values.shape != shape:
+                if values.shape != (shape := light.shape if key == "error" else (n,)):
                     raise _bad(name, key.removesuffix("_c"), values.shape, f"the shape {shape}")
                 each[key] = values[order]
         made = cls(time[order], exposure[order], light[order], name=name, **each, **how)

@@ -273,8 +273,7 @@ def survey_light_curve(
             break
         reasons = np.where(used, reasons | flagged, reasons)
     assert survey is not None
-    finite = np.isfinite(flux)
-    below = finite & (reasons != 0) & (np.where(finite, flux, 0.0) - level < -FAR * sd)
+    below = np.isfinite(flux) & (reasons != 0) & (flux - level < -FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     survey = survey.frames((reasons == 0)[np.searchsorted(frames.time_s, survey.time_s)])
     light = quiescent_light(frames, survey, reasons, ~guessed, seed, steps.part(0.9, 1.0))
@@ -305,10 +304,8 @@ def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], 
 def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
     """Raise InputError if too few frames are without a fault, or if most of them have the same flux."""
     usable = reasons == 0
-    if usable.sum() < MIN_USABLE:
-        raise InputError(
-            f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {usable.sum()}", key="frames"
-        )
+    if (n := usable.sum()) < MIN_USABLE:
+        raise InputError(f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {n}", key="frames")
     flux = frames.white_light[0][usable]
     if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
         raise InputError(

@@ -135,8 +135,6 @@ KNOWN = {
 }  # fmt: skip
 #: Names of times where no column is called time and none is named after its dates, such as BJD.
 OTHER_TIMES = ("t", "date", "datetime", "timestamp", "date-obs", "date_obs", "utc", "ut")
-#: Names of the times at which frames start and end, where no other column is a time.
-EDGES = ("t0", "t1")
 #: Part of a frame that times refer to.
 PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 #: Dates of observed light, MJD, from 1845 to 2269.
@@ -175,7 +173,8 @@ def recognised(file: TableFile) -> FrameMapping:
         timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
         columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
     if columns["time"] is None:
-        edges = tuple(first_of((name,), names, file.what) for name in EDGES)
+        # The start and the end of each frame.
+        edges = tuple(first_of((name,), names, file.what) for name in ("t0", "t1"))
         columns["time"] = None if None in edges else edges
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
@@ -221,7 +220,7 @@ def times_of(
         unit = u.Unit(said.unit)
         offset = stated.offset_in(unit, file.what)
         scale, position = scale or said.scale or stated.default_scale, position or said.position
-        epoch = _epoch_mjd(said, stated, time[0].name, file.what) if epoch is None else epoch
+        epoch = next((one for one in (epoch, stated.epoch_mjd, said.epoch_mjd) if one is not None), None)
     is_cheops = str(file.header.get("EXTNAME", "")).upper().startswith(CHEOPS)
     if is_cheops and position == "BARYCENTER" and not mapping.scale:
         scale = "tt"
@@ -239,51 +238,41 @@ def times_of(
     return (seconds if epoch is not None else seconds + first_d * DAY_S), exposure, dates, tuple(remarks)
 
 
-def _epoch_mjd(said: TimeUnit, stated: TimeSystem, name: str, what: str) -> float | None:
-    """Return the MJD from which times count, as their unit or name says or else the header; these must agree."""
-    if said.epoch_mjd is None or stated.epoch_mjd is None:
-        return said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
-    if abs(said.epoch_mjd - stated.epoch_mjd) > 1e-5:
-        raise InputError(
-            f"{what}: {name!r} counts from MJD {said.epoch_mjd:g} by its unit or name and from {stated.epoch_mjd:g} by "
-            "its header; give one epoch, or a mapping with epoch",
-            key="epoch",
-        )
-    return stated.epoch_mjd
-
-
 def _time_unit(
     time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
 ) -> tuple[TimeUnit, list[str]]:
-    """Return the unit of times and what it says of their zero: of the mapping, the column, its name, the header."""
+    """Return the unit of times and what it says of their zero, by the mapping, the column, its name or the header.
+
+    Raises InputError if it contradicts the header.
+    """
     if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
         names = " and ".join(repr(one.name) for one in time)
         raise InputError(f"{file.what}: {names} must have the same unit, but have different units", key="time")
     text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
     named = time_in_name(time[0].name)
-    said = named if not text else time_unit(text)
-    if said is None:
-        text = text or stated.unit
-        said = time_unit(text) if text else None
-        if said is None and text:
-            # Checks the unit; times keep theirs, so that long times lose no digits.
-            converted(replace(time[0], unit=text), None, "s", "time_unit")
-            said = TimeUnit(str(unit_in(text)))
+    said = time_unit(text) if text else named
+    if said is None and (text := text or stated.unit) and (said := time_unit(text)) is None:
+        # Checks the unit; times keep theirs, so that long times lose no digits.
+        converted(replace(time[0], unit=text), None, "s", "time_unit")
+        said = TimeUnit(str(unit_in(text)))
+    remarks = list[str]()
     if said is None:
         held = {*map(key_of, file.columns)}
-        for columns, times, text in TIMES_OF_COLUMNS:
-            if columns <= held:
-                return times, [f"ASSUMED: the times of {file.what} are {text}; it states no unit"]
-        words = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
-        mission = next((one for one in MISSIONS if one in words), None)
-        finite = values[np.isfinite(values)]
-        if mission is None or not (finite.size and 0 < float(np.median(finite)) < 20_000):
-            converted(time[0], None, "s", "time_unit")
-        name = MISSIONS[mission or "TESS"].upper()
-        said = time_unit(name) or TimeUnit("d")
-        return said, [
-            f"ASSUMED: the times of {file.what} are {name}, days, as in files of {mission}; it states no unit"
-        ]
-    if said.epoch_mjd is None and named is not None and named.unit == said.unit:
+        if known := [(times, words) for columns, times, words in TIMES_OF_COLUMNS if columns <= held]:
+            said, text = known[0]
+        else:
+            keywords = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
+            mission = next((one for one in MISSIONS if one in keywords), None)
+            finite = values[np.isfinite(values)]
+            if mission is None or not (finite.size and 0 < float(np.median(finite)) < 20_000):
+                converted(time[0], None, "s", "time_unit")
+            name = MISSIONS[mission or "TESS"].upper()
+            said, text = time_unit(name) or TimeUnit("d"), f"{name}, days, as in files of {mission}"
+        remarks = [f"ASSUMED: the times of {file.what} are {text}; it states no unit"]
+    elif said.epoch_mjd is None and named is not None and named.unit == said.unit:
         said = named
-    return said, []
+    own, header = said.epoch_mjd, stated.epoch_mjd
+    if mapping.epoch is None and own is not None and header is not None and abs(own - header) > 1e-5:
+        fault = f"{file.what}: {time[0].name!r} counts from MJD {own:g} by its unit or name and from {header:g} by"
+        raise InputError(f"{fault} its header; give one epoch, or a mapping with epoch", key="epoch")
+    return said, remarks

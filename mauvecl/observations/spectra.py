@@ -228,21 +228,24 @@ def _weighted_sums(
     )
     kept = float(np.median(templates.best / steady.best))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
-    mixing = _whitening(sums, pairs)
-    if mixing is not None:
-        templates, sums = templates.mixed(mixing), sums @ mixing.T
-    turn = _slow_axes(sums, quiet)
-    templates, sums = templates.mixed(turn), sums @ turn.T
+    mixing = _independent(sums, pairs, quiet)
+    templates, sums = templates.mixed(mixing), sums @ mixing.T
     drift *= abs(float(unknown["dark"].sum() / light.sum()))
     return SpectralSeries(excess, light, noise, model, known, changes, kept, drift), templates, sums
 
 
-def _slow_axes(sums: Float, quiet: Bool) -> Float:
-    """Return the rotation of sums, of unit covariance, to the axes along which they change slowly."""
-    means = _slow_means(sums[quiet])
-    if len(means) < 2 * sums.shape[1]:
-        return np.eye(sums.shape[1])
-    return np.asarray(np.linalg.eigh(np.cov(means.T).reshape(sums.shape[1], -1))[1].T[::-1])
+def _independent(sums: Float, pairs: NDArray[np.intp], quiet: Bool) -> Float:
+    """Return the matrix of sums of unit covariance, as measured, along the axes on which they change slowly."""
+    n = sums.shape[1]
+    mixing = np.eye(n)
+    steps = sums[pairs + 1] - sums[pairs]
+    covariance = steps.T @ steps / (2 * pairs.size)
+    if (np.abs(covariance - mixing) > DEPARTS * 2 * relative_error(pairs.size)).any():
+        mixing = np.linalg.inv(np.linalg.cholesky(covariance))
+    means = _slow_means(sums[quiet] @ mixing.T)
+    if len(means) >= 2 * n:
+        mixing = np.linalg.eigh(np.cov(means.T).reshape(n, n))[1].T[::-1] @ mixing
+    return np.asarray(mixing)
 
 
 def _slow_means(values: Float) -> Float:
@@ -280,30 +283,11 @@ def _dark_changes(
     return ({"dark": np.inf}, drift) if drift > max(DARK_DRIFTS * error, BEYOND_JITTER * independent) else (jitter, 0.0)
 
 
-def _whitening(sums: Float, pairs: NDArray[np.intp]) -> Float | None:
-    """Return the matrix that gives the sums unit covariance, as measured; None if they have it already."""
-    steps = sums[pairs + 1] - sums[pairs]
-    covariance = steps.T @ steps / (2 * pairs.size)
-    error = 2 * relative_error(pairs.size)
-    departs = np.abs(covariance - np.eye(len(covariance))) > DEPARTS * error
-    return np.linalg.inv(np.linalg.cholesky(covariance)) if departs.any() else None
+def event_colour(spectra: Float, error: Float, event: Bool, quiet: Bool) -> tuple[float, float, float]:
+    """Return the relative rise in the blue half of the pixels over that in the red, its error, and a p-value.
 
-
-@dataclass(frozen=True)
-class Colour:
-    """Spectrum of an event against the spectrum of the quiescent star."""
-
-    chi2: float  # of the event's spectrum as a multiple of the quiescent one
-    dof: int
-    p_value: float  # of a chi-squared at least as large without colour, as of a step of the throughput
-    blue_over_red: float  # relative rise in the blue half of the pixels over that in the red: 1 without colour
-    blue_over_red_error: float
-
-
-def event_colour(spectra: Float, error: Float, event: NDArray[np.bool_], quiet: NDArray[np.bool_]) -> Colour:
-    """Compare the mean spectrum of the frames of an event with that of the quiescent star near it.
-
-    Pixels are in order of wavelength; those that are not finite in a frame are left out.
+    The rise is 1 and the p-value, of chi-squared, is even for a multiple of the quiescent spectrum. Pixels are in order
+    of wavelength; those that are not finite in a frame are left out.
     """
     fine = np.isfinite(spectra).all(axis=0) & np.isfinite(error).all(axis=0) & (error > 0).all(axis=0)
     spectra, error = spectra[:, fine], error[:, fine]
@@ -312,13 +296,12 @@ def event_colour(spectra: Float, error: Float, event: NDArray[np.bool_], quiet: 
     count, base = np.count_nonzero(event), np.count_nonzero(quiet)
     variance = (error[event] ** 2).sum(axis=0) / count**2 + (error[quiet] ** 2).sum(axis=0) / base**2
     scale = _multiple(excess, star, variance)
-    chi2 = float(((excess - scale[0] * star) ** 2 / variance).sum())
-    dof = int(fine.sum()) - 1
+    chi2 = ((excess - scale[0] * star) ** 2 / variance).sum()
     half = fine.sum() // 2
     blue, red = (_multiple(excess[part], star[part], variance[part]) for part in (slice(None, half), slice(half, None)))
     ratio = blue[0] / red[0]
     relative = np.hypot(blue[1] / blue[0], red[1] / red[0])
-    return Colour(chi2, dof, float(scipy.stats.chi2.sf(chi2, dof)), float(ratio), float(abs(ratio) * relative))
+    return float(ratio), float(abs(ratio) * relative), float(scipy.stats.chi2.sf(chi2, fine.sum() - 1))
 
 
 def _multiple(excess: Float, star: Float, variance: Float) -> tuple[float, float]:

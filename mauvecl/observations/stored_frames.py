@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.tables.files import check_folder, limit_bytes, parsing
 from mauvecl.host.tables.fits_tables import FitsTables
@@ -24,23 +24,20 @@ from mauvecl.schema.errors import InputError, missing_package
 
 #: Largest number of files in a folder.
 MAX_FILES = 2**20
-#: Column of a table with the names of files, by default.
-FILES = "file"
-
-Open = Callable[[Path], AbstractContextManager[TableFile]]
 
 
 class FolderFile(TableFile):
     """Spectra in the files of a folder; quantities of frames are keywords of their headers or columns of a table."""
 
-    def __init__(self, folder: Path, mapping: FrameMapping, what: str, open_file: Open) -> None:
+    def __init__(self, folder: Path, mapping: FrameMapping, what: str,
+                 open_file: Callable[[Path], AbstractContextManager[TableFile]]) -> None:  # fmt: skip
         super().__init__(what, {}, [])
         self.open_file = open_file
         self.table: MemoryTable | None = None
         if mapping.table is not None:
             place = folder / mapping.table
             self.table = MemoryTable(read_table(place, "table of files"), f"table {mapping.table!r}")
-            listed = self.table.find(mapping.files or FILES)
+            listed = self.table.find(mapping.files or "file")
             self.paths = [folder / str(name) for name in listed.texts() or listed.read(0, listed.n_rows)]
         else:
             self.paths = sorted(
@@ -290,7 +287,7 @@ class PixelStatistics:
 
 
 def weighted_sums(
-    flux: Values, error: Values | None, quality: Values | None, weights: Float | None = None
+    flux: Values, error: Values | None, quality: Values | None, weights: ArrayLike | None = None
 ) -> tuple[list[Light], PixelStatistics]:
     """Reduce spectra to weighted sums, by default the sum over all pixels, reading them twice in pieces.
 

@@ -326,10 +326,7 @@ def line_index(
     good = np.isfinite(light) & np.isfinite(sd) & (sd > 0)
     if not good[..., inside].all():
         raise InputError("every pixel in the band needs a finite flux and an error above 0", key="flux")
-    windows = np.zeros(nm.size, np.bool_)
-    for start, end in continuum_nm:
-        windows |= (nm >= start) & (nm <= end)
-    left = good & windows
+    left = good & np.any([(nm >= start) & (nm <= end) for start, end in continuum_nm], axis=0)
     if (count := int(left.sum(axis=-1).min(initial=nm.size))) < MIN_CONTINUUM:
         raise InputError(f"the continuum needs {MIN_CONTINUUM} usable pixels or more, not {count}", key="continuum_nm")
     weight = np.where(left, 1.0 / np.where(left, sd, 1.0) ** 2, 0.0)
