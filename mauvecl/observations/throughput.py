@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -191,7 +190,8 @@ def _best(likelihood: Callable[[float], float], log_range: tuple[float, float]) 
 class ThroughputModel:
     """Mean light of standard stars for a throughput, wavelength scale and line width.
 
-    `light_error` is the relative standard deviation of the light of an observation.
+    The spline of the throughput has `knots` intervals. `light_error` is the relative standard deviation of the light of
+    an observation, by pointing.
     """
 
     def __init__(
@@ -229,6 +229,12 @@ class ThroughputModel:
         )
         # Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star.
         self.n_shape = 0 if self.n_stars < 2 else 4 if fwhm > 0 else 2
+        # Derivatives of the light with respect to these, for the nominal instrument, shape (n_star, n_pixel).
+        self.slopes_dn = list[Float]()
+        for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
+            moved = step * np.eye(self.n_shape)[place]
+            more, less = (self.light_dn(np.zeros(nm.size), sign * moved) for sign in (1, -1))
+            self.slopes_dn += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
 
     def light_dn(self, log_factor: Float, shape: Float) -> Float:
         """Return the mean light of a frame of each star, DN, shape (n_star, n_pixel).
@@ -258,16 +264,6 @@ class ThroughputModel:
         frames = np.array([one.n_frames for one in self.stars])
         dark = self.dark_terms[:, :1] * self.dark.level_dn_per_s
         return np.asarray(self.transfer.noise.variance(light_dn, dark) / frames[:, None])
-
-    @cached_property
-    def slopes_dn(self) -> list[Float]:
-        """Derivatives of the light with respect to the shape, for the nominal instrument, shape (n_star, n_pixel)."""
-        slopes = []
-        for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
-            moved = step * np.eye(self.n_shape)[place]
-            more, less = (self.light_dn(np.zeros(self.x.size), sign * moved) for sign in (1, -1))
-            slopes += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
-        return slopes
 
     def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
         """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""
@@ -304,27 +300,14 @@ class ThroughputModel:
         return _Linearised(observed + design[:, : around.size] @ around, design, np.array(prior), self.penalty)
 
 
-def fit_throughput(
-    stars: Sequence[CalibrationFrames],
-    nominal: Instrument,
-    dark: DarkFit,
-    transfer: PhotonTransfer,
-    *,
-    knots: int,
-    sky: Sky,
-    order: Order,
-    light_error: float = 0.0,
-    spectrum_error: float | None = None,
-) -> ThroughputFit:
+def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) -> ThroughputFit:
     """Fit the throughput to the mean frames of standard stars.
 
-    With two or more stars, wavelengths and the width of the line function are fitted as well. The spline has `knots`
-    intervals. `light_error` is the relative error of the light of an observation, by pointing, and `spectrum_error`
-    that of the stars' spectra at `ERROR_KNOTS` knots; by default assumed for one star, and fitted if several disagree.
+    With two or more stars, wavelengths and the width of the line function are fitted as well. `spectrum_error` is the
+    relative error of the stars' spectra at `ERROR_KNOTS` knots; by default assumed for one star, and fitted if several
+    disagree.
     """
-    nm = nominal.wavelength_nm
-    model = ThroughputModel(stars, nominal, dark, transfer, knots=knots, sky=sky, order=order, light_error=light_error)
-    several = model.n_stars > 1
+    nm, fwhm, several = model.nominal.wavelength_nm, model.nominal.gaussian_fwhm_nm, model.n_stars > 1
     error = spectrum_error if spectrum_error is not None else 0.0
     best = _iterated(model, error)
     m, n = model.n_shape, model.basis.shape[1]
@@ -341,30 +324,22 @@ def fit_throughput(
     # One star cannot tell errors of its spectrum from the throughput.
     apart = 0.0 if several or spectrum_error is not None else ONE_STAR_ERROR
     _, chi2, dof, structure, log_pixel, variance = best.pixels(model)
-    joint = _joint_covariance(model, best, variance, apart)
+    onto, errors = scipy.linalg.block_diag(model.basis, np.eye(m)), apart * _linear_basis(nm)
+    joint = np.asarray(onto @ best.scaled(model.basis)[: n + m, : n + m] @ onto.T)
+    joint[: nm.size, : nm.size] += np.diag(variance) + errors @ errors.T + model.transfer.relative_gain_error**2
     log_factor = model.basis @ best.found[:n] + log_pixel
     light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
-    scales, errors = (1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm), np.sqrt(np.diag(joint))[nm.size :]
+    sd = np.sqrt(np.diag(joint))[nm.size :]
     shift, stretch, width, change = (
-        Value(scale * float(shape[k] + (k == 2)), scale * float(errors[k])) if k < m else None
-        for k, scale in enumerate(scales)
+        Value(scale * float(shape[k] + (k == 2)), scale * float(sd[k])) if k < m else None
+        for k, scale in enumerate((1.0, 1.0, fwhm, fwhm))
     )
     return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, chi2, dof,
                          best.smoothing, apart or error, structure, tuple(assumed))  # fmt: skip
-
-
-def _joint_covariance(model: ThroughputModel, best: _Linearised, variance: Float, spectrum_error: float) -> Float:
-    """Return the covariance of log throughput and shape, with the errors of the gain and, apart, of spectra."""
-    n, nm = model.basis.shape[1] + model.n_shape, model.nominal.wavelength_nm
-    onto = scipy.linalg.block_diag(model.basis, np.eye(model.n_shape))
-    joint = np.asarray(onto @ best.scaled(model.basis)[:n, :n] @ onto.T)
-    errors = spectrum_error * _linear_basis(nm)
-    joint[: nm.size, : nm.size] += np.diag(variance) + errors @ errors.T + model.transfer.relative_gain_error**2
-    return joint
 
 
 def _iterated(model: ThroughputModel, error: float) -> _Linearised:
