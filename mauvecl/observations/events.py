@@ -187,7 +187,8 @@ def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: DetectedEvent)
         shared = process.times(time, near)
         # The constant level is known to 1 / (1^T C^-1 1).
         rest = float(near.sum() - weights @ shared[quiet])
-        variance += float(near @ shared - shared[quiet] @ given.solve(shared[quiet])) + rest**2 / float(weights.sum())
+        of_level = float(near @ shared - shared[quiet] @ given.solve(shared[quiet])) + rest**2 / float(weights.sum())
+        variance += of_level
     return total, float(np.sqrt(max(variance, 0.0))) * factor
 
 
