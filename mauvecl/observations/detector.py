@@ -180,7 +180,8 @@ def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_err
         "DN": _fit(light, dark, variance, dof),
         "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof),
     }
-    better, unit, assumed = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit, ("unit of the dark counts",)
+    better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
+    assumed: tuple[str, ...] = ("unit of the dark counts",)
     if abs(better) > TELLS:
         unit, assumed = "electrons" if better > 0 else "DN", ()
     (read, gain), covariance, chi2, model = fits[unit]
