@@ -113,7 +113,7 @@ class _Linearised:
         middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(penalty))
         # That of the largest restricted likelihood.
         self.smoothing = _best(self.likelihood, tuple(middle + np.array(LOG_SMOOTHING)))
-        self.covariance: Float = np.linalg.inv(self._information(self.smoothing, prior))
+        self.covariance: Float = np.asarray(np.linalg.inv(self._information(self.smoothing, prior)))
         self.found: Float = self.covariance @ self.projected
 
     def _information(self, smoothing: float, prior: Float) -> Float:
