@@ -348,11 +348,11 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "light summed above a known level": (
         "test_error_of_a_summed_duration_includes_that_of_its_level",
-        ("variance += _level_variance(process, time, noise, quiet, near)", "pass"),
+        ("variance += of_level", "pass"),
     ),
     "a slow decay on top of the fast one": (
         "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
-        ("row[rise], row[len(rises) + start] = 1.0, 1.0 - share", "row[rise], row[len(rises) + start] = 1.0, 1.0"),
+        ("starts = np.eye(len(fast))[start] * (1.0 - share[decay, None])", "starts = np.eye(len(fast))[start]"),
     ),
     "published shapes that do not share their weight": (
         "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
@@ -497,7 +497,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "one star without errors of its spectrum": (
         "test_one_star_determines_throughput_alone",
-        ("errors = spectrum_error * _linear_basis(nm)", "errors = 0.0 * _linear_basis(nm)"),
+        ("apart * _linear_basis(nm)", "0.0 * _linear_basis(nm)"),
     ),
     "a wider line that is narrower": (
         "test_fit_recovers_another_width_and_wavelength_scale",

@@ -25,7 +25,7 @@ from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
 from mauvecl.observations import detector
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, fit_throughput
+from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, ThroughputModel, fit_throughput
 from mauvecl.schema.columns import Column, View, number, percent
 from mauvecl.schema.errors import InputError
 
@@ -456,10 +456,11 @@ def calibrate(
         dark = detector.fit_dark(without, nominal, transfer.noise)
         error = float(np.sqrt(dark.shared[0, 0]))
         transfer = detector.fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
-    throughput = fit_throughput(
+    model = ThroughputModel(
         lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
-        light_error=asked.light_error, spectrum_error=asked.spectrum_error,
+        light_error=asked.light_error,
     )  # fmt: skip
+    throughput = fit_throughput(model, asked.spectrum_error)
     return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
 
 

@@ -319,9 +319,10 @@ class Analysis:
     def _verdict_messages(self) -> Iterator[str]:
         """Yield messages on why events have no verdict or another threshold than the wanted one."""
         if not self.likeness.alike:
+            clearest = int(np.argmax(self.likeness.excess))
             yield (
-                f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "
-                f"{self.likeness.lag} frames), which the fitted process does not describe: there are no verdicts. "
+                f"Residuals of the quiescent light are correlated ({self.likeness.correlations[clearest]:.2f} at a lag "
+                f"of {clearest + 1} frames), which the fitted process does not describe: there are no verdicts. "
                 f"Sudden dips, which are no flares, have an S/N of up to {max(self.dip, self.candidates):.3g}: rises "
                 "of that size are no evidence of flares."
             )

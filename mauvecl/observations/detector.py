@@ -176,15 +176,14 @@ def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_err
     `dark_error_dn`, moves the read noise.
     """
     variance, light, dark, dof = np.concatenate(measured, axis=1)
-    fits = {}
-    for name, column in (("DN", light), ("electrons", light + dark)):
-        fixed = dark if name == "DN" else np.zeros_like(dark)
-        fits[name] = _fit(column, fixed, variance, dof)
-    better = fits["DN"][2] - fits["electrons"][2]
-    tells = abs(better) > TELLS
-    measured_unit: Literal["DN", "electrons"] = "electrons" if better > 0 else "DN"
-    unit = measured_unit if tells else nominal.dark_unit
-    assumed = () if tells else ("unit of the dark counts",)
+    fits = {
+        "DN": _fit(light, dark, variance, dof),
+        "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof),
+    }
+    better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
+    assumed: tuple[str, ...] = ("unit of the dark counts",)
+    if abs(better) > TELLS:
+        unit, assumed = "electrons" if better > 0 else "DN", ()
     (read, gain), covariance, chi2, model = fits[unit]
     errors = np.sqrt(np.diag(covariance))
     if not gain > MIN_SNR * errors[1]:
@@ -237,10 +236,10 @@ class DarkFit:
     slope_per_c: float  # common to all pixels
     pixel_slope_per_c: Float  # shape (n_pixel,); of each pixel alone; NaN if it is not determined
     pixel_slope_error: Float
-    chi2: float
-    dof: int
-    slopes_p_value: float  # of pixel slopes at least as different if all are equal; NaN if not determined
     assumed: tuple[str, ...]  # quantities that these frames do not determine
+    chi2: float = np.nan
+    dof: int = 0
+    slopes_p_value: float = np.nan  # of pixel slopes at least as different if all are equal
 
     @property
     def p_value(self) -> float:
@@ -286,9 +285,6 @@ def assumed_dark(nominal: Instrument, n_pixel: int) -> DarkFit:
         slope_per_c=nominal.dark_slope_per_c,
         pixel_slope_per_c=nothing,
         pixel_slope_error=nothing,
-        chi2=np.nan,
-        dof=0,
-        slopes_p_value=np.nan,
         assumed=("dark current", "dark slope", "bias"),
     )
 

@@ -102,8 +102,7 @@ def _log_above(x: float, log_weight: Float, mean: Float, sd: Float, goal: float)
 
 def joined(parts: Sequence[NormalMixture]) -> NormalMixture:
     """Return the mixture of several."""
-    names = ("log_weight", "mean", "sd")
-    return NormalMixture(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return NormalMixture(*np.hstack([(part.log_weight, part.mean, part.sd) for part in parts]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,14 +308,10 @@ def _lights(window: Window, shape: Profile, parameters: Float) -> Float:
 def _slopes(window: Window, shape: Profile, parameters: Float) -> Float:
     """Return the derivatives of the light with the parameters of `_parameters`, shape (n_parameter, n)."""
     rows = parameters.reshape(-1, 3)
-    steps = 1e-4 * np.column_stack([np.exp(rows[:, 2]), np.ones(len(rows))])
-    moved = np.repeat(rows[:, None], 4, axis=1)
-    moved[:, 0, 1] += steps[:, 0]
-    moved[:, 1, 1] -= steps[:, 0]
-    moved[:, 2, 2] += steps[:, 1]
-    moved[:, 3, 2] -= steps[:, 1]
-    light = _lights(window, shape, moved).reshape(len(rows), 4, -1)
-    along = (light[:, 0::2] - light[:, 1::2]) / (2 * steps[:, :, None])
+    steps = 1e-4 * np.column_stack([np.ones(len(rows)), np.exp(rows[:, 2]), np.ones(len(rows))])
+    signs = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    light = _lights(window, shape, rows[:, None] + signs * steps[:, None]).reshape(len(rows), 4, -1)
+    along = (light[:, 0::2] - light[:, 1::2]) / (2 * steps[:, 1:, None])
     return np.concatenate([_lights(window, shape, parameters)[:, None], along], axis=1).reshape(parameters.size, -1)
 
 
@@ -363,6 +358,7 @@ def _single(
     The grid begins from the range `box`; `last` is the grid of the first fit, if that was a fit of the same family.
     """
     outer = _ranges(window)
+    durations = family.weights @ [float(part.before(0.0) + part.after(0.0)) for part in family.parts]
     box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])
     fits = []
     for epsilon in family.epsilon:
@@ -382,7 +378,7 @@ def _single(
                 break
         box = grid.box
         shape, flare = grid.best
-        per_amplitude = grid.half_widths_s * family.durations[grid.shape] - grid.along(likelihood.toward)
+        per_amplitude = grid.half_widths_s * durations[grid.shape] - grid.along(likelihood.toward)
         in_level = grid.along(likelihood.level)
         level = float(window.values @ likelihood.level) - grid.amplitude * in_level
         level = np.where(level > 0, level, window.quiet_level)
@@ -428,7 +424,7 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
         along[2::3] += total
         variance = float(along @ covariance @ along) + likelihood.left + mean**2 * likelihood.level_variance
         # As the grid of a single flare, without the factor of one amplitude.
-        log = likelihood.log_factor - 0.5 * float(likelihood.chi2(light)) + prior
+        log = likelihood.log_of(light) + prior
         log += 0.5 * float(np.linalg.slogdet(covariance)[1]) + (3 * n - 1) / 2 * np.log(2 * np.pi)
         fits.append(Fit(NormalMixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares, epsilon))
     return fits

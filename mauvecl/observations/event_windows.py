@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,18 +60,15 @@ class Half:
 
     def before(self, tau: ArrayLike) -> Float:
         """Return the integral up to tau."""
-        return self._integral(tau, whole=not self.decays)
+        return self._from_peak(np.maximum(tau, 0.0)) if self.decays else self.integral(np.minimum(tau, 0.0))
 
     def after(self, tau: ArrayLike) -> Float:
         """Return the integral from tau on."""
-        return self._integral(tau, whole=self.decays)
+        return self.integral(np.maximum(tau, 0.0)) if self.decays else self._from_peak(np.minimum(tau, 0.0))
 
-    def _integral(self, tau: ArrayLike, whole: bool) -> Float:
-        """Return the `whole` integral on the far side of tau from the peak, or that between the peak and tau."""
-        t = np.asarray(np.maximum(tau, 0.0) if self.decays else np.minimum(tau, 0.0))
-        if whole:
-            return self.integral(t)
-        return self.integral(np.zeros(())) - self.integral(t) if t.any() else np.zeros(t.shape)
+    def _from_peak(self, tau: Float) -> Float:
+        """Return the integral between the peak and tau."""
+        return self.integral(np.zeros(())) - self.integral(tau) if tau.any() else np.zeros(tau.shape)
 
 
 def _exponential(rate: float) -> Half:
@@ -138,22 +135,15 @@ class Family:
         barycentric[[0, -1]] /= 2
         interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
         slow, interpolated = [_exponential(float(rate)) for rate in np.exp(points)], interpolate(np.log(SLOW_RATES))
-        choices = [(0.0, 0), *((share, rate) for share in SLOW_SHARES for rate in range(SLOW_RATES.size))]
         # Each share has the same weight: without a slow decay, its rate does not matter.
-        rates = np.array([1.0 if share == 0 else 1 / SLOW_RATES.size for share, _ in choices])
-        prior = np.tile(rates / rates.sum(), len(rises) * len(fast)) / (len(rises) * len(fast))
-        rows = []
-        for rise, start, (share, rate) in product(range(len(rises)), range(len(fast)), choices):
-            row = np.zeros(len(rises) + len(fast) + len(slow))
-            row[rise], row[len(rises) + start] = 1.0, 1.0 - share
-            row[len(rises) + len(fast) :] = share * interpolated[rate]
-            rows.append(row)
-        return cls(GENERAL, (*rises, *fast, *slow), np.array(rows), np.log(prior), GENERAL_EPSILON, GENERAL_WEIGHT)
-
-    @property
-    def durations(self) -> Float:
-        """Equivalent duration of each shape for unit amplitude and half-width."""
-        return np.asarray(self.weights @ [float(part.before(0.0) + part.after(0.0)) for part in self.parts])
+        share = np.append(0.0, np.repeat(SLOW_SHARES, SLOW_RATES.size))
+        rates = np.where(share == 0, 1.0, 1 / SLOW_RATES.size)
+        decays = share[:, None] * np.vstack([interpolated[:1], *[interpolated] * len(SLOW_SHARES)])
+        rise, start, decay = np.indices((len(rises), len(fast), share.size)).reshape(3, -1)
+        starts = np.eye(len(fast))[start] * (1.0 - share[decay, None])
+        weights = np.hstack([np.eye(len(rises))[rise], starts, decays[decay]])
+        prior = (rates / rates.sum())[decay] / (len(rises) * len(fast))
+        return cls(GENERAL, (*rises, *fast, *slow), weights, np.log(prior), GENERAL_EPSILON, GENERAL_WEIGHT)
 
     def shape(self, k: int) -> WeightedSum:
         """Return one of the shapes."""
@@ -222,13 +212,11 @@ class Window:
         inside[begin : end + 1] = True
         at = np.flatnonzero(inside | ~taken[near])
         distance = np.abs(numbers[at] - peak)
-        size = np.ones(at.size)
         length = numbers[end] - numbers[begin] + 1
-        size[inside[at]] = max(1, int(np.ceil(length / MAX_INSIDE)))
         shortest = min(process.shortest_s for process in survey.processes)
         ends = np.where(numbers[at] > peak, distance - (numbers[end] - peak), distance - (peak - numbers[begin]))
         outer = np.clip(np.maximum(ends, 0.0) / GROWTH, 1.0, max(1.0, SHORT * shortest / frame_s))
-        size[~inside[at]] = np.maximum(np.floor(outer), size.min())[~inside[at]]
+        size = np.where(inside[at], np.ceil(length / MAX_INSIDE), np.floor(outer))
         first = _bins(numbers[at], size, inside[at])
         count = np.diff(np.append(first, at.size))
         is_inside = inside[at][first]
@@ -255,10 +243,8 @@ class Window:
         """Covariance of the level in the bins, shape (n, n)."""
         unit = self.survey.bank.directions[self.one.direction]
         lags = self.middle[:, None] - self.middle
-        total = np.zeros(lags.shape)
-        for weight, process in zip(unit, self.survey.processes, strict=True):
-            total += weight**2 * process.at(lags)
-        return total
+        parts = zip(unit, self.survey.processes, strict=True)
+        return np.asarray(sum(weight**2 * process.at(lags) for weight, process in parts))
 
     def model(self, shape: Integrable, peak_s: Float, half_width_s: Float) -> Float:
         """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""

@@ -11,11 +11,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.flares.shapes import between, sides
+from mauvecl.flares.shapes import consecutive_integrals
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
-from mauvecl.observations.process import UNREPORTED, Process, Steps
+from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 
 Float = NDArray[np.float64]
@@ -124,10 +124,9 @@ def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> b
     level = float(plain.level_without(model))
     survey, one = window.survey, window.one
     start = survey.stare.start_s[one.first : one.last + 1]
-    within = 0.0
+    edges, within = np.column_stack([start, start + survey.stare.frame_s]), 0.0
     for flare in best.flares:
-        edges = [(time - flare.peak_s) / flare.half_width_s for time in (start, start + survey.stare.frame_s)]
-        light = between(*(sides(best.shape, tau) for tau in edges))
+        light = consecutive_integrals(best.shape, (edges - flare.peak_s) / flare.half_width_s)
         within += flare.amplitude * flare.half_width_s * float(light.sum())
     mixture = joined([fit.mixture for fit in fits])
     low, high = (mixture.quantile(0.5 + sign * LEVELS[0] / 2) for sign in (-1, 1))
@@ -183,21 +182,14 @@ def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: DetectedEvent)
         middle = time[event] + survey.stare.frame_s / 2
         peak = event.start + min(int(np.searchsorted(middle, one.peak_s)), numbers.size - 1)
         near[peak] += total / factor / max(float(level[begin + peak]), 1e-12)
-        variance += _level_variance(process, time, noise, quiet, near)
+        given = process.covariance(time[quiet], noise[quiet])
+        weights = given.solve(np.ones(int(quiet.sum())))
+        shared = process.times(time, near)
+        # The constant level is known to 1 / (1^T C^-1 1).
+        rest = float(near.sum() - weights @ shared[quiet])
+        of_level = float(near @ shared - shared[quiet] @ given.solve(shared[quiet])) + rest**2 / float(weights.sum())
+        variance += of_level
     return total, float(np.sqrt(max(variance, 0.0))) * factor
-
-
-def _level_variance(process: Process, time: Float, noise: Float, quiet: Bool, weights: Float) -> float:
-    """Return the variance of a weighted sum of the level given quiescent frames."""
-    one = process.covariance(time[quiet], noise[quiet])
-    level = one.solve(np.ones(int(quiet.sum())))
-    # K w at all times.
-    shared = process.times(time, weights)
-    towards = shared[quiet]
-    solved = one.solve(towards)
-    # The constant level is known to 1 / (1^T C^-1 1).
-    rest = float(weights.sum() - level @ towards)
-    return float(weights @ shared - towards @ solved) + rest**2 / float(level.sum())
 
 
 def _is_step(window: Window, fits: Sequence[Fit]) -> bool:

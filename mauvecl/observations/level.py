@@ -248,16 +248,6 @@ class Likeness:
         return np.asarray(np.abs(self.correlations) / np.maximum(CORRELATED, SIGNIFICANT * self.errors))
 
     @property
-    def lag(self) -> int:
-        """Lag of the clearest correlation in frames."""
-        return int(np.argmax(self.excess)) + 1
-
-    @property
-    def correlation(self) -> float:
-        """Clearest correlation."""
-        return float(self.correlations[self.lag - 1])
-
-    @property
     def alike(self) -> bool:
         """True unless the residuals are significantly and clearly correlated."""
         return bool(self.excess.max() < 1)
@@ -351,7 +341,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         return Binned.of(time_s[quiet], light[quiet], np.ones(int(quiet.sum())), frame_s, MAX_TRIED)
 
     for _ in range(ROUNDS):
-        left = values - _light_of_steps(values.size, places, sizes)
+        left = values - np.cumsum(np.bincount(places, sizes, values.size))
         quiet = ~guess_flares(numbers, left)
         process = fit_process(binned(left), process)
         change, error = _fitted_steps(process, time_s, left, quiet, places, frame_s)
@@ -367,7 +357,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
             break
     if not places.size:
         return constant
-    added = _light_of_steps(values.size, places, sizes)
+    added = np.cumsum(np.bincount(places, sizes, values.size))
     costs = []
     for light, each, n_steps in ((values - added, process, places.size), (values, None, 0)):
         data = binned(light)
@@ -406,13 +396,6 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
                 lasting.add(place)
     places = np.array(sorted(sorted(lasting, key=lambda one: found[one], reverse=True)[:MOST_STEPS]), np.intp)
     return places, np.array([found[int(one)][1] for one in places])
-
-
-def _light_of_steps(n_frames: int, places: Places, sizes: Float) -> Float:
-    """Return the sum of steps in each frame."""
-    added = np.zeros(n_frames)
-    added[places] = sizes
-    return np.cumsum(added)
 
 
 def _fitted_steps(

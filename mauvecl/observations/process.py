@@ -131,12 +131,6 @@ class ProcessTerm:
         """True if the term is periodic."""
         return self.kind in ("rotation", "sharp rotation")
 
-    @property
-    def shortest_s(self) -> float:
-        """Shortest time in which the term changes by much of its standard deviation."""
-        turns = {"correlated": 0.5 / np.pi, "smooth": 1, "rotation": 2, "sharp rotation": HARMONICS}[self.kind]
-        return self.scale_s / (2 * np.pi * turns)
-
     def coefficients(self) -> tuple[list[tuple[float, float]], list[tuple[float, float, float, float]]]:
         """Return a and c of each exponential, and a, b, c and d of each underdamped oscillator, as celerite names them.
 
@@ -204,8 +198,9 @@ class Process:
 
     @property
     def shortest_s(self) -> float:
-        """Shortest time scale of the terms; infinite without terms."""
-        return min((term.shortest_s for term in self.terms), default=np.inf)
+        """Shortest time in which a term changes by much of its standard deviation; infinite without terms."""
+        turns = {"correlated": 0.5 / np.pi, "smooth": 1, "rotation": 2, "sharp rotation": HARMONICS}
+        return min((term.scale_s / (2 * np.pi * turns[term.kind]) for term in self.terms), default=np.inf)
 
     @property
     def n_parameters(self) -> int:
@@ -271,10 +266,7 @@ class Covariance:
 
     def _solved_lower(self, values: Float) -> Float:
         out = np.array(values.reshape(len(values), -1), np.float64, order="C")
-        rows = slice(self._d.size - len(values), None)
-        return np.asarray(
-            self._driver.solve_lower(self._time[rows], self._rates, self._u[rows], self._w[rows], out, out)
-        )
+        return np.asarray(self._driver.solve_lower(self._time, self._rates, self._u, self._w, out, out))
 
     def solve(self, values: Float) -> Float:
         """Return the inverse times values, shape (n,) or (n, k)."""
@@ -283,12 +275,8 @@ class Covariance:
         return np.asarray(solved).reshape(np.shape(values))
 
     def whitened(self, values: Float) -> Float:
-        """Return the innovations of values, which are independent and of unit variance, shape (n,) or (n, k).
-
-        Fewer values than times are the last ones; those before them are zero.
-        """
-        sd = np.sqrt(self._d[self._d.size - len(values) :])
-        return np.asarray(self._solved_lower(values) / sd[:, None]).reshape(np.shape(values))
+        """Return the innovations of values, which are independent and of unit variance, shape (n,) or (n, k)."""
+        return np.asarray(self._solved_lower(values) / np.sqrt(self._d)[:, None]).reshape(np.shape(values))
 
     def squared_norms(self, columns: Float, first: int, after: int) -> Float:
         """Return v^T C^-1 v of each column, shape (n_column,).

@@ -89,46 +89,14 @@ class Filter:
         return np.asarray(self.weights @ np.array([[one.unit] for one in self.norms]))
 
     @property
-    def unsolved(self) -> Bool:
-        """Onsets at which the norm of at least one sum is not solved, shape (n_onset,)."""
-        return np.asarray(np.any([one.unsolved for one in self.norms], axis=0))
-
-    @property
     def per_amplitude(self) -> Float:
         """Mean of rho for a flare with unit peak along each direction, shape (n_direction, n_onset).
 
         It is zero where the template is not searched, and where its norm is not solved.
         """
         norm = self.weights @ np.maximum(np.array([one.norm for one in self.norms]) - self.lost, 0.0)
-        tried = (norm >= LEAST_SHARE * self.without_gaps) & ~self.unsolved
+        tried = (norm >= LEAST_SHARE * self.without_gaps) & ~np.any([one.unsolved for one in self.norms], axis=0)
         return np.sqrt(np.where(tried, norm, 0.0))
-
-
-@dataclass(frozen=True, eq=False)
-class FrameGrid:
-    """Numbers of frames with shortened gaps: no template reaches over a long gap, whose frames only take memory."""
-
-    middle: NDArray[np.int64]  # shape (n_gap,); middle of each shortened gap on the grid
-    lacking: NDArray[np.int64]  # shape (n_gap + 1,); frames that all gaps before each part of the grid lack
-
-    @classmethod
-    def of(cls, numbers: NDArray[np.int64], bank: Bank) -> FrameGrid:
-        """Shorten the gaps between frames that are longer than two templates."""
-        longest = 2 * max(abs(one.first) + one.shapes.shape[1] for one in bank.templates)
-        steps = np.diff(numbers)
-        long = np.flatnonzero(steps > longest)
-        lacking = np.concatenate([[0], np.cumsum(steps[long] - longest)])
-        return cls(numbers[long] + longest // 2 - lacking[:-1], lacking)
-
-    def shortened(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers of frames on the grid."""
-        part = np.searchsorted(self.middle + self.lacking[:-1], numbers, side="right")
-        return np.asarray(numbers - self.lacking[part])
-
-    def numbers(self, shortened: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers of places on the grid; a gap belongs to the frames next to each of its halves."""
-        part = np.searchsorted(self.middle, shortened, side="right")
-        return np.asarray(shortened + self.lacking[part])
 
 
 class ProcessSearch:
@@ -143,8 +111,20 @@ class ProcessSearch:
         before: ProcessSearch | None = None,
     ) -> None:  # fmt: skip
         self.bank, self.stare, self.processes, self.variance = bank, stare, processes, variance
-        self.grid: FrameGrid = FrameGrid.of(stare.numbers, bank) if before is None else before.grid
-        self.frames = self.grid.shortened(stare.numbers)
+        numbers = stare.numbers
+        if before is None:
+            # Gaps are no longer than two templates, since none reaches over them and their frames only take memory.
+            longest = 2 * max(abs(one.first) + one.shapes.shape[1] for one in bank.templates)
+            steps = np.diff(numbers)
+            long = np.flatnonzero(steps > longest)
+            lacking = np.concatenate([[0], np.cumsum(steps[long] - longest)])
+            # Middles of shortened gaps, shape (n_gap,), and frames that all gaps before each part of the grid lack.
+            gaps = numbers[long] + longest // 2 - lacking[:-1], lacking
+        else:
+            gaps = before._gaps
+        self._gaps: tuple[NDArray[np.int64], NDArray[np.int64]] = gaps
+        middle, lacking = gaps
+        self.frames = numbers - lacking[np.searchsorted(middle + lacking[:-1], numbers, side="right")]
         self.at = self.frames - self.frames[0]
         self.n_grid = int(self.at[-1]) + 1
         self._before = before
@@ -168,7 +148,8 @@ class ProcessSearch:
         templates = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
         earlier = self._before.filters if self._before is not None else [None] * len(templates)
         pairs = list(zip(templates, earlier, strict=True))
-        filters = list(map_in_threads(lambda pair: self._filter(*pair[0], pair[1]), pairs, _threads(self.n_grid)))
+        threads = 1 if self.n_grid < FEW_VALUES else None
+        filters = list(map_in_threads(lambda pair: self._filter(*pair[0], pair[1]), pairs, threads))
         self._before = None
         return filters
 
@@ -176,7 +157,7 @@ class ProcessSearch:
     def rows(self) -> list[Filter]:
         """Templates of which all denominators are solved."""
         for one in self.filters:
-            self._solve(one, one.unsolved)
+            self._solve(one, np.ones(one.peaks.size, np.bool_))
         return self.filters
 
     def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[Filter, Float]]:
@@ -200,14 +181,14 @@ class ProcessSearch:
             if above is not None:
                 # A template of which a smaller share lies in frames is not searched.
                 least = np.sqrt(LEAST_SHARE * one.without_gaps)
-                self._solve(one, one.unsolved & (rho[0] > above * least).any(axis=0))
+                self._solve(one, (rho[0] > above * least).any(axis=0))
             per_amplitude = one.per_amplitude
             tried = per_amplitude > 0
             np.divide(rho, per_amplitude, out=rho, where=tried)
             rho[:, ~tried] = -np.inf
             return one, rho
 
-        yield from map_in_threads(searched, filters, _threads(scores.size))
+        yield from map_in_threads(searched, filters, 1 if scores.size < FEW_VALUES else None)
 
     def largest(self, sums: NDArray[Any]) -> Float:
         """Return the largest value of each light curve, shape (n_stare,)."""
@@ -215,8 +196,10 @@ class ProcessSearch:
 
     def peaks_s(self, row: Filter) -> Float:
         """Return the times of the peaks of a row's templates, from the start of the stare, shape (n_onset,)."""
-        frames = self.grid.numbers(self.frames[0] + row.peaks) + row.template.phases[row.phase]
-        return np.asarray(frames * self.bank.frame_s)
+        (middle, lacking), places = self._gaps, self.frames[0] + row.peaks
+        # A gap belongs to the frames next to each of its halves.
+        numbers = places + lacking[np.searchsorted(middle, places, side="right")]
+        return np.asarray((numbers + row.template.phases[row.phase]) * self.bank.frame_s)
 
     def _filter(self, template: Template, phase: int, earlier: Filter | None) -> Filter:
         """Prepare the templates of a half-width and phase, from those of the search `before`, if there is one."""
@@ -308,11 +291,6 @@ class ProcessSearch:
                     columns = padded[np.clip(place, 0, one.shape.size + 1, out=place)]
                     norms.norm[left[:stop]] = self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
                 left, starts = left[stop:], starts[stop:]
-
-
-def _threads(n_values: int) -> int | None:
-    """Return the number of threads for templates in some values: one for few, or None for the default."""
-    return 1 if n_values < FEW_VALUES else None
 
 
 class Correlations:

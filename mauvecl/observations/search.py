@@ -228,22 +228,25 @@ def simulated_rates(
     length = max(block_length(column) for column in residual.T)
     covariances = part.search.covariances
     counts = np.maximum(survey.levels(quiet)[:n, 0] * survey.scale * survey.counts, 0.0) if survey.counts else None
-    largest: tuple[list[Float], list[Float]] = ([], [])
+
+    def coloured(white: Float) -> Float:
+        return np.stack([one.coloured(white[:, :, k].T).T for k, one in enumerate(covariances)], axis=2)
+
+    modelled, measured = list[Float](), list[Float]()
     batch = max(1, BATCH // (n * n_sum))
     for first in steps.each(range(0, count, batch), -(-count // batch)):
         size = min(batch, count - first)
         starts = rng.integers(0, len(residual), (size, -(-n // length)))
         rows = (starts[:, :, None] + np.arange(length)) % len(residual)
-        for white, found in zip(
-            (rng.standard_normal((size, n, n_sum)), residual[rows.reshape(size, -1)[:, :n]]), largest, strict=True
-        ):
-            if counts is not None and found is largest[0]:
-                drawn = rng.poisson(counts, (size, n))[:, :, None] / survey.counts / survey.scale
-            else:
-                drawn = np.stack([one.coloured(white[:, :, k].T).T for k, one in enumerate(covariances)], axis=2)
-            found.append(part.search.largest(drawn))
-    modelled, measured = (np.sort(np.concatenate(values)) for values in largest)
-    return SimulatedRate(modelled, days, bool(survey.counts)), SimulatedRate(measured, days, True)
+        drawn = rng.standard_normal((size, n, n_sum))
+        if counts is None:
+            drawn = coloured(drawn)
+        else:
+            drawn = rng.poisson(counts, (size, n))[:, :, None] / survey.counts / survey.scale
+        modelled.append(part.search.largest(drawn))
+        measured.append(part.search.largest(coloured(residual[rows.reshape(size, -1)[:, :n]])))
+    of_model, of_residuals = (np.sort(np.concatenate(values)) for values in (modelled, measured))
+    return SimulatedRate(of_model, days, bool(survey.counts)), SimulatedRate(of_residuals, days, True)
 
 
 def largest_dip(survey: SeriesSurvey, quiet: Bool, least: float) -> float:

@@ -14,20 +14,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
-from scipy.sparse import csr_array
 
 from mauvecl.host.exposure.expectation import continued_to_reach, expect
 from mauvecl.host.exposure.response import Order, response_matrix
 from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.stars.source import Source
 from mauvecl.observations.detector import CalibrationFrames, DarkFit, PhotonTransfer
 from mauvecl.schema.errors import InputError
 
@@ -102,31 +99,32 @@ class ThroughputFit:
         return nm, np.divide(np.nansum(part, axis=2), np.sqrt(count), out=np.full(count.shape, np.nan), where=count > 0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pixels:
-    """Factors of single pixels on the throughput that the spline leaves."""
-
-    log_factor: Float  # shape (n_pixel,), like its variance; 0 if the spline follows the throughput
-    variance: Float
-    structure: float  # relative standard deviation of the factors
-    disagree: bool  # true if the stars differ from each other
-    chi2: float  # of the fit with these factors
-    dof: float
-
-
-@dataclass(frozen=True, eq=False)
 class _Linearised:
-    """Observed counts as a linear function of the parameters, independent and of variance one."""
+    """Observed counts as a linear function of the parameters, and the parameters that fit them best.
 
-    values: Float  # shape (n,)
-    design: Float  # shape (n, n_parameter); the spline's coefficients first
-    prior: Float  # shape (n_parameter,); standard deviations; infinite for free parameters
-    penalty: Float  # shape (n_coefficient, n_coefficient)
+    Values and the rows of the design are independent and of variance one. The spline's coefficients are the first
+    parameters; `prior` has the standard deviation of each, infinite for free ones.
+    """
+
+    def __init__(self, values: Float, design: Float, prior: Float, penalty: Float) -> None:
+        self.values, self.design, self.prior, self.penalty = values, design, prior, penalty
+        self.normal, self.projected = design.T @ design, design.T @ values
+        n = len(penalty)
+        middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(penalty))
+        # That of the largest restricted likelihood.
+        self.smoothing = _best(self.likelihood, tuple(middle + np.array(LOG_SMOOTHING)))
+        self.covariance: Float = np.asarray(np.linalg.inv(self._information(self.smoothing, prior)))
+        self.found: Float = self.covariance @ self.projected
+
+    def _information(self, smoothing: float, prior: Float) -> Float:
+        full, n = np.diag(prior**-2.0), len(self.penalty)
+        full[:n, :n] += smoothing * self.penalty
+        return self.normal + full
 
     def likelihood(self, smoothing: float, prior: Float | None = None) -> float:
         """Return minus twice the logarithm of the restricted likelihood, up to a constant."""
         prior = self.prior if prior is None else prior
-        full = self.normal + self._full(smoothing, prior)
+        full = self._information(smoothing, prior)
         found = np.linalg.solve(full, self.projected)
         rank = len(self.penalty) - 2
         known = np.isfinite(prior)
@@ -134,39 +132,6 @@ class _Linearised:
             self.values @ self.values - self.projected @ found - rank * np.log(smoothing)
             + 2 * np.log(prior[known]).sum() + np.linalg.slogdet(full)[1]
         )  # fmt: skip
-
-    @cached_property
-    def smoothing(self) -> float:
-        """Smoothing of the largest restricted likelihood."""
-        n = len(self.penalty)
-        middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(self.penalty))
-        return _best(self.likelihood, tuple(middle + np.array(LOG_SMOOTHING)))
-
-    @cached_property
-    def covariance(self) -> Float:
-        """Covariance of the parameters."""
-        return np.asarray(np.linalg.inv(self.normal + self._full(self.smoothing, self.prior)))
-
-    @cached_property
-    def found(self) -> Float:
-        """Parameters."""
-        return np.asarray(self.covariance @ self.projected)
-
-    @cached_property
-    def normal(self) -> Float:
-        """Information of the values, shape (n_parameter, n_parameter)."""
-        return np.asarray(self.design.T @ self.design)
-
-    @cached_property
-    def projected(self) -> Float:
-        """Values times the design, shape (n_parameter,)."""
-        return np.asarray(self.design.T @ self.values)
-
-    def _full(self, smoothing: float, prior: Float) -> Float:
-        full = np.diag(prior**-2.0)
-        n = len(self.penalty)
-        full[:n, :n] += smoothing * self.penalty
-        return full
 
     def scaled(self, basis: Float) -> Float:
         """Return the covariance with a smoothing bias as large as that of the fitted curve, on average over pixels."""
@@ -186,8 +151,13 @@ class _Linearised:
         scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
         return np.asarray(noise + max(scale, 0.0) * pull @ covariance)
 
-    def pixels(self, model: ThroughputModel) -> _Pixels:
-        """Divide the residuals into those that all stars share, and those by which they differ."""
+    def pixels(self, model: ThroughputModel) -> tuple[bool, float, float, float, Float, Float]:
+        """Divide the residuals into those that all stars share, and those by which they differ.
+
+        Returned are whether the stars differ from each other, chi-squared and degrees of freedom of the fit with a
+        factor for each pixel, the relative standard deviation of these factors, zero if the spline follows the
+        throughput, their logarithms, shape (n_pixel,), and the variances of these.
+        """
         n_star, n_pixel = model.observed_dn.shape
         design = self.design
         every = self.values - design @ self.found
@@ -201,15 +171,14 @@ class _Linearised:
         dof = float(np.any(design != 0, axis=1).sum() - np.sum(self.covariance * self.normal))
         of_shared = float(np.sum(shared**2 * information))
         dof_shared = dof - model.usable.sum() + used.sum()
-        disagree = n_star > 1 and scipy.stats.chi2.sf(chi2 - of_shared, dof - dof_shared) < REJECTED
+        disagree = n_star > 1 and bool(scipy.stats.chi2.sf(chi2 - of_shared, dof - dof_shared) < REJECTED)
         if model.order != "paper" or scipy.stats.chi2.sf(of_shared, dof_shared) >= REJECTED:
-            nothing = np.zeros(n_pixel)
-            return _Pixels(nothing, nothing, 0.0, disagree, chi2, dof)
+            return disagree, chi2, dof, 0.0, np.zeros(n_pixel), np.zeros(n_pixel)
         variance = (of_shared - dof_shared) / float(np.sum(information))
         kept = variance * information / (1 + variance * information)
         chi2 -= float(np.sum(shared**2 * information * kept * (2 - kept)))
-        return _Pixels(np.log1p(kept * shared), variance * (1 - kept), float(np.sqrt(variance)), disagree, chi2,
-                       dof - float(kept.sum()))  # fmt: skip
+        factors = np.log1p(kept * shared), variance * (1 - kept)
+        return disagree, chi2, dof - float(kept.sum()), float(np.sqrt(variance)), *factors
 
 
 def _best(likelihood: Callable[[float], float], log_range: tuple[float, float]) -> float:
@@ -218,72 +187,54 @@ def _best(likelihood: Callable[[float], float], log_range: tuple[float, float]) 
     return float(np.exp(found.x))
 
 
-@dataclass(frozen=True, eq=False)
 class ThroughputModel:
-    """Mean light of standard stars for a throughput, wavelength scale and line width."""
+    """Mean light of standard stars for a throughput, wavelength scale and line width.
 
-    stars: tuple[CalibrationFrames, ...]
-    nominal: Instrument
-    dark: DarkFit
-    transfer: PhotonTransfer
-    sky: Sky
-    order: Order
-    basis: Float  # shape (n_pixel, n_coefficient); B-spline at the pixels
-    penalty: Float  # matrix of its squared second derivative
-    light_error: float  # relative standard deviation of the light of an observation
+    The spline of the throughput has `knots` intervals. `light_error` is the relative standard deviation of the light of
+    an observation, by pointing.
+    """
 
-    @cached_property
-    def x(self) -> Float:
-        """Wavelengths of the pixels from -1 to 1."""
-        nm = self.nominal.wavelength_nm
-        return np.asarray(2 * (nm - nm[0]) / np.ptp(nm) - 1)
-
-    @property
-    def n_shape(self) -> int:
-        """Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star."""
-        return 0 if self.n_stars < 2 else 4 if self.nominal.gaussian_fwhm_nm > 0 else 2
-
-    @property
-    def n_stars(self) -> int:
-        """Number of stars with different spectra; stars that differ in brightness alone count once."""
-        flux = [one.star.flux_flam / one.star.flux_flam.max() for one in self.stars if one.star is not None]
-        return sum(
+    def __init__(
+        self, stars: Sequence[CalibrationFrames], nominal: Instrument, dark: DarkFit, transfer: PhotonTransfer,
+        *, knots: int, sky: Sky, order: Order, light_error: float,
+    ) -> None:  # fmt: skip
+        nm, fwhm, frame_s = nominal.wavelength_nm, nominal.gaussian_fwhm_nm, nominal.frame_s
+        self.stars, self.nominal, self.dark, self.transfer = stars, nominal, dark, transfer
+        self.order, self.light_error = order, light_error
+        # B-spline at the pixels, shape (n_pixel, n_coefficient), and the matrix of its squared second derivative.
+        self.basis, self.penalty = _basis(nm, knots)
+        # Wavelengths of the pixels from -1 to 1.
+        self.x = 2 * (nm - nm[0]) / np.ptp(nm) - 1
+        # Mean light of a frame, and pixels that stay below saturation, shape (n_star, n_pixel).
+        self.observed_dn = np.array([one.raw_dn.mean(axis=0) - dark.mean_dn(one) for one in stars])
+        self.usable = np.array([one.usable(nominal) for one in stars])
+        # Seconds of dark current and their change with its slope, shape (n_star, 2).
+        self.dark_terms = np.array([dark.terms(one) for one in stars])
+        # Covariance between stars of each pixel's subtracted dark, shape (n_pixel, n_star, n_star).
+        jacobian = np.column_stack([np.ones(len(stars)), self.dark_terms[:, 0]])
+        self.dark_covariance = jacobian @ dark.covariance @ jacobian.T
+        spectra = [one.star for one in stars if one.star is not None]
+        # Zodiacal light of a second in each pixel, shape (n_pixel,).
+        quiet = expect(spectra[0], nominal, exposure=frame_s, sky=sky, order=order)
+        self.sky_electrons = quiet.sky_electrons / frame_s
+        # Each star with the electrons per second for its flux, through line functions of `WIDTHS` on the nominal.
+        lines = [nominal.with_(gaussian_fwhm_nm=fwhm * width) for width in WIDTHS[: 3 if fwhm else 1]]
+        reached = [continued_to_reach(star, lines[-1]) for star in spectra]
+        self.responses = [(s, [response_matrix(line, s.wavelength_nm, order) for line in lines]) for s in reached]
+        # Stars that differ in brightness alone count once.
+        flux = [star.flux_flam / star.flux_flam.max() for star in spectra]
+        self.n_stars = sum(
             all(one.shape != other.shape or not np.allclose(one, other) for other in flux[:k])
             for k, one in enumerate(flux)
         )
-
-    @cached_property
-    def observed_dn(self) -> Float:
-        """Mean light of a frame, shape (n_star, n_pixel)."""
-        return np.array([one.raw_dn.mean(axis=0) - self.dark.mean_dn(one) for one in self.stars])
-
-    @cached_property
-    def usable(self) -> NDArray[np.bool_]:
-        """Pixels that stay below saturation, shape (n_star, n_pixel)."""
-        return np.array([one.usable(self.nominal) for one in self.stars])
-
-    @cached_property
-    def dark_terms(self) -> Float:
-        """Seconds of dark current and their change with its slope, shape (n_star, 2)."""
-        return np.array([self.dark.terms(one) for one in self.stars])
-
-    @cached_property
-    def sky_electrons(self) -> Float:
-        """Zodiacal light of a second in each pixel, shape (n_pixel,)."""
-        star, frame_s = self.stars[0].star, self.nominal.frame_s
-        assert star is not None
-        return expect(star, self.nominal, exposure=frame_s, sky=self.sky, order=self.order).sky_electrons / frame_s
-
-    @cached_property
-    def responses(self) -> list[tuple[Source, list[csr_array]]]:
-        """Each star with the electrons per second for its flux, through line functions of `WIDTHS` on the nominal."""
-        fwhm, found = self.nominal.gaussian_fwhm_nm, []
-        lines = [self.nominal.with_(gaussian_fwhm_nm=fwhm * width) for width in WIDTHS[: 3 if fwhm else 1]]
-        for one in self.stars:
-            assert one.star is not None
-            star = continued_to_reach(one.star, lines[-1])
-            found.append((star, [response_matrix(line, star.wavelength_nm, self.order) for line in lines]))
-        return found
+        # Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star.
+        self.n_shape = 0 if self.n_stars < 2 else 4 if fwhm > 0 else 2
+        # Derivatives of the light with respect to these, for the nominal instrument, shape (n_star, n_pixel).
+        self.slopes_dn = list[Float]()
+        for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
+            moved = step * np.eye(self.n_shape)[place]
+            more, less = (self.light_dn(np.zeros(nm.size), sign * moved) for sign in (1, -1))
+            self.slopes_dn += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
 
     def light_dn(self, log_factor: Float, shape: Float) -> Float:
         """Return the mean light of a frame of each star, DN, shape (n_star, n_pixel).
@@ -313,22 +264,6 @@ class ThroughputModel:
         frames = np.array([one.n_frames for one in self.stars])
         dark = self.dark_terms[:, :1] * self.dark.level_dn_per_s
         return np.asarray(self.transfer.noise.variance(light_dn, dark) / frames[:, None])
-
-    @cached_property
-    def dark_covariance(self) -> Float:
-        """Covariance between stars of each pixel's subtracted dark, shape (n_pixel, n_star, n_star)."""
-        jacobian = np.column_stack([np.ones(len(self.stars)), self.dark_terms[:, 0]])
-        return np.asarray(jacobian @ self.dark.covariance @ jacobian.T)
-
-    @cached_property
-    def slopes_dn(self) -> list[Float]:
-        """Derivatives of the light with respect to the shape, for the nominal instrument, shape (n_star, n_pixel)."""
-        slopes = []
-        for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
-            moved = step * np.eye(self.n_shape)[place]
-            more, less = (self.light_dn(np.zeros(self.x.size), sign * moved) for sign in (1, -1))
-            slopes += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
-        return slopes
 
     def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
         """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""
@@ -365,66 +300,46 @@ class ThroughputModel:
         return _Linearised(observed + design[:, : around.size] @ around, design, np.array(prior), self.penalty)
 
 
-def fit_throughput(
-    stars: Sequence[CalibrationFrames],
-    nominal: Instrument,
-    dark: DarkFit,
-    transfer: PhotonTransfer,
-    *,
-    knots: int,
-    sky: Sky,
-    order: Order,
-    light_error: float = 0.0,
-    spectrum_error: float | None = None,
-) -> ThroughputFit:
+def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) -> ThroughputFit:
     """Fit the throughput to the mean frames of standard stars.
 
-    With two or more stars, wavelengths and the width of the line function are fitted as well. The spline has `knots`
-    intervals. `light_error` is the relative error of the light of an observation, by pointing, and `spectrum_error`
-    that of the stars' spectra at `ERROR_KNOTS` knots; by default assumed for one star, and fitted if several disagree.
+    With two or more stars, wavelengths and the width of the line function are fitted as well. `spectrum_error` is the
+    relative error of the stars' spectra at `ERROR_KNOTS` knots; by default assumed for one star, and fitted if several
+    disagree.
     """
-    nm = nominal.wavelength_nm
-    model = ThroughputModel(tuple(stars), nominal, dark, transfer, sky, order, *_basis(nm, knots), light_error)
-    several = model.n_stars > 1
+    nm, fwhm, several = model.nominal.wavelength_nm, model.nominal.gaussian_fwhm_nm, model.n_stars > 1
     error = spectrum_error if spectrum_error is not None else 0.0
     best = _iterated(model, error)
     m, n = model.n_shape, model.basis.shape[1]
-    if several and spectrum_error is None and best.pixels(model).disagree:
+    if several and spectrum_error is None and best.pixels(model)[0]:
         trial = _iterated(model, ONE_STAR_ERROR)
         of_spectra = trial.prior == ONE_STAR_ERROR
         error = _best(lambda sd: trial.likelihood(trial.smoothing, np.where(of_spectra, sd, trial.prior)), LOG_ERROR)
         best = _iterated(model, error)
-    pixels, shape = best.pixels(model), best.found[n : n + m]
+    shape = best.found[n : n + m]
     if (np.abs(shape) > LIMITS[:m]).any():
         fault = "the stars' spectra must match a wavelength scale and line width near the nominal ones, but do not"
         most = f"use standards with shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %"
         raise InputError(f"{fault}; {most}", key="observations")
     # One star cannot tell errors of its spectrum from the throughput.
     apart = 0.0 if several or spectrum_error is not None else ONE_STAR_ERROR
-    joint = _joint_covariance(model, best, pixels, apart)
-    log_factor = model.basis @ best.found[:n] + pixels.log_factor
+    _, chi2, dof, structure, log_pixel, variance = best.pixels(model)
+    onto, errors = scipy.linalg.block_diag(model.basis, np.eye(m)), apart * _linear_basis(nm)
+    joint = np.asarray(onto @ best.scaled(model.basis)[: n + m, : n + m] @ onto.T)
+    joint[: nm.size, : nm.size] += np.diag(variance) + errors @ errors.T + model.transfer.relative_gain_error**2
+    log_factor = model.basis @ best.found[:n] + log_pixel
     light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
-    scales, errors = (1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm), np.sqrt(np.diag(joint))[nm.size :]
+    sd = np.sqrt(np.diag(joint))[nm.size :]
     shift, stretch, width, change = (
-        Value(scale * float(shape[k] + (k == 2)), scale * float(errors[k])) if k < m else None
-        for k, scale in enumerate(scales)
+        Value(scale * float(shape[k] + (k == 2)), scale * float(sd[k])) if k < m else None
+        for k, scale in enumerate((1.0, 1.0, fwhm, fwhm))
     )
-    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
-                         best.smoothing, apart or error, pixels.structure, tuple(assumed))  # fmt: skip
-
-
-def _joint_covariance(model: ThroughputModel, best: _Linearised, pixels: _Pixels, spectrum_error: float) -> Float:
-    """Return the covariance of log throughput and shape, with the errors of the gain and, apart, of spectra."""
-    n, nm = model.basis.shape[1] + model.n_shape, model.nominal.wavelength_nm
-    onto = scipy.linalg.block_diag(model.basis, np.eye(model.n_shape))
-    joint = np.asarray(onto @ best.scaled(model.basis)[:n, :n] @ onto.T)
-    errors = spectrum_error * _linear_basis(nm)
-    joint[: nm.size, : nm.size] += np.diag(pixels.variance) + errors @ errors.T + model.transfer.relative_gain_error**2
-    return joint
+    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, chi2, dof,
+                         best.smoothing, apart or error, structure, tuple(assumed))  # fmt: skip
 
 
 def _iterated(model: ThroughputModel, error: float) -> _Linearised:
