@@ -19,7 +19,7 @@ from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import map_in_threads
-from mauvecl.runs.checkpoint import Checkpoint, Task, fingerprint, shards
+from mauvecl.runs.checkpoint import Checkpoint, ShardLost, Stopped, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Realisations
@@ -43,21 +43,6 @@ PREPARED = 1
 Sums = TypeVar("Sums", DetectionSums, SnrSums, "StareSums")
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-
-
-class Stopped(Exception):  # noqa: N818
-    """Raised between two tiles of a shard whose result is no longer needed."""
-
-
-class ShardLost(Exception):  # noqa: N818
-    """Raised by workers that could not count a shard, which the pool then submits again.
-
-    If `failed` is true it counts as a failure of the shard, of which there may be `MAX_FAILURES`.
-    """
-
-    def __init__(self, reason: object, *, failed: bool = True) -> None:
-        super().__init__(str(reason))
-        self.failed = failed
 
 
 @validated

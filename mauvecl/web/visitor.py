@@ -28,7 +28,8 @@ from mauvecl.device.drivers import DeviceError
 from mauvecl.device.engine import Engine
 from mauvecl.host import VERSION
 from mauvecl.observations.frame_files import ColumnNames
-from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
+from mauvecl.runs.checkpoint import Stopped
+from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError, reworded, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
