@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from mauvecl.answers.answer import Answer
     from mauvecl.device.build import Device
     from mauvecl.runs.checkpoint import Checkpoint
-    from mauvecl.runs.pool import Pool, Workers
+    from mauvecl.runs.cluster import DaskWorkers
+    from mauvecl.runs.pool import LocalWorkers, Pool
     from mauvecl.runs.store import Store
     from mauvecl.study.study import Study
 
@@ -278,14 +279,14 @@ class Session(Options):
 
 
 @contextmanager
-def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
+def working(device: str | None, cluster: str | None) -> Iterator[LocalWorkers | DaskWorkers]:
     """Open the requested workers; release them at the end, immediately if the work ended early."""
     from mauvecl.runs.pool import LocalWorkers
 
     if cluster is not None:
         from mauvecl.runs.cluster import DaskWorkers
 
-        workers: Workers = DaskWorkers(cluster, device)
+        workers: LocalWorkers | DaskWorkers = DaskWorkers(cluster, device)
     else:
         workers = LocalWorkers([None] if device is None else [word.strip() for word in device.split(",")])
     try:

@@ -115,6 +115,21 @@ class Task:
         return f"{self.key}-{self.shard.name}"
 
 
+class Stopped(Exception):  # noqa: N818
+    """Raised between two tiles of a shard whose result is no longer needed."""
+
+
+class ShardLost(Exception):  # noqa: N818
+    """Raised by workers that could not count a shard, which the pool then submits again.
+
+    If `failed` is true it counts as a failure of the shard, of which there may be `MAX_FAILURES`.
+    """
+
+    def __init__(self, reason: object, *, failed: bool = True) -> None:
+        super().__init__(str(reason))
+        self.failed = failed
+
+
 #: Packages whose code affects the counts of a shard.
 DRAWING_PACKAGES = ("detection", "device", "fits", "flares", "kernels", "noise", "search")
 

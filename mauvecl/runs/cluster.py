@@ -24,8 +24,7 @@ from mauvecl.device.build import DeviceRecord
 from mauvecl.device.drivers import THREADS, DeviceError
 from mauvecl.host import VERSION
 from mauvecl.host.tables.files import is_file, parsing, read_text
-from mauvecl.runs.checkpoint import Task, code_identity
-from mauvecl.runs.pool import ShardLost, Stopped
+from mauvecl.runs.checkpoint import ShardLost, Stopped, Task, code_identity
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, missing_package, shortened
 

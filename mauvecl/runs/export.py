@@ -133,7 +133,14 @@ def _fits(selection: Selection) -> HDUList:
     parts: list[ImageHDU | BinTableHDU] = []
     for group in dict.fromkeys(scene.group for scene in selection.scenes):
         here = [scene for scene in selection.scenes if scene.group == group]
-        table = _calibration(here[0])
+        x, n = here[0].expectation, here[0].expectation.wavelength_nm.size
+        # The -TAB axis requires all wavelengths in one cell, of shape (1, n_pixel): one row, whose columns are vectors.
+        columns = [fits.Column("COORDS", f"{n}D", unit="nm", dim=f"(1,{n})", array=x.wavelength_nm.reshape(1, n, 1))]
+        for key, unit in CALIBRATION.items():
+            unit = unit.replace("DN", "adu").replace(" ", "")
+            columns.append(fits.Column(key.upper(), f"{n}D", unit=unit, array=getattr(x, key).reshape(1, n)))
+        name = f"{group}-calibration".upper().replace("-", "_")
+        table = fits.BinTableHDU.from_columns(columns, name=name)
         parts += [*(_image(selection, scene, table.name) for scene in here), table]
     # Its lines may exceed the 72 characters of a card. FITS is restricted to ASCII; TOML strings accept escapes.
     text = re.sub(r"[^\x00-\x7f]", lambda letter: f"\\U{ord(letter[0]):08X}", store.study.toml())
@@ -173,21 +180,6 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     if scene.frames is not None:
         header["FRAMES"] = (",".join(map(str, scene.frames)), "numbers of the frames along axis 2")
     return hdu
-
-
-def _calibration(scene: StoredScene) -> BinTableHDU:
-    """Make the calibration table, with all wavelengths in one cell as the -TAB axis requires."""
-    from astropy.io import fits
-
-    x = scene.expectation
-    name = f"{scene.group}-calibration".upper().replace("-", "_")
-    # The coordinates are a cell of shape (1, n_pixel), so the table has one row and all columns are vectors.
-    n = x.wavelength_nm.size
-    columns = [fits.Column("COORDS", f"{n}D", unit="nm", dim=f"(1,{n})", array=x.wavelength_nm.reshape(1, n, 1))]
-    units = {"nm": "nm", "DN": "adu", "DN / electron": "adu/electron"}
-    for key, unit in CALIBRATION.items():
-        columns.append(fits.Column(key.upper(), f"{n}D", unit=units[unit], array=getattr(x, key).reshape(1, n)))
-    return fits.BinTableHDU.from_columns(columns, name=name)
 
 
 def _hdf5(selection: Selection, place: io.BytesIO) -> None:

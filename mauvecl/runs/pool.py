@@ -10,7 +10,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from numpy.typing import NDArray
 
@@ -19,9 +19,8 @@ from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import map_in_threads
-from mauvecl.runs.checkpoint import Checkpoint, Task, fingerprint, shards
+from mauvecl.runs.checkpoint import Checkpoint, ShardLost, Stopped, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Realisations
 
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
     from mauvecl.flares.stare_scene import StaresRequest, StareSums
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.runs.cluster import DaskWorkers
 
 #: Number of failures at a shard after which the run fails; a shrinking cluster may lose several workers at once.
 MAX_FAILURES = 8
@@ -43,45 +43,6 @@ PREPARED = 1
 Sums = TypeVar("Sums", DetectionSums, SnrSums, "StareSums")
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-
-
-class Stopped(Exception):  # noqa: N818
-    """Raised between two tiles of a shard whose result is no longer needed."""
-
-
-class ShardLost(Exception):  # noqa: N818
-    """Raised by workers that could not count a shard, which the pool then submits again.
-
-    If `failed` is true it counts as a failure of the shard, of which there may be `MAX_FAILURES`.
-    """
-
-    def __init__(self, reason: object, *, failed: bool = True) -> None:
-        super().__init__(str(reason))
-        self.failed = failed
-
-
-class Workers(Protocol):
-    """Interface of the workers that count shards."""
-
-    @property
-    def count(self) -> int:
-        """Number of concurrent workers."""
-
-    @property
-    def first(self) -> Engine | None:
-        """An engine of this process, for work that is not divided, or None."""
-
-    def describe(self) -> list[DeviceRecord]:
-        """Return the devices, for run records."""
-
-    def submit(self, task: Task) -> Future[Arrays]:
-        """Submit a shard for counting; its future raises `ShardLost` if another attempt may succeed."""
-
-    def stop(self) -> None:
-        """Stop work in progress as soon as possible."""
-
-    def close(self) -> None:
-        """Release all resources."""
 
 
 @validated
@@ -107,14 +68,13 @@ class LocalWorkers:
         self._threads = ThreadPoolExecutor(len(devices))
 
     def _made(self, place: int) -> Engine:
-        return self._make(self._devices[place], progress=partial(self._tick, place))
+        def progress(done: int, total: int) -> None:
+            if self._stopping:
+                raise Stopped
+            if (tick := self._ticks[place]) is not None:
+                tick(done)
 
-    def _tick(self, place: int, done: int, total: int) -> None:
-        if self._stopping:
-            raise Stopped
-        tick = self._ticks[place]
-        if tick is not None:
-            tick(done)
+        return self._make(self._devices[place], progress=progress)
 
     @property
     def count(self) -> int:
@@ -131,7 +91,7 @@ class LocalWorkers:
         return [engine.device for engine in self._engines]
 
     def submit(self, task: Task) -> Future[Arrays]:
-        """Count a shard as soon as a device is free."""
+        """Count a shard as soon as a device is free; the future raises `ShardLost` if another attempt may succeed."""
         return self._threads.submit(self._count, task)
 
     def _count(self, task: Task) -> Arrays:
@@ -181,7 +141,7 @@ class Pool:
 
     Parameters
     ----------
-    workers : Workers, optional
+    workers : LocalWorkers or DaskWorkers, optional
         The default is the default device of this machine.
     checkpoint : Checkpoint, optional
         Checkpoint from which shards are read and to which they are written.
@@ -193,17 +153,14 @@ class Pool:
 
     def __init__(
         self,
-        workers: Workers | None = None,
+        workers: LocalWorkers | DaskWorkers | None = None,
         *,
         checkpoint: Checkpoint | None = None,
         progress: Progress | None = None,
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
-        if workers is not None and not hasattr(workers, "submit"):
-            raise InputError.of("workers", workers, "LocalWorkers or DaskWorkers")
         self.workers = LocalWorkers() if workers is None else workers
-        self._meanwhile = meanwhile
-        self.checkpoint, self._progress = checkpoint, progress
+        self.checkpoint, self._progress, self._meanwhile = checkpoint, progress, meanwhile
         self._lock = threading.RLock()
         self._done = self._total = self._shards = self._of = self._resumed = self._expected = self._retries = 0
         self._partly: dict[str, int] = {}

@@ -394,15 +394,6 @@ class Store:
                 if check == _check(name, written):
                     self.digests[f"{scene.path}/{name}"] = written
 
-    def note(self, chunk: Chunk, digest_text: str) -> None:
-        """Add a chunk's digest to its array's list; threads wait for each other."""
-        self.digests[chunk.key] = digest_text
-        place = self.path / chunk.scene.path / DIGESTS
-        what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
-        with self._listing, writing(what, NO_ROOM, key="store"), place.open("ab", buffering=0) as file:
-            # A single short write, which first ends a line that a full disk has cut short.
-            file.write(f"\n{_line(chunk.name, digest_text)}".encode())
-
     def sort_digests(self) -> None:
         """Write the lists of digests in the order of their chunks, which may have been written in another."""
         for scene in self.scenes:
@@ -421,10 +412,15 @@ class Store:
         return memoryview(whole.data).cast("B"), crc(whole)
 
     def write(self, chunk: Chunk, rows: NDArray[Any]) -> None:
-        """Write a chunk atomically, and then its digest."""
+        """Write a chunk atomically, and then its digest to its array's list, for which threads wait for each other."""
         data, check = self.encode(chunk, rows)
         write_whole(self.path / chunk.key, data, check)
-        self.note(chunk, digest(data, check))
+        written = self.digests[chunk.key] = digest(data, check)
+        place = self.path / chunk.scene.path / DIGESTS
+        what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
+        with self._listing, writing(what, NO_ROOM, key="store"), place.open("ab", buffering=0) as file:
+            # A single short write, which first ends a line that a full disk has cut short.
+            file.write(f"\n{_line(chunk.name, written)}".encode())
 
     def has(self, chunk: Chunk) -> bool:
         """Return whether a chunk was written, by digest list and file size; `bulk.state` checks its content."""

@@ -14,6 +14,7 @@ The photon noise of the flare is approximated as normal; its skewness is small a
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,7 +29,7 @@ from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
 
 if TYPE_CHECKING:
-    from mauvecl.search.flare_fits import FittedFlares, SingleFlareFit
+    from mauvecl.search.flare_fits import SingleFlareFit
     from mauvecl.search.search import Search, SearchedFrames, Survey
     from mauvecl.search.templates import Bank
 
@@ -47,19 +48,6 @@ class Refit:
     amplitudes: Float  # injected amplitudes, shape (n_half_width, n_amplitude)
     temperature_k: float  # temperature of the injected flares
     count: int  # number of stares per peak time with fits, the first ones
-
-    def compared(self, recovered: FittedFlares, amplitude: Float, site: InjectionSite) -> dict[str, NDArray[Any]]:
-        """Compare fits with the injected flares, by the names of `FIT_QUANTITIES`, shape (n_amplitude,) each."""
-        duration = amplitude * site.half_width_s * self.fit.bank.shape.equivalent_duration
-        off = np.abs(recovered.equivalent_duration_s - duration)
-        return {
-            "energy": recovered.equivalent_duration_s / duration,
-            "amplitude": recovered.amplitude / amplitude,
-            "half_width": recovered.half_width_s / site.half_width_s,
-            "temperature": recovered.temperature_k / self.temperature_k,
-            "peak": (recovered.peak_s - site.peak_s) / site.half_width_s,
-            "covered": off <= recovered.equivalent_duration_error_s,
-        }
 
 
 #: Columns of the accuracy of fits, for values by name.
@@ -84,23 +72,20 @@ def fit_accuracy(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, Float
     detections.
     """
     each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
-    count = np.isfinite(each["energy"]).sum(axis=2)
-    none = count == 0
-
-    def quantile(name: str, q: float) -> Float:
-        blank = ~np.isfinite(each[name]).any(axis=2)
-        filled = np.where(blank[:, :, None], 0.0, each[name])
-        return np.where(blank, np.nan, np.nanquantile(filled, q, axis=2))
-
-    peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
+    # NumPy warns of cells without detections.
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+        low, middle, high = (
+            {name: np.nanquantile(values, q, axis=2) for name, values in each.items()} for q in (0.16, 0.5, 0.84)
+        )
+        covered = np.nanmean(each["covered"], axis=2)
     return {
-        "fitted": count.astype(np.float64),
-        "energy_ratio_low": quantile("energy", 0.16),
-        "energy_ratio_high": quantile("energy", 0.84),
-        **{f"{name}_ratio": quantile(name, 0.5) for name in ("energy", "amplitude", "half_width", "temperature")},
-        "peak_offset": peak[1],
-        "peak_scatter": (peak[2] - peak[0]) / 2,
-        "energy_covered": np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
+        "fitted": np.isfinite(each["energy"]).sum(axis=2).astype(np.float64),
+        "energy_ratio_low": low["energy"],
+        "energy_ratio_high": high["energy"],
+        **{f"{name}_ratio": middle[name] for name in ("energy", "amplitude", "half_width", "temperature")},
+        "peak_offset": middle["peak"],
+        "peak_scatter": (high["peak"] - low["peak"]) / 2,
+        "energy_covered": covered,
     }
 
 
@@ -142,15 +127,16 @@ class InjectionSite:
 
 def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[InjectionSite, ...]:
     """Return the sites of flares of several half-widths that peak at one time."""
-    bank, reaches = survey.bank, [_Reach.of(survey.bank, width, peak_s) for width in widths_s]
-    if survey.stare.n_frames <= WHOLE:
-        search, first = survey.search, 0
-    else:
-        # Only the frames that templates cover are searched.
-        limits = min(reach.begin_s for reach in reaches), max(reach.end_s for reach in reaches)
+    bank, reaches = survey.bank, [_reach(survey.bank, width, peak_s) for width in widths_s]
+    search, first = survey.search, 0
+    if survey.stare.n_frames > WHOLE:
+        # Only the frames that templates cover are searched; those of the widest flare reach farthest.
+        widest, earliest, latest = reaches[int(np.argmax(widths_s))]
+        lead, tail = (frames * bank.frame_s for frames in bank.window(widest[-1]))
+        limits = earliest - lead, latest + tail + bank.frame_s
         first, last = np.searchsorted(survey.stare.start_s, limits).tolist()
-        tried = {width for reach in reaches for width in reach.half_widths_s}
-        search = survey.frames.part(slice(first, last)).search(replace(bank, half_widths_s=tuple(sorted(tried))))
+        tried = tuple(sorted({width for near, _, _ in reaches for width in near}))
+        search = survey.frames.part(slice(first, last)).search(replace(bank, half_widths_s=tried))
     stare = search.stare
     edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
@@ -174,52 +160,39 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
     return tuple(sites)
 
 
+def _reach(bank: Bank, width_s: float, peak_s: float) -> tuple[list[float], float, float]:
+    """Return the half-widths of the templates that are tried for a flare, and their earliest and latest peak."""
+    near = [w for w in bank.half_widths_s if width_s / WIDEST <= w <= width_s * WIDEST]
+    near = near or [min(bank.half_widths_s, key=lambda w: abs(np.log(w / width_s)))]
+    return near, peak_s - (BEFORE * near[-1] + width_s), peak_s + AFTER * max(width_s, near[-1])
+
+
 def _near_templates(
-    search: Search, reaches: Sequence[_Reach], means: Float, along: Float
+    search: Search, reaches: Sequence[tuple[list[float], float, float]], means: Float, along: Float
 ) -> list[tuple[NDArray[np.int64], Float, NDArray[np.bool_]]]:
     """Return the templates that may detect each flare.
 
     These are their rows in the search times `n_grid` plus their onsets, (n_template,), the times of their peaks, and
-    whether they count as a detection, (n_temperature, n_template). `means` are those of the flares, and `along` is
-    their light along the bank's directions.
+    whether they count as a detection, (n_temperature, n_template). `reaches` and
+    `means` are those of the flares, and `along` is their light along the bank's directions.
     """
     seen: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         peaks = search.peaks_s(row)
-        for templates, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
-            if row.template.half_width_s in reach.half_widths_s:
+        for templates, (near, earliest, latest), value in zip(seen, reaches, correlated[:, 0], strict=True):
+            if row.template.half_width_s in near:
                 values = along[:, None] * value
-                inside = (peaks >= reach.first_s) & (peaks <= reach.last_s) & (row.per_amplitude > 0)
+                inside = (peaks >= earliest) & (peaks <= latest) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside & (values.max(axis=0) > 0))
                 templates.append((number * search.n_grid + onsets, peaks[onsets], values[:, onsets]))
-    near = []
+    found = []
     for templates in seen:
         places, times, values = (np.concatenate(part, axis=-1) for part in zip(*templates, strict=True))
         counts = values >= OVERLAP * values.max(initial=0)
         used = counts.any(axis=0)
-        near.append((places[used], times[used], counts[:, used]))
-    return near
-
-
-@dataclass(frozen=True)
-class _Reach:
-    """Templates that are tried for a flare, and the frames that they cover."""
-
-    half_widths_s: tuple[float, ...]
-    first_s: float  # earliest and latest peak of a template
-    last_s: float
-    begin_s: float  # start and end of the frames
-    end_s: float
-
-    @classmethod
-    def of(cls, bank: Bank, width_s: float, peak_s: float) -> _Reach:
-        near = [w for w in bank.half_widths_s if width_s / WIDEST <= w <= width_s * WIDEST]
-        if not near:
-            near = [min(bank.half_widths_s, key=lambda w: abs(np.log(w / width_s)))]
-        first, last = peak_s - (BEFORE * near[-1] + width_s), peak_s + AFTER * max(width_s, near[-1])
-        lead, tail = (frames * bank.frame_s for frames in bank.window(near[-1]))
-        return cls(tuple(near), first, last, first - lead, last + tail + bank.frame_s)
+        found.append((places[used], times[used], counts[:, used]))
+    return found
 
 
 #: Number of stares per batch.
@@ -274,15 +247,11 @@ class Injections:
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
     @cached_property
-    def quiescent(self) -> Components:
-        """Components of the frames without flares."""
+    def quiescent(self) -> tuple[Components, Method]:
+        """Components of the frames without flares, and the method of drawing them."""
         components = self.survey.components
-        return Components(components.quiet, components.flare_electrons[:0], components.weights)
-
-    @cached_property
-    def method(self) -> Method:
-        """Method of drawing frames."""
-        return method_for(self.quiescent, self.survey.stare, self.processes)
+        quiescent = Components(components.quiet, components.flare_electrons[:0], components.weights)
+        return quiescent, method_for(quiescent, self.survey.stare, self.processes)
 
     def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
         """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
@@ -291,18 +260,23 @@ class Injections:
         # Without templates, one frame is drawn, since requests cannot be empty.
         reached = [site.frames for site in sites if len(site.filters)] or [slice(0, 1)]
         first = min(part.start for part in reached)
-        window = slice(first, max(part.stop for part in reached))
-        start = (1 + position) * NUMBERS
-        frames = survey.frames.part(window)
+        frames = survey.frames.part(slice(first, max(part.stop for part in reached)))
+        start, (quiescent, method) = (1 + position) * NUMBERS, self.quiescent
         single = replace(frames, known=frames.known.astype(np.float32))
         sites = tuple(replace(site, first=site.first - first) for site in sites)
         injecting = CriticalAmplitudes(
             sites, self.threshold, survey.bank.directions, survey.response, self.photons, single, start, refit
         )
         return StaresRequest(
-            self.quiescent, frames.stare, self.draws, self.seed, start=start, method=self.method,
+            quiescent, frames.stare, self.draws, self.seed, start=start, method=method,
             processes=self.processes, reduction=injecting, glow=True,
         )  # fmt: skip
+
+
+#: Random part of the frames of some stares: sums without a flare less their known mean, (n_sum, n_draw, n_frame);
+#: standard normals for the photon noise of the flare, likewise; and the relative change of all light,
+#: (n_draw, n_frame), or (1, n_frame) if there is none.
+FrameNoise = tuple[Float, Single, Single]
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,35 +306,32 @@ class CriticalAmplitudes:
             for column, site in zip(critical[part].T, self.sites, strict=True):
                 if len(site.filters):
                     column[:] = self._critical(site, self.values(site, drawn))
-        arrays_of_fits: dict[str, NDArray[Any]] = {"critical": critical}
-        if self.refit is not None:
-            # Stares are processed one at a time, so that fits do not depend on the batch.
-            these = range(min(len(values), max(0, self.start + self.refit.count - first)))
-            each = [self._fitted(self.frame_noise(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
-            none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
-            arrays_of_fits |= {
-                name: np.array([arrays[name] for arrays in each]) if each else none for name in FIT_QUANTITIES
-            }
-        return arrays_of_fits
+        if self.refit is None:
+            return {"critical": critical}
+        # Stares are processed one at a time, so that fits do not depend on the batch.
+        fitted = max(0, min(len(values), self.start + self.refit.count - first))
+        fits = {name: np.full((fitted, *self.refit.amplitudes.shape), np.nan, np.float32) for name in FIT_QUANTITIES}
+        for k in range(fitted):
+            estimates = {name: fit[k] for name, fit in fits.items()}
+            self._fit(self.frame_noise(values[k : k + 1], glow[k : k + 1]), self.refit, estimates)
+        return {"critical": critical, **fits}
 
     def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
         """Prepare the random part of some stares."""
         n_sum = values.shape[2]
         noise = np.moveaxis(self.frames.net(values), 2, 0)
         own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
-        return FrameNoise(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
+        return _multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else light[:1]
 
     def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
         """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
-        filters, here, mean = site.weights, site.frames, drawn.mean(site)
-        stare, width = self.frames.stare, site.half_width_s
+        (noise, normals, light), filters, here = drawn, site.weights, site.frames
+        mean, stare, width = site.mean * (1 + light[:, here]), self.frames.stare, site.half_width_s
         since = stare.start_s[here] - site.peak_s
-        shining = (since > -width - stare.frame_s) & (since < GLOW * width)
-        ends = np.flatnonzero(shining)[[0, -1]] if shining.any() else np.array([0, -1])
-        lit = slice(int(ends[0]), int(ends[1]) + 1)
-        own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
+        lit = slice(np.searchsorted(since, -width - stare.frame_s, "right"), np.searchsorted(since, GLOW * width))
+        own = normals[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
         return (
-            _combined(self.directions, drawn.noise[:, :, here] @ filters),
+            _combined(self.directions, noise[:, :, here] @ filters),
             _combined((self.directions @ self.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
             _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
         )
@@ -379,9 +350,9 @@ class CriticalAmplitudes:
         np.copyto(root, 0, where=(left <= 0) & site.counts[:, None])
         return np.asarray(root.min(axis=(0, 2)) ** 2)
 
-    def _fitted(self, drawn: FrameNoise, refit: Refit) -> dict[str, Single]:
-        """Fit the detected flares of one stare; arrays of shape (n_half_width, n_amplitude), NaN if not detected."""
-        estimates = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
+    def _fit(self, drawn: FrameNoise, refit: Refit, estimates: Mapping[str, Single]) -> None:
+        """Fit the detected flares of one stare, and set their estimates, shape (n_half_width, n_amplitude) each."""
+        noise, normals, light = (array[..., 0, :] for array in drawn)
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue
@@ -395,27 +366,22 @@ class CriticalAmplitudes:
             which = flat.argmax(axis=1)[alarm] % len(site.filters)
             # Frames with the flare less their known mean, (n_amplitude, n_frame, n_sum).
             here, shining = site.frames, np.sqrt(np.maximum(site.mean, 0))
-            own = np.einsum("kj,jt->tk", self.photons.astype(np.float32), drawn.own[:, 0, here] * shining)
-            rise = drawn.mean(site)[0][:, None] * self.response.astype(np.float32)
-            noise = drawn.noise[:, 0, here].T
-            sums = np.array([noise + x * rise + np.sqrt(x) * own for x in row[alarm].astype(np.float32)])
+            own = np.einsum("kj,jt->tk", self.photons.astype(np.float32), normals[:, here] * shining)
+            rise = (site.mean * (1 + light[here]))[:, None] * self.response.astype(np.float32)
+            sums = np.array([noise[:, here].T + x * rise + np.sqrt(x) * own for x in row[alarm].astype(np.float32)])
             recovered = refit.fit.run(sums, self.frames.part(here), site.peaks_s[which], site.widths_s[which])
-            for name, values in refit.compared(recovered, row[alarm], site).items():
+            duration = row[alarm] * site.half_width_s * refit.fit.bank.shape.equivalent_duration
+            off = np.abs(recovered.equivalent_duration_s - duration)
+            compared = {
+                "energy": recovered.equivalent_duration_s / duration,
+                "amplitude": recovered.amplitude / row[alarm],
+                "half_width": recovered.half_width_s / site.half_width_s,
+                "temperature": recovered.temperature_k / refit.temperature_k,
+                "peak": (recovered.peak_s - site.peak_s) / site.half_width_s,
+                "covered": off <= recovered.equivalent_duration_error_s,
+            }
+            for name, values in compared.items():
                 estimates[name][d, alarm] = values
-        return estimates
-
-
-@dataclass(frozen=True, eq=False)
-class FrameNoise:
-    """Random part of the frames of some stares."""
-
-    noise: Float  # sums without a flare less their known mean, shape (n_sum, n_draw, n_frame)
-    own: Single  # standard normals for the photon noise of the flare, shape (n_sum, n_draw, n_frame)
-    light: Single | None  # relative change of all light, shape (n_draw, n_frame)
-
-    def mean(self, site: InjectionSite) -> Single:
-        """Return the means of a flare in the frames of its site at unit amplitude, shape (n_draw or 1, n_frame)."""
-        return np.atleast_2d(site.mean if self.light is None else site.mean * (1 + self.light[:, site.frames]))
 
 
 def _multiple(values: Single, step: float) -> Single:

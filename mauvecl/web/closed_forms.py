@@ -292,51 +292,38 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
         try:
             assumed = closed.assuming(unknown)
             answer: DetectAnswer | None = answers.get("detection" if assumed is closed else OTHER)
-            if answer is None:
-                how = "in closed form"
-                if not (assumed.study.nuisances.usual or assumed.slow or assumed.chance != assumed.chance):
+            if answer is not None:
+                (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
+                value, drawn = float(row["probability"]), f"of {closed.question.realisations[0]:,} simulated"
+                how = f"{chance_range(row['low'], row['high'])}, {drawn}"
+            else:
+                value, how = assumed.chance, "in closed form"
+                if not (assumed.study.nuisances.usual or assumed.slow or value != value):
                     # Computed at once.
                     lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
                     ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), sky=True)]
                     how += f"; {chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower "
                     how += "or higher"
-                chance = Chance(unknown, assumed.chance, how)
-            else:
-                (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
-                drawn = f"of {closed.question.realisations[0]:,} simulated"
-                chance = Chance(unknown, float(row["probability"]), f"{chance_range(row['low'], row['high'])}, {drawn}")
         except InputError as error:
             if unknown == closed.question.unknown:
                 raise
-            chance = Chance(unknown, float("nan"), sentence(error))
-        all_chances.append(chance)
+            value, how = float("nan"), sentence(error)
+        all_chances.append(Chance(unknown, value, how))
     return all_chances
 
 
-class Wording(NamedTuple):
-    """Words for a limit."""
-
-    before: str  # text before its value
-    value: Callable[[float], str]
-    none: str  # for a limit that does not exist
-    slow: str  # for a limit whose closed form is slow
-
-
-#: Words for limits by their quantity.
-LIMITS = {
-    "amplitude": Wording("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude",
-                         "of an amplitude that takes a simulation"),
-    "magnitude": Wording("to {band} =", lambda value: f"{value:.2f}", "at no magnitude",
-                         "to a magnitude that takes a simulation"),
-    "exposure": Wording("in", lambda value: f"{short(value)} s", "in no exposure",
-                        "in an exposure that takes a simulation"),
-}  # fmt: skip
+#: Words for a limit by its quantity: before its value, the value, without a limit, and for one that takes a simulation.
+LIMITS: dict[str, tuple[str, Callable[[float], str], str, str]] = {
+    "amplitude": ("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude", "of an amplitude"),
+    "magnitude": ("to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude"),
+    "exposure": ("in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure"),
+}
 
 
 def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
     q, asked = closed.question, closed.study.limit
-    words = LIMITS[asked.of]
+    before, in_words, none, some = LIMITS[asked.of]
     clauses: dict[str, str] = {}
     near: float | None = None
     # The ideal limit is found at once, and the realistic one near it.
@@ -344,9 +331,10 @@ def solved(closed: ClosedForms) -> str:
         try:
             assumed = closed.assuming(unknown)
             near = None if assumed.slow else LimitSearch(assumed.case, assumed.question.statistic).root(near)
-            clauses[unknown] = words.slow if near is None else f"{words.before.format(band=q.band)} {words.value(near)}"
+            value = "" if near is None else f"{before.format(band=q.band)} {in_words(near)}"
+            clauses[unknown] = value or f"{some} that takes a simulation"
         except InputError:
-            clauses[unknown] = words.none
+            clauses[unknown] = none
     flares = "flares" if asked.of == "amplitude" else f"flares of {q.amplitude_percent:g} %"
     at = "" if asked.of == "magnitude" else f" at {q.band} = {q.magnitude:g}"
     first = clauses[REALISTIC]

@@ -420,16 +420,15 @@ def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
 
 def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return a message with the labels of fields in place of keys and flags."""
+
+    def remedy(match: re.Match[str]) -> str:
+        label = _label(match["key"], keys)
+        if label == match["key"]:
+            return label
+        return f"{label} {match['value']}" if match["value"] else f"“{label}”"
+
     text = _FLAG.sub(lambda match: f"“{FIELDS[name].label}”" if (name := field_of(match[0])) else match[0], text)
-    text = _REMEDY.sub(lambda match: _remedy(match, keys), text)
-    return _KEY.sub(lambda match: _label(match[0], keys), text)
-
-
-def _remedy(match: re.Match[str], keys: Mapping[str, str]) -> str:
-    label = _label(match["key"], keys)
-    if label == match["key"]:
-        return label
-    return f"{label} {match['value']}" if match["value"] else f"“{label}”"
+    return _KEY.sub(lambda match: _label(match[0], keys), _REMEDY.sub(remedy, text))
 
 
 def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:

@@ -138,14 +138,14 @@ def curve(closed: ClosedForms, answers: Answers) -> ChartData:
         text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
     if "limit" in answers:
         limits = [limit for limit in answers["limit"].limits if limit.statistic == q.statistic]
-        words = LIMITS[closed.study.limit.of]
+        before, in_words, *_ = LIMITS[closed.study.limit.of]
         for one in limits:
             # Points of another quantity than the axis's are reported in words only.
             if one.of == "magnitude":
                 points = [(p.value, p.probability.value) for p in (*one.points, one.check)]
                 series["simulated"] = np.array(points).T
-            value, low, high = map(words.value, (one.value.value, one.value.low, one.value.high))
-            limit = f"{words.before.format(band=q.band)} {value} [{low} to {high}]"
+            value, low, high = map(in_words, (one.value.value, one.value.low, one.value.high))
+            limit = f"{before.format(band=q.band)} {value} [{low} to {high}]"
             text += f" Simulated: {100 * power:g} % are detected {limit}."
     return ChartData(text, series)
 

@@ -85,12 +85,12 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
             ) from error
     if done.returncode == 0:
         return done.stdout
-    if done.returncode == _REFUSED:
+    reasons = {
         # The reader prints its error as a sentence.
-        raise InputError(done.stderr.decode("utf-8", "replace").strip(), key="upload")
-    if done.returncode == _NO_ROOM:
-        raise InputError(f"the upload takes more than {MEMORY_MIB} MiB of memory to read; give {smaller}", key="upload")
-    raise InputError(f"the upload ended its reader; give {other}", key="upload")
+        _REFUSED: done.stderr.decode("utf-8", "replace").strip(),
+        _NO_ROOM: f"the upload takes more than {MEMORY_MIB} MiB of memory to read; give {smaller}",
+    }
+    raise InputError(reasons.get(done.returncode, f"the upload ended its reader; give {other}"), key="upload")
 
 
 def _main() -> int:

@@ -165,18 +165,6 @@ class OneLine(logging.Formatter):
         return f"({ei[0].__name__}: {ei[1]}; {', '.join(f'{name} line {line}' for name, line in ours)})"
 
 
-def install() -> None:
-    """Apply the format to warnings and errors of all libraries."""
-    handler = logging.StreamHandler()
-    handler.setFormatter(OneLine("%(asctime)s %(levelname)s %(name)s %(message)s"))
-    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    # They write their own otherwise.
-    for name in ("bokeh", "tornado"):
-        logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [], True
-        logger.setLevel(logging.WARNING)
-
-
 #: Largest size in bytes of a message, an upload with a margin, and of a request's body, of which the page has none.
 MESSAGE, BODY = 17 * 2**20, 2**16
 #: Seconds that a connection may take for the headers and the body of each request.
@@ -276,7 +264,14 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
             for visitor in list(Visitor.here):
                 visitor.on_close()
 
-    install()
+    # Warnings and errors of all libraries have one format; bokeh and tornado write their own otherwise.
+    handler = logging.StreamHandler()
+    handler.setFormatter(OneLine("%(asctime)s %(levelname)s %(name)s %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    for name in ("bokeh", "tornado"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [], True
+        logger.setLevel(logging.WARNING)
     # Threads share two pools of glibc's malloc, since each pool keeps what its threads have freed; -8 is M_ARENA_MAX.
     if (change := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         change(-8, 2)
@@ -304,9 +299,9 @@ _FOLDER = Path(__file__).parent / "assets"
 
 
 @cache
-def packed(content: bytes) -> tuple[bytes, str]:
-    """Compress content with gzip, and return it with its digest."""
-    return gzip.compress(content, 6, mtime=0), hashlib.sha256(content).hexdigest()[:16]
+def packed(content: bytes) -> bytes:
+    """Compress content with gzip."""
+    return gzip.compress(content, 6, mtime=0)
 
 
 @cache
@@ -321,13 +316,15 @@ def asset(name: str) -> bytes | None:
 @cache
 def front() -> bytes:
     """Return the page."""
+    # The digest of all assets, so that browsers do not use old ones.
+    assets = [packed(content) for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
+    digest = hashlib.sha256(b"".join(assets)).hexdigest()[:12]
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
         fields=fields, uploads=UPLOADS, examples=EXAMPLES, names=[star.name for star in well_known_stars()],
         mapped=MAPPED, time_units=TIME_UNITS, library=library_names(), tabs=TABS, groups=GROUPS, version=VERSION,
-        titles=TITLES, digest=_digest(),
-        words=json.dumps(_words()).replace("<", "\\u003c"),
+        titles=TITLES, digest=digest, words=json.dumps(_words()).replace("<", "\\u003c"),
     )  # fmt: skip
     return str(text).encode()
 
@@ -341,11 +338,7 @@ def _words() -> dict[str, Any]:
     return {
         "version": VERSION,
         "fields": {name: field.first for name, field in fields.FIELDS.items()},
-        "sliders": {
-            name: {"low": s.low, "high": s.high, "step": s.step, "log": s.log}
-            for name, field in fields.FIELDS.items()
-            if (s := field.slider) is not None
-        },
+        "sliders": {name: vars(field.slider) for name, field in fields.FIELDS.items() if field.slider is not None},
         "stars": all_names(),
         "example": "AU Mic\nYZ CMi\neps Eri",
         "headings": {
@@ -376,12 +369,6 @@ def _words() -> dict[str, Any]:
         "pins": PINS,
         "unused": UNUSED,
     }
-
-
-def _digest() -> str:
-    """Return the digest of all assets, so that browsers do not use old ones."""
-    each = [packed(content)[1] for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
-    return hashlib.sha256("".join(each).encode()).hexdigest()[:12]
 
 
 @cache
@@ -424,11 +411,13 @@ class ContentHandler(RequestHandler):
             self.set_header(name, value)
 
     def get(self, *names: str) -> None:
-        """Send content, or status 404 if there is none; a file with its digest in its address never changes."""
+        """Send content, or status 404 if there is none; a file with its digest in its address never changes.
+
+        Tornado adds a tag of the content, and sends status 304 if the browser has it.
+        """
         content = self._content(self, *names)
         if content is None:
             raise HTTPError(404)
-        small, self._digest = packed(content)
         # The names of assets end in their kind.
         self.set_header("Content-Type", KINDS[self._kind or names[0].rpartition(".")[2]])
         self.set_header("Vary", "Accept-Encoding")
@@ -436,12 +425,8 @@ class ContentHandler(RequestHandler):
         self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
         if "gzip" in self.request.headers.get("Accept-Encoding", ""):
             self.set_header("Content-Encoding", "gzip")
-            content = small
+            content = packed(content)
         self.finish(content)
-
-    def compute_etag(self) -> str:
-        """Return the tag of the content, for which tornado sends status 304 if the browser has it."""
-        return f'"{self._digest}"'
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Send a message without internal details."""

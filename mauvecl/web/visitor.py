@@ -28,7 +28,8 @@ from mauvecl.device.drivers import DeviceError
 from mauvecl.device.engine import Engine
 from mauvecl.host import VERSION
 from mauvecl.observations.frame_files import ColumnNames
-from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
+from mauvecl.runs.checkpoint import Stopped
+from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError, reworded, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
@@ -63,11 +64,11 @@ def _set_pending(thread: int, error: type[BaseException] | None) -> None:
     ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), given)
 
 
-def _engine(progress: Callable[[int, int], None]) -> Engine:
+def _engine(device: str | None, progress: Callable[[int, int], None]) -> Engine:
     """Return this thread's engine, which reports the progress of this job from any thread."""
     if not hasattr(_per_thread, "engine"):
         listener = _per_thread.listener = [progress]
-        _per_thread.engine = Engine(progress=lambda done, total: listener[0](done, total))
+        _per_thread.engine = Engine(device, progress=lambda done, total: listener[0](done, total))
     _per_thread.listener[0] = progress
     engine: Engine = _per_thread.engine
     return engine
@@ -108,8 +109,7 @@ class Job:
         try:
             self._check()
             self._started = time.monotonic()
-            workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
-            self._pool = Pool(workers, progress=lambda done, total: self._check())
+            self._pool = Pool(LocalWorkers(make=_engine), progress=lambda done, total: self._check())
             return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
         except Stopped as error:
             raise Cancelled from error
@@ -209,7 +209,7 @@ class Visitor(WebSocketHandler):
         self.job: Job | None = None
         self._drawing: Job | None = None
         self._next: dict[str, Any] | None = None
-        self._answering = False
+        self._answering: asyncio.Task[None] | None = None
         self._solving = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._coming: dict[str, Any] | None = None
@@ -276,20 +276,16 @@ class Visitor(WebSocketHandler):
     def _ask_answer(self, asked: dict[str, Any]) -> None:
         """Send the answer and a tab's pictures; a later question replaces a waiting one."""
         self._next = asked
-        if not self._answering:
-            self._answering = True
-            self._begin(self._answer_all())
+        if self._answering is None or self._answering.done():
+            self._answering = self._begin(self._answer_all())
 
     async def _answer_all(self) -> None:
-        try:
-            while self._next is not None and self.ws_connection is not None:
-                asked, self._next = self._next, None
-                await self._answer(asked)
-        finally:
-            self._answering = False
+        while self._next is not None and self.ws_connection is not None:
+            asked, self._next = self._next, None
+            await self._answer(asked)
 
     async def _answer(self, asked: dict[str, Any]) -> None:
-        n, state, tab = asked["n"], self.state(asked["link"]), tab_of(str(asked.get("tab")))
+        n, state, tab = asked["n"], self.state(asked["link"]), tab_of(asked)
         faults = state.faults_of(tab.reads)
         message: dict[str, Any] = {"n": n, "stray": state.stray, "faults": faults, "known": known(state)}
         if faults:
@@ -347,11 +343,12 @@ class Visitor(WebSocketHandler):
         """Return everything on which an answer to some fields depends."""
         return state.asked(names), *(self._digests.get(name) for name in UPLOADS if name in names)
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+    def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a function without blocking other visitors."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+        return task
 
     def _give(self, work: Coroutine[Any, Any, None], **message: Any) -> None:
         """Run a function that the page may request a limited number of times."""
@@ -381,7 +378,7 @@ class Visitor(WebSocketHandler):
     async def _ask_solve(self, asked: dict[str, Any]) -> None:
         """Send the limit of the quantity for which the question solves, and the chances with other payloads."""
         n = self._solving = asked["n"]
-        closed = await _in_thread(self.closed, self.state(asked["link"]), tab_of(""))
+        closed = await _in_thread(self.closed, self.state(asked["link"]), next(iter(TABS.values())))
         if n != self._solving:
             # It takes long for a bright star, and a later question waits.
             self.send(n=n, solved="")
@@ -391,7 +388,7 @@ class Visitor(WebSocketHandler):
 
     async def _ask_pinned(self, asked: dict[str, Any]) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""
-        tab = tab_of(str(asked.get("tab")))
+        tab = tab_of(asked)
         pictures = [picture for picture in tab.pictures if picture.pins]
         question = self.state(asked["link"]).question(tab.reads)
         closed = await _in_thread(ClosedForms.of, question, Path(self._folder.name))
@@ -403,7 +400,7 @@ class Visitor(WebSocketHandler):
 
     def _ask_draw(self, asked: dict[str, Any]) -> None:
         """Draw one exposure with the flare."""
-        state, tab = self.state(asked["link"]), tab_of(str(asked.get("tab")))
+        state, tab = self.state(asked["link"]), tab_of(asked)
         key = self._key(state, tab.reads), tab.chance
         closed: ClosedForms | None = RESULTS.get(self, "closed", key)
         if closed is None:
@@ -432,8 +429,7 @@ class Visitor(WebSocketHandler):
         key = kind, self._key(state, reads_of(kind))
         question, tab = state.question(reads_of(kind)), SIMULATIONS[kind]
         given = await _in_thread(self.given, state, tab)
-        made = partial(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
-        closed = await _in_thread(made)
+        closed = await _in_thread(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
         if self.job is not None:
             raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
@@ -523,20 +519,20 @@ class Visitor(WebSocketHandler):
 
     async def _ask_export(self, asked: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""
-        tab = tab_of(str(asked.get("tab")))
+        tab = tab_of(asked)
         question = self.state(asked["link"]).question(tab.reads)
         taken = await _in_thread(commands_and_programs, tab, question, Path(self._folder.name))
         self.send(n=asked["n"], taken=taken)
 
 
-async def _in_thread(work: Callable[..., T], *given: Any) -> T:
+async def _in_thread(work: Callable[..., T], *given: Any, **options: Any) -> T:
     """Run a function in a thread."""
-    return await asyncio.get_running_loop().run_in_executor(_closed_forms, partial(work, *given))
+    return await asyncio.get_running_loop().run_in_executor(_closed_forms, partial(work, *given, **options))
 
 
-def tab_of(name: str) -> Tab:
-    """Return a tab by name, or the first one."""
-    return TABS.get(name, next(iter(TABS.values())))
+def tab_of(asked: dict[str, Any]) -> Tab:
+    """Return the tab of a request, or the first one."""
+    return TABS.get(str(asked.get("tab")), next(iter(TABS.values())))
 
 
 def shown(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
