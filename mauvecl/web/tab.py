@@ -264,7 +264,10 @@ def as_command(verb: str, study: Study) -> str:
         elif name == "sky":
             words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
         else:
-            words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
+            # TOML on one line is JSON with another separator, and bare keys.
+            toml = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
+            toml = re.sub(r'"(\w+)" = ', r"\1 = ", toml, flags=re.ASCII)
+            words += _flag_words(name, value, question) or ["--set", f"{name}={toml}"]
     return from_file if max(map(len, words)) > MOST_CHARACTERS else shlex.join(words)
 
 
@@ -304,12 +307,6 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
 def _text(value: str | float) -> str:
     """Return a value as it is typed, with every digit of a number."""
     return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
-
-
-def _toml(value: Any) -> str:
-    """Return a value as TOML on one line: as JSON with another separator, and bare keys."""
-    text = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
-    return re.sub(r'"(\w+)" = ', r"\1 = ", text, flags=re.ASCII)
 
 
 #: Held while matplotlib draws.
