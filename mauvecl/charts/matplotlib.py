@@ -121,24 +121,6 @@ def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
         legend.remove()
 
 
-def _plain_numbers(axis: Any, panel: Panel) -> None:
-    """Label logarithmic ticks as plain numbers (0.1, 20, 500), with intermediate ticks only over few decades."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
-        if side.get_scale() != "log":
-            continue
-        low, high = sorted(side.get_view_interval())
-        decades = float(np.log10(high / low))
-        if of.ticks is None:
-            # Powers of ten are too wide to stand side by side with others.
-            most = 1 if side is axis.xaxis and (low < 1e-4 or high > 1e5) else 2
-            side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
-        if decades < 4:
-            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
-        side.set_minor_formatter(NullFormatter())
-
-
 def written(value: float) -> str:
     """Return a number as people write it: 0.1, 500, or 2 times a power of ten."""
     digits, _, power = f"{value:.5e}".partition("e")
@@ -226,14 +208,29 @@ def draw_picture(picture: Picture, figure: Any = None) -> Any:
 
 
 def _finish(axis: Any, panel: Panel) -> None:
-    """Set the ranges of axes, which may be shared, when all panels are drawn."""
-    for name, of in (("x", panel.x), ("y", panel.y)):
-        limits = RANGE_NM if of.kind == "wavelength" and of.limits is None else of.limits
+    """Set ranges and ticks of axes, which may be shared, when all panels are drawn.
+
+    Logarithmic ticks are plain numbers (0.1, 20, 500), with intermediate ones only over few decades.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
+        limits, name = RANGE_NM if of.kind == "wavelength" and of.limits is None else of.limits, side.axis_name
         if limits is not None:
-            getattr(axis, f"set_{name}lim")(*limits)
+            axis.set(**{f"{name}lim": limits})
         if of.ticks is not None:
-            getattr(axis, f"set_{name}ticks")(*of.ticks, **({"fontsize": SMALL} if len(of.ticks) > 1 else {}))
-    _plain_numbers(axis, panel)
+            side.set_ticks(*of.ticks, **({"fontsize": SMALL} if len(of.ticks) > 1 else {}))
+        if side.get_scale() != "log":
+            continue
+        low, high = sorted(side.get_view_interval())
+        decades = float(np.log10(high / low))
+        if of.ticks is None:
+            # Powers of ten are too wide to stand side by side with others.
+            most = 1 if name == "x" and (low < 1e-4 or high > 1e5) else 2
+            side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
+        if decades < 4:
+            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
+        side.set_minor_formatter(NullFormatter())
     if panel.finish is not None:
         panel.finish(axis)
 
