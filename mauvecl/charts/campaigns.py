@@ -32,6 +32,37 @@ MOST_CALENDARS = 6
 MOST_MONTHS = 8
 
 
+def overview(answer: PlanAnswer) -> Picture:
+    """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
+    planned, left, right = answer.planned, list[Series](), list[Series]()
+    ends = [(target.energy_at(0.5), target.energy_at(0.9)) for target in planned]
+    for k, target in enumerate(planned):
+        if target.recovered is not None and target.recovered.high > 0:
+            # A logarithmic axis cannot show zero.
+            yields = target.recovered
+            low, high, expected = np.maximum([yields.low, yields.high, yields.expected], 0.05)
+            bar = Line("", "star", width=3.3, alpha=0.5, at=((low, high), [k, k]))
+            left += [bar, Dots("", "star", size=7, at=([expected], [k]))]
+        if np.isfinite(ends[k][0]):
+            bar = Line("", "flare", width=3.3, alpha=0.5, at=(ends[k], [k, k]))
+            right += [bar, Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
+    # Limits at whole decades avoid labels that overlap.
+    logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
+    decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
+    names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
+    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "mean (dot), and 95 % of campaigns"
+    row = [
+        Panel(Axis("flares recovered", log=True, limits=(0.05, None)), y, left, above),
+        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "recovered in 50 % (dot) to 90 %"),
+    ]
+    return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
+
+
+# Reports draw it in figures of their own.
+picture_of("PlanAnswer", "plan")(overview)
+
+
+@picture_of("PlanAnswer", "visible", given=lambda answer: (answer.seen,))
 @picture_of("VisibleAnswer", "visible")
 def calendar(answer: VisibleAnswer) -> Picture:
     """Plot daily hours of exposure: a calendar per target or, for many targets, a row."""
@@ -53,7 +84,7 @@ def _calendars(answer: VisibleAnswer, hours: Any) -> Picture:
         for day, value in zip(answer.days, seen, strict=True):
             grid[months.index(day[:7]), int(day[8:]) - 1] = value
         at = np.arange(0.5, 32), np.arange(-0.5, len(months)), grid
-        mesh = Mesh("hours a day", high=max(float(hours.max()), 0.1), edges="white", at=at)
+        mesh = Mesh("hours a day", high=max(float(hours.max()), 0.1), edges="white", empty="white", at=at)
         panels.append(Panel(x, y, [mesh], f"{target.name}: {total:.0f} h in {answer.times.days:g} d"))
     rows, height = in_rows(panels, across), max(1.3, 0.17 * len(months) + 0.8)
     return Picture(rows, (3.9 * across + 0.8, height * len(rows) + 0.4), share_x=True)
@@ -90,42 +121,6 @@ SMALL, NORMAL, MANY = 5.5, 7.0, 9
 COLOURS_KEPT = 64
 #: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
 PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
-
-
-def overview(answer: PlanAnswer) -> Picture:
-    """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
-    planned, left, right = answer.planned, list[Series](), list[Series]()
-    ends = [(target.energy_at(0.5), target.energy_at(0.9)) for target in planned]
-    for k, target in enumerate(planned):
-        if target.recovered is not None and target.recovered.high > 0:
-            # A logarithmic axis cannot show zero.
-            yields = target.recovered
-            low, high, expected = np.maximum([yields.low, yields.high, yields.expected], 0.05)
-            bar = Line("", "star", width=3.3, alpha=0.5, at=((low, high), [k, k]))
-            left += [bar, Dots("", "star", size=7, at=([expected], [k]))]
-        if np.isfinite(ends[k][0]):
-            bar = Line("", "flare", width=3.3, alpha=0.5, at=(ends[k], [k, k]))
-            right += [bar, Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
-    # Limits at whole decades avoid labels that overlap.
-    logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
-    decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
-    names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "mean (dot), and 95 % of campaigns"
-    row = [
-        Panel(Axis("flares recovered", log=True, limits=(0.05, None)), y, left, above),
-        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "recovered in 50 % (dot) to 90 %"),
-    ]
-    return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
-
-
-# Reports draw it in figures of their own.
-picture_of("PlanAnswer", "plan")(overview)
-
-
-@picture_of("PlanAnswer", "visible")
-def visible(answer: PlanAnswer) -> Any:
-    """Plot the daily hours of exposure of all targets."""
-    return calendar(answer.seen)
 
 
 @dataclass(frozen=True)

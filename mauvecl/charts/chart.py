@@ -145,6 +145,15 @@ class Mesh(Series):
     high: float | None = 1.0
     palette: str = "cividis"
     edges: str = "none"  # colour of the cells' edges
+    empty: str = "#bbbbbb"  # colour of cells without a value, which no palette has
+    columns: tuple[str, ...] = ("x", "y", "values")
+
+
+@dataclass(frozen=True)
+class Levels(Series):
+    """Contours of a probability over x and y, for files."""
+
+    levels: tuple[float, ...] = (0.1, 0.5, 0.9)
     columns: tuple[str, ...] = ("x", "y", "values")
 
 
@@ -268,12 +277,6 @@ class Entry:
     when: Callable[[Any], bool] = lambda thing: True  # whether a thing has the picture
     document: bool = False
 
-    def of(self, thing: Any) -> list[tuple[int, str, Callable[..., Any]]]:
-        """Return number, name and bound function of each picture of an object."""
-        if self.each is not None:
-            return [(n, f"{self.name}-{n}", partial(self.make, *given)) for n, given in enumerate(self.each(thing), 1)]
-        return [(0, self.name, partial(self.make, *self.given(thing)))]
-
 
 #: Entries by class name, since importing the classes would import every answer.
 ENTRIES: defaultdict[str, list[Entry]] = defaultdict(list)
@@ -299,7 +302,15 @@ def _made_of(thing: Any, *, document: bool) -> list[tuple[str, Callable[..., Any
     """Return the functions of an object's class by name, numbered ones in the order of their numbers."""
     load()
     own = next((ENTRIES[kind.__name__] for kind in type(thing).__mro__ if kind.__name__ in ENTRIES), [])
-    made = [part for entry in own if entry.document is document and entry.when(thing) for part in entry.of(thing)]
+    made = list[tuple[int, str, Callable[..., Any]]]()
+    for entry in own:
+        if entry.document is not document or not entry.when(thing):
+            continue
+        if entry.each is None:
+            made.append((0, entry.name, partial(entry.make, *entry.given(thing))))
+        else:
+            numbered = enumerate(entry.each(thing), 1)
+            made += [(n, f"{entry.name}-{n}", partial(entry.make, *given)) for n, given in numbered]
     return [(name, make) for _, name, make in sorted(made, key=lambda pair: pair[0])]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
@@ -99,30 +100,23 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
     above = f"{title}: a threshold per flare" if len(own) > 1 else title
     if len(own) == len(cuts) == 1:
         above = f"{title}: threshold {written(float(f'{cuts[0]:.3g}'))}"
-    finish = partial(_scaled, linear=linear, ends=(min(ends + cuts), max(ends + cuts)))
-    y = Axis("realisations / peak", limits=(0, 1.05))
-    return Panel(Axis(statistic_label(statistic)), y, series, above, finish=finish)
-
-
-def _scaled(axis: Any, linear: bool, ends: tuple[float, float]) -> None:
-    """Scale the axis of a statistic, whose means differ by decades, and show the values between two ends."""
-    decades = [10.0**power for power in range(10)]
+    low, high = min(ends + cuts), max(ends + cuts)
+    x, y = Axis(statistic_label(statistic)), Axis("realisations / peak", limits=(0, 1.05))
     if linear:
-        axis.set_xscale("asinh", linear_width=2)
-        low, high = np.arcsinh(np.array(ends) / 2)
-        axis.set_xlim(*2 * np.sinh([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
-        shown = [*range(-10, 8, 2)] if high - low < WIDE else [-10, -4, 0, 4]
-        major = [*shown, *(digit * decade for decade in decades[1:] for digit in ((1, 3) if decade < 100 else (1,)))]
-        minor = [*range(-10, 10), *(digit * decade for decade in decades[1:] for digit in range(1, 10))]
-    else:
-        axis.set_xscale("log")
-        low, high = np.log10(ends)
-        axis.set_xlim(*10 ** np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
-        # Over few decades, powers of ten alone are too sparse.
-        few = {0.4: (1, 1.2, 1.4, 1.7, 2, 2.5, 3, 4, 5, 6, 8), 0.8: (1, 2, 3, 5), 2.0: (1, 2, 5), np.inf: (1,)}
-        digits = next(digits for most, digits in few.items() if high - low <= most)
-        major = [digit * decade for decade in decades for digit in digits]
-        minor = [digit * decade for decade in decades for digit in range(1, 10)]
+        return Panel(x, y, series, above, finish=partial(_asinh, ends=(low, high)))
+    margin = (high / low) ** MARGIN
+    return Panel(replace(x, log=True, limits=(low / margin, high * margin)), y, series, above)
+
+
+def _asinh(axis: Any, ends: tuple[float, float]) -> None:
+    """Scale the axis of a weighted sum, whose means differ by decades, and show the values between two ends."""
+    axis.set_xscale("asinh", linear_width=2)
+    low, high = np.arcsinh(np.array(ends) / 2)
+    axis.set_xlim(*2 * np.sinh([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
+    shown = [*range(-10, 8, 2)] if high - low < WIDE else [-10, -4, 0, 4]
+    decades = [10.0**power for power in range(1, 10)]
+    major = [*shown, *(digit * decade for decade in decades for digit in ((1, 3) if decade < 100 else (1,)))]
+    minor = [*range(-10, 10), *(digit * decade for decade in decades for digit in range(1, 10))]
     low, high = axis.get_xlim()
     axis.set_xticks([tick for tick in major if low <= tick <= high])
     axis.set_xticks([tick for tick in minor if low <= tick <= high], minor=True)

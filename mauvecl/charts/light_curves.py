@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import cycle
-from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from mauvecl.charts import matplotlib as figures
-from mauvecl.charts.chart import Area, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
 from mauvecl.schema.columns import First, part_note
 
@@ -37,7 +35,6 @@ SIZES = {
 MOST_CURVES = 6
 #: Largest number of maps in a picture.
 MOST_MAPS = 6
-CONTOURS = figures.strokes_of((0.1, 0.5, 0.9))
 HALF_WIDTH = Axis("half-width (s)", log=True)
 
 
@@ -62,8 +59,7 @@ def maps(answer: InjectAnswer) -> Picture:
             return Panel(Axis("completeness"), size, [Line("", "star", at=(f.completeness[0], y))], star.title)
 
         mesh = Mesh("completeness", at=(_edges(x), _edges(y), z))
-        finish = partial(figures.draw_contours, at=(x, y, z), strokes=CONTOURS)
-        return Panel(HALF_WIDTH, size, [mesh, *figures.contour_entries(CONTOURS, "found")], star.title, finish)
+        return Panel(HALF_WIDTH, size, [mesh, Levels("found", at=(x, y, z))], star.title)
 
     return _stars(answer, panel, below=True)
 
@@ -100,8 +96,7 @@ def energies(answer: InjectAnswer) -> Picture:
             at = _edges(x), _edges(y), np.log10(star.fitted["energy_ratio"].T)
             label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
-        finish = methodcaller("set_facecolor", figures.EMPTY)
-        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title, finish)
+        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title)
 
     return _stars(answer, panel, "medians; grey: none found")
 
@@ -142,8 +137,7 @@ def light_curves(star: StarStare) -> Picture:
         series = list[Series](always)
         for number, part in enumerate(gaps):
             # Means of groups of frames, of which the last may be smaller.
-            step = -(-part.size // max(1, MOST_POINTS * part.size // stare.n_frames))
-            edges = np.arange(0, part.size, max(1, step))
+            edges = np.arange(0, part.size, -(-stare.n_frames // MOST_POINTS))
             columns = (stare.middle_s / scale, light.flux[:, k] / level[k], light.mean[:, k] / level[k])
             sums = (np.add.reduceat(values[part], edges) for values in columns)
             time, flux, mean = (values / np.diff(np.append(edges, part.size)) for values in sums)
@@ -212,7 +206,6 @@ def spectra_panel(
     mesh = Mesh(label, low=-reach, high=reach, palette="RdBu_r", at=(time, nm, image.T))
 
     def finish(axis: Any) -> None:
-        axis.set_facecolor(figures.EMPTY)
         for ends, colour in marks:
             axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=figures.INK[colour], linewidth=3,
                       clip_on=False, solid_capstyle="butt")  # fmt: skip

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mauvecl.charts import matplotlib as figures
-from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
+from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.matplotlib import COLOURS, picture_of
 from mauvecl.detection.requests import statistic_label
 from mauvecl.schema.columns import First, note_of
 from mauvecl.study.cases import full_label
@@ -49,24 +48,19 @@ def detection_map(answer: MapAnswer) -> Picture:
         ticks = (places[-1], values) if named else None
         axes.append(quantity_axis(study, sweep.quantity, log=sweep.log and not named, ticks=ticks))
     (x, y), (x_axis, y_axis) = places, axes
-    strokes = figures.strokes_of(question.contours) if min(x.size, y.size) > 1 else {}
-
-    def finish(axis: Any, probability: Any) -> None:
-        axis.set_facecolor(figures.EMPTY)
-        if strokes:
-            figures.draw_contours(axis, (x, y, probability), strokes)
-
-    lines, row = figures.contour_entries(strokes, "detected"), []
+    contoured, row = bool(question.contours) and min(x.size, y.size) > 1, []
     for statistic, p in zip(answer.statistics, answer.probability, strict=True):
-        series = [Mesh("detection probability", at=(x, y, p)), *lines]
+        series: list[Series] = [Mesh("detection probability", at=(x, y, p))]
+        if contoured:
+            series.append(Levels("detected", levels=tuple(question.contours), at=(x, y, p)))
         title = statistic_label(statistic).partition(" (")[0]
-        row.append(Panel(x_axis, y_axis, series, title, partial(finish, probability=p)))
+        row.append(Panel(x_axis, y_axis, series, title))
     names = {axis.quantity for axis in question.axes}
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
     title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
     empty = "grey: no answer" if np.isnan(answer.probability).any() else ""
-    return Picture([row], (figures.COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=bool(strokes), share_y=True)
+    return Picture([row], (figures.COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=contoured, share_y=True)
 
 
 @picture_of("LimitAnswer", "limit")
@@ -125,16 +119,12 @@ def budget_series(x: Expectation) -> dict[str, Any]:
 
 
 @picture_of("SnrAnswer", "noise-budget")
-def noise_budgets(answer: SnrAnswer) -> Any:
+def noise_budgets(answer: SnrAnswer) -> Picture:
     """Plot pixel noise by origin against wavelength, one panel per star and cell, as in the paper."""
-    observed = [(star, star.result.expectation) for star in answer.stars]
-    named = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in observed]
-    return noise_budget(named, each=answer.study.sweep.size)
-
-
-@styled_picture
-def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1) -> Picture:
-    """Plot pixel noise by origin against wavelength for titled expectations, `each` of every star side by side."""
+    each, observed = answer.study.sweep.size, list[tuple[str, Any]]()
+    for star in answer.stars:
+        x = star.result.expectation
+        observed.append((star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x))
 
     def finish(axis: Any) -> None:
         # Zodiacal light can be far below everything else.
@@ -239,10 +229,14 @@ MOST_FLARES = 4
 MANY_FITS = 1000
 
 
-def _few(answer: MeasureAnswer, *, single: bool = False) -> tuple[Any, ...]:
-    """Return the first flares, of all models or of those with a single temperature."""
-    flares = [flare for flare in answer.flares if not single or flare.model != "two-temperatures"]
-    return (First(flares, MOST_FLARES, "flares"),)
+def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
+    """Return the first flares."""
+    return (First(answer.flares, MOST_FLARES, "flares"),)
+
+
+def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
+    """Return the first flares whose model has a single temperature."""
+    return (First([flare for flare in answer.flares if flare.model != "two-temperatures"], MOST_FLARES, "flares"),)
 
 
 @picture_of("MeasureAnswer", "fit", given=_few)
@@ -279,11 +273,7 @@ def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Pane
     return Picture([row], (3.4 * len(flares), 3.6), notes=(note_of(flares),), below=True)
 
 
-#: The first flares whose model has a single temperature.
-SINGLE = partial(_few, single=True)
-
-
-@picture_of("MeasureAnswer", "contours", given=SINGLE, when=lambda answer: bool(SINGLE(answer)[0]))
+@picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
 def contours(flares: Sequence[MeasuredFlare]) -> Picture:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, wraps
+import textwrap
+from collections.abc import Callable, Sequence
+from functools import wraps
 from itertools import cycle
 from pathlib import Path
 from typing import Any, ParamSpec
 
 import numpy as np
 
-from mauvecl.charts.chart import AXES, Area, Dots, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets, register
+from mauvecl.charts import chart
+from mauvecl.charts.chart import Area, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
@@ -20,8 +22,6 @@ P = ParamSpec("P")
 #: lightness as well.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
-#: Colour of a mesh's cells without a value, which no palette has.
-EMPTY = "#bbbbbb"
 #: Colours of files by their names in charts; `web.figures.INKS` has those of the page's themes.
 INK = {
     "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73", "drawn": NULL, "dark": "#CC79A7", "read": "#E69F00",
@@ -40,8 +40,8 @@ UNBROKEN = "\N{NO-BREAK SPACE}"
 MINUS = "\N{MINUS SIGN}"
 #: Size of the labels of ticks that are names.
 SMALL = 8
-#: Largest fraction of a figure's width for titles and legends.
-INSIDE = 0.97
+#: Largest fractions of a figure's width for legends, and for titles, of whose letters the mean width is known.
+INSIDE, TITLE = 0.97, 0.93
 
 STYLE = {
     "font.size": 9,
@@ -74,28 +74,19 @@ def style() -> Any:
     return mpl.rc_context(STYLE)  # type: ignore[arg-type]
 
 
-@cache
-def _figure_class() -> Any:
-    """Return the class of figures, which imports matplotlib."""
+def new_figure(size: tuple[float, float], **how: Any) -> Any:
+    """Return an empty figure that Agg renders, without pyplot's windows, and that notebooks display."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    class NotebookFigure(Figure):
-        """Matplotlib figure that notebooks display."""
+    def png() -> bytes:
+        content = io.BytesIO()
+        figure.savefig(content, format="png")
+        return content.getvalue()
 
-        def _repr_png_(self) -> bytes:
-            content = io.BytesIO()
-            self.savefig(content, format="png")
-            return content.getvalue()
-
-    return NotebookFigure
-
-
-def new_figure(size: tuple[float, float], **how: Any) -> Any:
-    """Return an empty figure that Agg renders, without pyplot's windows, backend and list of open figures."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = _figure_class()(figsize=size, **how)
+    figure: Any = Figure(figsize=size, **how)
     FigureCanvasAgg(figure)
+    figure._repr_png_ = png
     return figure
 
 
@@ -116,13 +107,8 @@ def _own_part(ax: Any) -> Any:
 def _headline(figure: Any, text: str) -> None:
     """Add a title above all panels, wrapped to a part of the width; matplotlib would fill it to the edges."""
     title = figure.suptitle(text, fontsize=9.0)
-    lines = [""]
-    for word in text.split(" "):
-        title.set_text(f"{lines[-1]} {word}".strip())
-        if lines[-1] and title.get_window_extent(_renderer(figure)).width > INSIDE * figure.bbox.width:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    title.set_text("\n".join(lines))
+    letters = int(TITLE * len(text) * figure.bbox.width / title.get_window_extent().width)
+    title.set_text(textwrap.fill(text, max(letters, 1), break_on_hyphens=False, break_long_words=False))
 
 
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
@@ -130,27 +116,9 @@ def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
     for rows in range(1, len(handles) + 1):
         columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
-        if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
+        if columns == 1 or legend.get_window_extent().width <= INSIDE * figure.bbox.width:
             return
         legend.remove()
-
-
-def _plain_numbers(axis: Any, panel: Panel) -> None:
-    """Label logarithmic ticks as plain numbers (0.1, 20, 500), with intermediate ticks only over few decades."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
-        if side.get_scale() != "log":
-            continue
-        low, high = sorted(side.get_view_interval())
-        decades = float(np.log10(high / low))
-        if of.ticks is None:
-            # Powers of ten are too wide to stand side by side with others.
-            most = 1 if side is axis.xaxis and (low < 1e-4 or high > 1e5) else 2
-            side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
-        if decades < 4:
-            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
-        side.set_minor_formatter(NullFormatter())
 
 
 def written(value: float) -> str:
@@ -167,35 +135,11 @@ def in_rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
     return [panels[k : k + columns] for k in range(0, len(panels), columns)]
 
 
-def strokes_of(levels: Iterable[float]) -> dict[float, str]:
-    """Return the line style of each contour; lines are close where a map is steep, so that labels would not fit."""
-    return dict(zip(sorted(levels), cycle(("dotted", "dashed", "-", "dashdot")), strict=False))
-
-
-def contour_entries(strokes: Mapping[float, str], found: str) -> list[Line]:
-    """Return the entries of the legend for contours of a probability."""
-    return [Line(f"{found} in {100 * level:g} %", "text", dash=dash, at=([], [])) for level, dash in strokes.items()]
-
-
-def draw_contours(axis: Any, at: tuple[Any, Any, Any], strokes: Mapping[float, str]) -> None:
-    """Draw contours of a map, with a bright edge that sets them off."""
-    axis.contour(*at, levels=list(strokes), colors="white", linewidths=2.4)
-    axis.contour(*at, levels=list(strokes), colors="black", linewidths=1.2, linestyles=list(strokes.values()))
-
-
 def in_figure(unit: str) -> str:
     """Return a unit, as astropy spells it, as the label of an axis has it."""
     from astropy.units import Unit
 
     return str(Unit(unit).to_string("latex_inline"))
-
-
-def _renderer(figure: Any) -> Any:
-    """Return the renderer that measures text."""
-    from matplotlib.backends.backend_agg import RendererAgg
-
-    size = figure.bbox
-    return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
 
 
 def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
@@ -220,12 +164,12 @@ def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[P, Any]],
     `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `how` is as for
     `chart.Entry`.
     """
-    return lambda draw: register(kind, name, styled_picture(draw), **how)
+    return lambda draw: chart.register(kind, name, styled_picture(draw), **how)
 
 
 def draw_picture(picture: Picture, figure: Any = None) -> Any:
     """Draw a picture in a figure, by default one of its own or the caller's axes, and return the figure."""
-    rows, n, ax = picture.rows, max(len(row) for row in picture.rows), AXES.get()
+    rows, n, ax = picture.rows, max(len(row) for row in picture.rows), chart.AXES.get()
     alone = ax is not None and len(rows) == n == 1
     if figure is None:
         figure = new_figure(picture.size) if ax is None else ax.figure if alone else _own_part(ax)
@@ -264,14 +208,29 @@ def draw_picture(picture: Picture, figure: Any = None) -> Any:
 
 
 def _finish(axis: Any, panel: Panel) -> None:
-    """Set the ranges of axes, which may be shared, when all panels are drawn."""
-    for name, of in (("x", panel.x), ("y", panel.y)):
-        limits = RANGE_NM if of.kind == "wavelength" and of.limits is None else of.limits
+    """Set ranges and ticks of axes, which may be shared, when all panels are drawn.
+
+    Logarithmic ticks are plain numbers (0.1, 20, 500), with intermediate ones only over few decades.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
+        limits, name = RANGE_NM if of.kind == "wavelength" and of.limits is None else of.limits, side.axis_name
         if limits is not None:
-            getattr(axis, f"set_{name}lim")(*limits)
+            axis.set(**{f"{name}lim": limits})
         if of.ticks is not None:
-            getattr(axis, f"set_{name}ticks")(*of.ticks, **({"fontsize": SMALL} if len(of.ticks) > 1 else {}))
-    _plain_numbers(axis, panel)
+            side.set_ticks(*of.ticks, **({"fontsize": SMALL} if len(of.ticks) > 1 else {}))
+        if side.get_scale() != "log":
+            continue
+        low, high = sorted(side.get_view_interval())
+        decades = float(np.log10(high / low))
+        if of.ticks is None:
+            # Powers of ten are too wide to stand side by side with others.
+            most = 1 if name == "x" and (low < 1e-4 or high > 1e5) else 2
+            side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
+        if decades < 4:
+            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
+        side.set_minor_formatter(NullFormatter())
     if panel.finish is not None:
         panel.finish(axis)
 
@@ -300,7 +259,15 @@ def _draw_series(axis: Any, item: Series) -> Any:
     match item:
         case Mesh():
             look = {"cmap": item.palette, "rasterized": at[2].size > MANY, "edgecolors": item.edges, "linewidth": 0.2}
+            axis.set_facecolor(item.empty)
             return axis.pcolormesh(*at, vmin=item.low, vmax=item.high, **look)
+        case Levels():
+            # Lines are close where a map is steep, so that labels would not fit; a bright edge sets them off.
+            strokes = dict(zip(sorted(item.levels), cycle(("dotted", "dashed", "-", "dashdot")), strict=False))
+            axis.contour(*at, levels=list(strokes), colors="white", linewidths=2.4)
+            axis.contour(*at, levels=list(strokes), colors="black", linewidths=1.2, linestyles=list(strokes.values()))
+            for level, dash in strokes.items():
+                axis.plot([], [], "k", linestyle=dash, label=f"{item.called} in {100 * level:g} %", **width)
         case Rule():
             for place in np.atleast_1d(at):
                 (axis.axvline if item.along == "x" else axis.axhline)(place, **look, linewidth=0.8, linestyle=item.dash)

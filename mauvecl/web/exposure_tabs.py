@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.closed_forms import spoken, unknown_cost
+from mauvecl.answers.closed_forms import Cost, spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
 from mauvecl.answers.signal import simulate
@@ -313,13 +313,9 @@ DETECTION = Tab(
 )
 
 
-#: Name of an unknown, and the matched S/N plain and marginalised.
-Row = tuple[str, float, float]
-
-
 @lru_cache(maxsize=4)
-def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
-    """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
+def costs(closed: ClosedForms) -> list[Cost]:
+    """Return the flare's matched S/N with unknowns, alone and together."""
     # Without a sky its brightness is no unknown. Those without a default prior are projected out.
     chosen = {}
     for name, row in NUISANCES.items():
@@ -330,12 +326,8 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     chosen["all the usual together"] = NuisanceChoice()
     if closed.study.nuisances.own:
         chosen["your own spectrum"] = NuisanceChoice(usual=False, own=closed.study.nuisances.own)
-    rows, known_snr = list[Row](), 0.0
-    for name, choice in chosen.items():
-        cost = unknown_cost(name, closed.quiet, closed.flare, choice, closed.study.run.comparison())
-        known_snr = cost.known or known_snr
-        rows.append((name, cost.plain, cost.marginal))
-    return known_snr, rows
+    flare, comparison = closed.flare, closed.study.run.comparison()
+    return [unknown_cost(name, closed.quiet, flare, choice, comparison) for name, choice in chosen.items()]
 
 
 def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
@@ -357,26 +349,24 @@ def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
 ).data()  # fmt: skip
 def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the matched S/N with each unknown, plain and marginalised."""
-    known_snr, rows = costs(closed)
-    names, plain, marginal = zip(*rows[::-1], strict=True)
-    worst = min(rows, key=lambda row: row[2])
+    rows = costs(closed)
+    bars = zip(*((row.of, row.plain, row.marginal, row.known) for row in rows[::-1]), strict=True)
+    worst = min(rows, key=lambda row: row.marginal)
     text = (
-        f"With everything known the flare has a matched S/N of {known_snr:.3g}; {worst[0]} leaves {worst[2]:.3g} "
-        "of it, the least of these."
+        f"With everything known the flare has a matched S/N of {worst.known:.3g}; {worst.of} leaves "
+        f"{worst.marginal:.3g} of it, the least of these."
     )
-    bars = names, np.array(plain), np.array(marginal), np.full(len(rows), known_snr)
-    return ChartData(text, {"bars": bars}, {"y range": {"factors": names}})
+    return ChartData(text, {"bars": tuple(bars)}, {"y range": {"factors": [row.of for row in rows[::-1]]}})
 
 
 def table_of_costs(closed: ClosedForms, answers: Answers) -> View:
     """Return the S/N of the flare with each unknown, and the chance to detect it."""
-    known_snr, rows = costs(closed)
-    given: list[Row] = [("nothing: everything is known", known_snr, known_snr), *rows]
-    fap = closed.question.fap
+    rows, fap = costs(closed), closed.question.fap
     table = [
-        {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
-        for name, plain, marginal in given
-    ]
+        {"unknown": row.of, "plain": row.plain, "marginalised": row.marginal,
+         "detected": float(power(row.marginal, fap))}
+        for row in (Cost("nothing: everything is known", *[rows[0].known] * 3), *rows)
+    ]  # fmt: skip
     return View("", [column for column in COLUMNS if column.name in table[0]], table)
 
 

@@ -17,6 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from mauvecl.answers.measure import COLUMNS
 from mauvecl.answers.measurements import expected_measurements, models_of
 from mauvecl.charts.chart import Area, Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
+from mauvecl.charts.limits import RISES
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.study.observation import KNOWN, NuisanceChoice
@@ -265,8 +266,6 @@ ASSUMED = {
 }
 #: Names of the curves.
 NAMES = ("known", "usual", "free")
-#: Increase of chi-squared that encloses 95 % in two dimensions.
-RISE_95 = 5.99
 #: Factors on the amplitude at which errors are computed.
 FACTORS = np.geomspace(0.1, 10.0, 9)
 #: Half-widths before and after the peak of a flare in a stare that are shown.
@@ -347,7 +346,7 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
         series["fits"] = some[:, 0], 100 * some[:, 1]
     one_temperature = isinstance(all_known.fitted, FlareModel)
     for name, measurement in (("known", all_known), ("free", free)):
-        kelvin, low, high = measurement.region(RISE_95) if one_temperature else _ellipse(best, measurement.ahead)
+        kelvin, low, high = measurement.region(RISES["95 %"]) if one_temperature else _ellipse(best, measurement.ahead)
         series[name] = kelvin, 100 * low, 100 * high
     x = np.asarray(series["free"][0])
     text = (
@@ -369,8 +368,8 @@ def _ellipse(best: Float, ahead: Forecast) -> tuple[Float, Float, Float]:
     if not (np.diag(spread) < 1.0).all():
         return np.empty(0), np.empty(0), np.empty(0)
     angle, slope = np.linspace(-np.pi / 2, np.pi / 2, 161), spread[0, 1] / spread[0, 0]
-    along = np.sqrt(RISE_95 * spread[0, 0]) * np.sin(angle)
-    half = np.sqrt(RISE_95 * (spread[1, 1] - slope * spread[0, 1])) * np.cos(angle)
+    along = np.sqrt(RISES["95 %"] * spread[0, 0]) * np.sin(angle)
+    half = np.sqrt(RISES["95 %"] * (spread[1, 1] - slope * spread[0, 1])) * np.cos(angle)
     low, high = (best[1] * np.exp(slope * along + side) for side in (-half, half))
     return best[0] * np.exp(along), low, high
 

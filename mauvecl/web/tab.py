@@ -213,11 +213,6 @@ STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.ins
 ALWAYS_USED = ("nuisances.", "observation.temperature_c")
 #: Longest value in a command; a longer one is in the study file.
 MOST_CHARACTERS = 500
-#: Name of the study file in a command that needs it.
-STUDY_FILE = "study.toml"
-
-#: Arguments of verbs for what their command does if a flare is given.
-OPTIONS = {"simulate": ", flaring=True"}
 
 PROGRAM = """from mauvecl import Engine, Study, {verb}
 
@@ -248,7 +243,7 @@ def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[
 
 def as_command(verb: str, study: Study) -> str:
     """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
-    question, from_file = VERBS[verb], shlex.join(["mauvecl", verb, STUDY_FILE])
+    question, from_file = VERBS[verb], shlex.join(["mauvecl", verb, "study.toml"])
     if any(file is not None for file in (study.flare.spectrum.file, *(star.file for star in study.star))):
         return from_file
     base = Study().with_settings([f"{key}={value}" for key, value in (question.defaults or {}).items()])
@@ -264,7 +259,10 @@ def as_command(verb: str, study: Study) -> str:
         elif name == "sky":
             words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
         else:
-            words += _flag_words(name, value, question) or ["--set", f"{name}={_toml(value)}"]
+            # TOML on one line is JSON with another separator, and bare keys.
+            toml = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
+            toml = re.sub(r'"(\w+)" = ', r"\1 = ", toml, flags=re.ASCII)
+            words += _flag_words(name, value, question) or ["--set", f"{name}={toml}"]
     return from_file if max(map(len, words)) > MOST_CHARACTERS else shlex.join(words)
 
 
@@ -304,12 +302,6 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
 def _text(value: str | float) -> str:
     """Return a value as it is typed, with every digit of a number."""
     return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
-
-
-def _toml(value: Any) -> str:
-    """Return a value as TOML on one line: as JSON with another separator, and bare keys."""
-    text = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
-    return re.sub(r'"(\w+)" = ', r"\1 = ", text, flags=re.ASCII)
 
 
 #: Held while matplotlib draws.
@@ -366,6 +358,8 @@ def commands_and_programs(tab: Tab, question: FieldValues, folder: Path) -> list
         for key, value in keys_used(VERBS[verb], study, Study()):
             set_key(keys, key.split("."), value, key)
         text = pformat(keys, width=100, sort_dicts=False).replace("\n", "\n    ")
-        program = PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
+        # The command does so if a flare is given.
+        options = ", flaring=True" if verb == "simulate" else ""
+        program = PROGRAM.format(verb=verb, data=text, options=options)
         entries.append({"question": name, "command": as_command(verb, study), "python": program})
     return entries
