@@ -59,11 +59,6 @@ class StarDetection(InCell):
     #: Closed-form chances if everything but the noise were known, shape (n_flare, n_statistic); None if it is known.
     ideal: NDArray[np.float64] | None = None
 
-    @property
-    def shown(self) -> tuple[str, Detection, list[str]]:
-        """Title, detection and names of the flares, for pictures."""
-        return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
-
 
 def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
     amplitude = amplitude_column(

@@ -77,17 +77,7 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
     """Compare an answer's folder with the digests in its run record.
 
     Any change of a file of the run, and of the record itself, is detected, unless digests are also recomputed: the
-    digest is not a signature. Other files in the folder are ignored.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Value of a verb's ``--output``.
-
-    Returns
-    -------
-    list of FileFault
-        Empty if all files are unchanged.
+    digest is not a signature. Other files in the folder, the value of a verb's ``--output``, are ignored.
     """
     folder = Path(folder)
     if not is_answer(folder):
@@ -189,18 +179,9 @@ def write_document(content: Callable[[], bytes], path: Path) -> Path:
 
 
 def write_record(
-    verb: str,
-    study: Mapping[str, Any],
-    expectations: Sequence[Expectation],
-    folder: Path,
-    *,
-    pool: Pool | None,
-    opened: Device | None = None,
-    seconds: float,
-    messages: Sequence[str],
-    files: Sequence[Path] | None = None,
-    whole: bool = True,
-) -> Path:
+    verb: str, study: Mapping[str, Any], expectations: Sequence[Expectation], folder: Path, *, pool: Pool | None,
+    opened: Device | None = None, seconds: float, messages: Sequence[str], files: Sequence[Path], whole: bool = True,
+) -> Path:  # fmt: skip
     """Write the run record, which says how an answer was computed.
 
     The study is as JSON can hold it. `opened` is the device if something was drawn without a pool. The record contains
@@ -223,10 +204,8 @@ def write_record(
         record |= _devices(pool.devices, pool.kernel_digest) | {"shards": asdict(pool.standing)}
     elif opened is not None:
         record |= _devices([opened.record], opened.kernel_digest)
-    stale: list[Path] = []
-    if files is not None:
-        record["files"] = {path.name: digest_of(path) for path in files}
-        stale = [path for path in _left_by_another(folder) if path.name not in record["files"]] if whole else []
+    record["files"] = {path.name: digest_of(path) for path in files}
+    stale = [path for path in _left_by_another(folder) if path.name not in record["files"]] if whole else []
     # Converted to JSON and back, so that the digest of a record that is read again is the same.
     record = json.loads(json_text(record))
     record[OWN_DIGEST] = record_digest(record)

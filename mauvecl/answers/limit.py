@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_columns
-from mauvecl.answers.limit_search import LimitSearch, Point, Report, settle
+from mauvecl.answers.limit_search import LimitSearch, Point, settle
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
@@ -50,19 +50,15 @@ if TYPE_CHECKING:
 def what_matters(study: Study) -> QTable:
     """Compute the closed-form limits of a study with each assumption at both ends of its range.
 
-    Returns
-    -------
-    QTable
-        One row per star, flare, statistic and assumption; for each limit, the assumption that changes it most first.
+    The table has one row per star, flare, statistic and assumption; for each limit, that which changes it most first.
     """
     rows, flares = [], _single_flares(cases(study, swept=False))
     for single, statistic in product(flares, study.run.statistics):
         rows += sorted(_moves(single, statistic), key=lambda row: -row["span"])
     columns = assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
-    for column in columns:
-        if column.format == LIMIT:
-            table[column.name].info.format = LIMIT
+    for name in (study.limit.of, "at_low_end", "at_high_end", "span"):
+        table[name].info.format = LIMIT
     return table
 
 
@@ -302,7 +298,7 @@ class LimitAnswer(Answer):
         return [*failed, *stars, *unknown]
 
 
-def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = None) -> Limit:
+def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None]) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
     Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
