@@ -213,13 +213,12 @@ class Answer(Drawable, ContentEquality):
     @cached_property
     def neighbours(self) -> QTable | None:
         """Neighbours of the stars that the answer observes, or None."""
+        if not self.study.has_neighbours or "instrument" not in self.uses:
+            return None
         rows, shares = list[dict[str, Any]](), set[float]()
-        for case in self.observed if self.study.has_neighbours and "instrument" in self.uses else ():
-            near = case.neighbours
-            if near is None:
-                continue
+        for case, near in ((case, case.neighbours) for case in self.observed):
             total = float((case.quiet.source_electrons + case.quiet.neighbour_electrons).sum())
-            for star in near.stars:
+            for star in near.stars if near else ():
                 shares.add(case.star.neighbour_share)
                 # Beyond the fibre no spectrum is needed.
                 enters, share, spectrum = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0, ""

@@ -97,14 +97,15 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
     elif record[OWN_DIGEST] != record_digest(record) or text != json_text(record) + "\n":
         faults.append(FileFault(RECORD, "changed"))
     for name, digest in files.items():
-        path = folder / name
+        path, state = folder / name, "missing"
         try:
-            same = path.exists() and check_size(path, "file", LARGEST) and digest_of(path) == digest
+            if path.exists():
+                check_size(path, "file", LARGEST)
+                state = "" if digest_of(path) == digest else "changed"
         except (InputError, OSError):
-            faults.append(FileFault(name, f"no regular file of at most {LARGEST >> 30} GiB"))
-            continue
-        if not same:
-            faults.append(FileFault(name, "changed" if path.exists() else "missing"))
+            state = f"no regular file of at most {LARGEST >> 30} GiB"
+        if state:
+            faults.append(FileFault(name, state))
     return faults
 
 

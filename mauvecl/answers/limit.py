@@ -344,10 +344,8 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
     """
     engine = engine or Engine()
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
-        raise InputError(
-            f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested",
-            key="sweep",
-        )
+        fault = f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested"
+        raise InputError(fault, key="sweep")
     asked = list(product(_single_flares(cases(study)), study.run.statistics))
     steps, lock = [0] * len(asked), Lock()
 
@@ -370,9 +368,9 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
 
     outcomes = list(map_in_order(engine, solved, range(len(asked))))
     errors = [outcome for outcome in outcomes if isinstance(outcome, InputError)]
-    if len(errors) == len(outcomes):
-        raise errors[0]
     limits = [outcome for outcome in outcomes if isinstance(outcome, Limit)]
+    if not limits:
+        raise errors[0]
     return LimitAnswer(study, limits, tuple(dict.fromkeys(map(str, errors))))
 
 

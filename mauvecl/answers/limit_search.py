@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
 
 #: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
-SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (None, 1e6)}
+SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (0.0, 1e6)}
 #: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
 MOST_EVALUATIONS = 8
 
@@ -99,24 +99,21 @@ class LimitSearch:
 
         Each draw of unknown values has its own reference and threshold.
         """
-        each = [draw.simulated(value, seed) for draw in self.draws]
-        probability = average(each) if each else self._detected(value, seed)
+        if self.draws:
+            probability = average([draw.simulated(value, seed) for draw in self.draws])
+        else:
+            assert self.engine is not None
+            quiet, flare = self.pair(value)
+            options = self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
+            detection = self.engine.detect(quiet, [flare], seed=seed, **options)
+            for message in detection.messages:
+                fault = f"{message.rstrip('.')}; some pixel must not be saturated at a limit"
+                raise InputError(f"at a {self.of} of {value:g}: {fault}", key="limit.of")
+            # Raises InputError where no threshold has the false-alarm probability.
+            detection.threshold(self.fap, self.statistic)
+            (probability,) = detection.detection_probability(self.fap, self.statistic)
         self.points.append(Point(value, probability, seed))
         self._report(len(self.points))
-        return probability
-
-    def _detected(self, value: float, seed: int) -> Interval:
-        assert self.engine is not None
-        quiet, flare = self.pair(value)
-        detection = self.engine.detect(
-            quiet, [flare], seed=seed, **self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
-        )
-        for message in detection.messages:
-            fault = f"at a {self.of} of {value:g}: {message.rstrip('.')}; some pixel must not be saturated at a limit"
-            raise InputError(fault, key="limit.of")
-        # Raises InputError where no threshold has the false-alarm probability.
-        detection.threshold(self.fap, self.statistic)
-        (probability,) = detection.detection_probability(self.fap, self.statistic)
         return probability
 
     def curve(self, value: float) -> tuple[tuple[float, float], ...]:
@@ -170,8 +167,7 @@ class LimitSearch:
         return self.case.instrument.frame_s
 
     def _beyond(self, value: float, verb: str) -> InputError:
-        star, (hardest, easiest) = self.case.star, SEARCH[self.of]
-        low, high = sorted((hardest or 0.0, easiest))
+        star, (low, high) = self.case.star, sorted(SEARCH[self.of])
         name = str(star.library or star.file)
         if self.of != "magnitude" and star.magnitude is not None:
             name += f" {star.band} = {star.magnitude:g}"

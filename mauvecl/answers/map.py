@@ -218,8 +218,7 @@ def magnitudes_of(case: Case) -> QuantityAxis:
     question, statistics = case.study.map, case.study.run.statistics
     statistic = RECOMMENDED if RECOMMENDED in statistics else statistics[0]
     values, powers = question.y.points(), (*question.contours, 0.5)
-    ends, saturating, (faint, _) = list[float](), list[float](), SEARCH["magnitude"]
-    assert faint is not None
+    ends, saturating, faint = list[float](), list[float](), SEARCH["magnitude"][0]
     for value in values if isinstance(values[0], str) else (values[0], values[-1]):
         for power in (min(powers), max(powers)):
             limit = LimitQuestion(of="magnitude", power=power)
