@@ -140,9 +140,10 @@ class LimitSearch:
             values = np.arange(first, easiest - 0.1, -0.5).tolist()
         else:
             values = (first * 2.0 ** np.arange(np.ceil(np.log2(easiest / first)) + 1)).tolist()
-        if self.theory(first) >= self.power and self.of == "exposure":
+        exceeds = self.theory(first) >= self.power
+        if exceeds and self.of == "exposure":
             return first
-        if self.theory(first) >= self.power:
+        if exceeds:
             raise self._beyond(first, "already exceeds")
         for before, value in pairwise(values):
             if self.theory(value) < self.power:
