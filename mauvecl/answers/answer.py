@@ -216,9 +216,12 @@ class Answer(Drawable, ContentEquality):
         if not self.study.has_neighbours or "instrument" not in self.uses:
             return None
         rows, shares = list[dict[str, Any]](), set[float]()
-        for case, near in ((case, case.neighbours) for case in self.observed):
+        for case in self.observed:
+            near = case.neighbours
+            if near is None:
+                continue
             total = float((case.quiet.source_electrons + case.quiet.neighbour_electrons).sum())
-            for star in near.stars if near else ():
+            for star in near.stars:
                 shares.add(case.star.neighbour_share)
                 # Beyond the fibre no spectrum is needed.
                 enters, share, spectrum = star.separation_arcsec <= case.instrument.field_of_view_radius_arcsec, 0.0, ""
