@@ -16,7 +16,8 @@ import numpy as np
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, TableOf, ecsv_text
+from mauvecl.answers.answer import Answer, TableOf
+from mauvecl.answers.files import ecsv_text
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.exposure.expectation import expect
 from mauvecl.host.instrument import shipped_names

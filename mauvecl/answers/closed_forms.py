@@ -238,11 +238,8 @@ def throughput_cases(case: Case) -> list[Case]:
             signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
             same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
             if same is None:
-                raise InputError(
-                    "an error of the calibrated wavelengths changes the pixels of the output range, which must end "
-                    "further from a pixel",
-                    key="observation.instrument",
-                )
+                why = "an error of the calibrated wavelengths changes the pixels of the output range"
+                raise InputError(f"{why}, which must end further from a pixel", key="observation.instrument")
             moved.append(same)
     return moved
 
@@ -265,12 +262,7 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
 
     A share is the mean increase of the explained variance when the unknown is added to a linear fit, over all orders of
     adding them (Lindeman, Merenda & Gold 1980; Groemping 2007, doi 10.1198/000313007X188252). Shares from single slopes
-    would count variance twice, since a few draws are correlated by chance.
-
-    Parameters
-    ----------
-    draws : DrawnStudies
-    outcome : ndarray, shape (n_draw,)
+    would count variance twice, since a few draws are correlated by chance. The outcome has the shape (n_draw,).
     """
     names, finite = draws.names, np.isfinite(outcome)
     x, y = draws.values[finite], outcome[finite]

@@ -59,11 +59,6 @@ class StarDetection(InCell):
     #: Closed-form chances if everything but the noise were known, shape (n_flare, n_statistic); None if it is known.
     ideal: NDArray[np.float64] | None = None
 
-    @property
-    def shown(self) -> tuple[str, Detection, list[str]]:
-        """Title, detection and names of the flares, for pictures."""
-        return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
-
 
 def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
     amplitude = amplitude_column(
@@ -231,7 +226,12 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
     def detected(case: Case) -> StarDetection:
         nm = case.quiet.wavelength_nm
         own = [Linear(name, read_at_pixels("weights", name, path, nm)) for name, path in run.weights.items()]
-        how = case.detect_options() | {"statistics": (*run.statistics, *own, *_other_templates(case))}
+        # Matched statistics that search for flares of other temperatures than the study's.
+        setting = Setting(case.quiet, ~case.quiet.saturated, run.comparison())
+        for kelvin in run.template_temperatures_k:
+            (shape,) = case.expect(case.with_value("flare_temperature", kelvin).flaring(case.amplitudes[0]))
+            own.append(Linear(f"matched {kelvin:g} K", Matched().weights_per_dn(setting, shape)))
+        how = case.detect_options() | {"statistics": (*run.statistics, *own)}
         detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
         statistics = [detection.statistic(name) for name in detection.statistics]
         return StarDetection(
@@ -291,16 +291,6 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
         f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of {squares} independent "
         "squares: its faintest pixels make most of it."
     ]
-
-
-def _other_templates(case: Case) -> list[Linear]:
-    """Return matched statistics that search for flares of other temperatures than the study's."""
-    filters, run = [], case.study.run
-    setting = Setting(case.quiet, ~case.quiet.saturated, run.comparison())
-    for kelvin in run.template_temperatures_k:
-        (shape,) = case.expect(case.with_value("flare_temperature", kelvin).flaring(case.amplitudes[0]))
-        filters.append(Linear(f"matched {kelvin:g} K", Matched().weights_per_dn(setting, shape)))
-    return filters
 
 
 def _template_costs(case: Case, star: StarDetection) -> list[str]:
@@ -444,9 +434,8 @@ def unknown_table(study: Study) -> UnknownAnswer:
     for case in prepared:
         for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
             of = case.label, case.quiet, flare
-            costs[case.label, amplitude] = {
-                name: forms.unknown_cost(*of, choice, comparison) for name, choice in SHOWN.items()
-            }
+            each = {name: forms.unknown_cost(*of, choice, comparison) for name, choice in SHOWN.items()}
+            costs[case.label, amplitude] = each
     quiet = [case.quiet for case in prepared]
     return UnknownAnswer(study, costs, collect_messages(quiet), quiet)
 

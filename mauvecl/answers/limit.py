@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_columns
-from mauvecl.answers.limit_search import LimitSearch, Point, Report, settle
+from mauvecl.answers.limit_search import LimitSearch, Point, settle
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.detection.names import RECOMMENDED, check_fap
@@ -50,19 +50,15 @@ if TYPE_CHECKING:
 def what_matters(study: Study) -> QTable:
     """Compute the closed-form limits of a study with each assumption at both ends of its range.
 
-    Returns
-    -------
-    QTable
-        One row per star, flare, statistic and assumption; for each limit, the assumption that changes it most first.
+    The table has one row per star, flare, statistic and assumption; for each limit, that which changes it most first.
     """
     rows, flares = [], _single_flares(cases(study, swept=False))
     for single, statistic in product(flares, study.run.statistics):
         rows += sorted(_moves(single, statistic), key=lambda row: -row["span"])
     columns = assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
-    for column in columns:
-        if column.format == LIMIT:
-            table[column.name].info.format = LIMIT
+    for name in (study.limit.of, "at_low_end", "at_high_end", "span"):
+        table[name].info.format = LIMIT
     return table
 
 
@@ -302,7 +298,7 @@ class LimitAnswer(Answer):
         return [*failed, *stars, *unknown]
 
 
-def solve(case: Case, statistic: str, engine: Engine | Pool, report: Report = None) -> Limit:
+def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None]) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
     Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
@@ -348,10 +344,8 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
     """
     engine = engine or Engine()
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
-        raise InputError(
-            f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested",
-            key="sweep",
-        )
+        fault = f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested"
+        raise InputError(fault, key="sweep")
     asked = list(product(_single_flares(cases(study)), study.run.statistics))
     steps, lock = [0] * len(asked), Lock()
 
@@ -374,9 +368,9 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
 
     outcomes = list(map_in_order(engine, solved, range(len(asked))))
     errors = [outcome for outcome in outcomes if isinstance(outcome, InputError)]
-    if len(errors) == len(outcomes):
-        raise errors[0]
     limits = [outcome for outcome in outcomes if isinstance(outcome, Limit)]
+    if not limits:
+        raise errors[0]
     return LimitAnswer(study, limits, tuple(dict.fromkeys(map(str, errors))))
 
 

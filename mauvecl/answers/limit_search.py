@@ -24,10 +24,8 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
-#: Function that is called with the number of simulations after each of them.
-Report = Callable[[int], None] | None
 #: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
-SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (None, 1e6)}
+SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (0.0, 1e6)}
 #: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
 MOST_EVALUATIONS = 8
 
@@ -48,9 +46,10 @@ class LimitSearch:
     """
 
     def __init__(
-        self, case: Case, statistic: str, engine: Engine | Pool | None = None, report: Report = None,
-        draws: Sequence[LimitSearch] = (),
+        self, case: Case, statistic: str, engine: Engine | Pool | None = None,
+        report: Callable[[int], None] = lambda count: None, draws: Sequence[LimitSearch] = (),
     ) -> None:  # fmt: skip
+        # `report` is called with the number of simulations after each of them.
         self.case, self.statistic, self.engine = case.with_value("amplitude", case.amplitudes[0]), statistic, engine
         self.draws = draws
         self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
@@ -103,26 +102,18 @@ class LimitSearch:
         if self.draws:
             probability = average([draw.simulated(value, seed) for draw in self.draws])
         else:
-            probability = self._detected(value, seed)
+            assert self.engine is not None
+            quiet, flare = self.pair(value)
+            options = self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
+            detection = self.engine.detect(quiet, [flare], seed=seed, **options)
+            for message in detection.messages:
+                fault = f"{message.rstrip('.')}; some pixel must not be saturated at a limit"
+                raise InputError(f"at a {self.of} of {value:g}: {fault}", key="limit.of")
+            # Raises InputError where no threshold has the false-alarm probability.
+            detection.threshold(self.fap, self.statistic)
+            (probability,) = detection.detection_probability(self.fap, self.statistic)
         self.points.append(Point(value, probability, seed))
-        if self._report is not None:
-            self._report(len(self.points))
-        return probability
-
-    def _detected(self, value: float, seed: int) -> Interval:
-        assert self.engine is not None
-        quiet, flare = self.pair(value)
-        detection = self.engine.detect(
-            quiet, [flare], seed=seed, **self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
-        )
-        for message in detection.messages:
-            raise InputError(
-                f"at a {self.of} of {value:g}: {message.rstrip('.')}; some pixel must not be saturated at a limit",
-                key="limit.of",
-            )
-        # Raises InputError where no threshold has the false-alarm probability.
-        detection.threshold(self.fap, self.statistic)
-        (probability,) = detection.detection_probability(self.fap, self.statistic)
+        self._report(len(self.points))
         return probability
 
     def curve(self, value: float) -> tuple[tuple[float, float], ...]:
@@ -149,9 +140,10 @@ class LimitSearch:
             values = np.arange(first, easiest - 0.1, -0.5).tolist()
         else:
             values = (first * 2.0 ** np.arange(np.ceil(np.log2(easiest / first)) + 1)).tolist()
-        if self.theory(first) >= self.power:
-            if self.of == "exposure":
-                return first
+        exceeds = self.theory(first) >= self.power
+        if exceeds and self.of == "exposure":
+            return first
+        if exceeds:
             raise self._beyond(first, "already exceeds")
         for before, value in pairwise(values):
             if self.theory(value) < self.power:
@@ -176,18 +168,16 @@ class LimitSearch:
         return self.case.instrument.frame_s
 
     def _beyond(self, value: float, verb: str) -> InputError:
-        star, (hardest, easiest) = self.case.star, SEARCH[self.of]
-        low, high = sorted((hardest or 0.0, easiest))
+        star, (low, high) = self.case.star, sorted(SEARCH[self.of])
         name = str(star.library or star.file)
         if self.of != "magnitude" and star.magnitude is not None:
             name += f" {star.band} = {star.magnitude:g}"
         flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.case.amplitudes[0]:.3g} %"
-        return InputError(
+        fault = (
             f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at "
-            f"{self.of} = {value:g}; a limit must lie between {low:g} and {high:g}"
-            f"{self.clauses(value)}",
-            key="limit.of",
+            f"{self.of} = {value:g}; a limit must lie between {low:g} and {high:g}{self.clauses(value)}"
         )
+        return InputError(fault, key="limit.of")
 
     def clauses(self, value: float) -> str:
         """Return the clauses of an error message on saturation, and on a weighted sum that the flare lowers."""
@@ -241,11 +231,8 @@ def _settle(question: LimitSearch, start: float) -> Interval:
     of, seed = question.of, question.case.study.run.seed
     slope, goal = question.slope(start), float(special.ndtri(question.power))
     if not slope > 0:
-        raise InputError(
-            f"the detection probability must rise towards an easier {of}, but does not at {start:g}"
-            f"{question.clauses(start)}",
-            key="limit.of",
-        )
+        fault = f"the detection probability must rise towards an easier {of}, but does not at {start:g}"
+        raise InputError(f"{fault}{question.clauses(start)}", key="limit.of")
     at, n = _coordinate(of, start), question.case.study.run.realisations
     for _ in range(MOST_EVALUATIONS):
         p = question.simulated(_value(of, at), seed)
@@ -257,11 +244,8 @@ def _settle(question: LimitSearch, start: float) -> Interval:
             ends = [_value(of, at + (goal - q) / slope) for q in (low, high)]
             return Interval(_value(of, at + move), min(ends), max(ends))
         at += float(np.clip(move, -0.75, 0.75))
-    raise InputError(
-        f"the limit of {of} must settle within {MOST_EVALUATIONS} simulations, but did not near {_value(of, at):g}"
-        f"{question.clauses(_value(of, at))}",
-        key="limit.of",
-    )
+    fault = f"the limit of {of} must settle within {MOST_EVALUATIONS} simulations, but did not near {_value(of, at):g}"
+    raise InputError(f"{fault}{question.clauses(_value(of, at))}", key="limit.of")
 
 
 def _settle_frames(question: LimitSearch, start: float) -> Interval:

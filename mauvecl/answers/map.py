@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -153,7 +154,9 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     unknown = forms.drawn(case.study) if study.unknowns.draws else None
     draws = [case] if unknown is None else [replace(case, study=draw) for draw in unknown.studies]
     x, y = study.map.axes
-    cells = Cells(x.points(), y.points(), engine or Engine(), len(draws), progress)
+    total = len(draws) * len(x.points()) * len(y.points())
+    report = (lambda done: None) if progress is None else (lambda done: progress(done, total))
+    cells = Cells(x.points(), y.points(), engine or Engine(), report)
     maps = [cells.map_of(draw) for draw in draws]
     values, parts = maps[0], {}
     if unknown is not None:
@@ -215,8 +218,7 @@ def magnitudes_of(case: Case) -> QuantityAxis:
     question, statistics = case.study.map, case.study.run.statistics
     statistic = RECOMMENDED if RECOMMENDED in statistics else statistics[0]
     values, powers = question.y.points(), (*question.contours, 0.5)
-    ends, saturating, (faint, _) = list[float](), list[float](), SEARCH["magnitude"]
-    assert faint is not None
+    ends, saturating, faint = list[float](), list[float](), SEARCH["magnitude"][0]
     for value in values if isinstance(values[0], str) else (values[0], values[-1]):
         for power in (min(powers), max(powers)):
             limit = LimitQuestion(of="magnitude", power=power)
@@ -247,27 +249,23 @@ def _shown(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
-#: Values of an axis.
-Values = tuple[float | str, ...]
 Arrays = dict[str, NDArray[np.float64]]
-#: A statistic, and the indices of a cell in which the flare lowers it.
-Lowered = tuple[str, int, int]
 
 
 @dataclass(eq=False)
 class Cells:
     """Cells of a map, and what their computation finds for messages."""
 
-    x: Values
-    y: Values
+    x: tuple[float | str, ...]
+    y: tuple[float | str, ...]
     engine: Engine | Pool
-    n_maps: int
-    progress: Progress
-    done: int = 0  # cells of all maps
+    progress: Callable[[int], None]  # called with the number of cells that are done, of all maps
+    done: int = 0
     quiet: list[Expectation] = field(default_factory=list)
     saturated: list[str] = field(default_factory=list)  # messages on flares that saturate
-    lowered: set[Lowered] = field(default_factory=set)  # weighted sums that flares lower
-    failed: dict[str, int] = field(default_factory=dict)  # number of cells without an answer by the reason
+    # Weighted sums that flares lower: the statistic and the indices of the cell.
+    lowered: set[tuple[str, int, int]] = field(default_factory=set)
+    failed: Counter[str] = field(default_factory=Counter)  # number of cells without an answer by the reason
 
     def map_of(self, case: Case) -> Arrays:
         """Compute the map on the instrument of a case."""
@@ -279,10 +277,10 @@ class Cells:
             quiet, flares = group[0].quiet, group[0].expect(*(cell.flaring(cell.amplitudes[0]) for cell in group))
             if not quiet.saturated.all():
                 try:
-                    self.lowered.update(_fill(values, cells, group[0], flares, self.engine))
+                    self._fill(values, cells, group[0], flares)
                 except InputError as error:
                     # Too few pixels may be left in some cells; the others have an answer.
-                    self.failed[str(error)] = self.failed.get(str(error), 0) + len(cells)
+                    self.failed[str(error)] += len(cells)
                     if self.failed[str(error)] == len(self.x) * len(self.y):
                         raise
             return quiet, len(cells), of_kind(collect_messages(flares), SATURATED)
@@ -296,9 +294,26 @@ class Cells:
             self.quiet.append(quiet)
             self.saturated.extend(texts)
             self.done += count
-            if self.progress is not None:
-                self.progress(self.done, self.n_maps * len(self.x) * len(self.y))
+            self.progress(self.done)
         return values
+
+    def _fill(self, values: Arrays, cells: list[tuple[int, int]], case: Case, flares: list[Expectation]) -> None:
+        """Compute cells that share the quiescent star of a case."""
+        run = case.study.run
+        result = self.engine.detect(case.quiet, flares, seed=run.seed, **case.detect_options())
+        ideal = forms.ideal_chances(case, flares, [result.statistic(name) for name in run.statistics])
+        for s, statistic in enumerate(run.statistics):
+            probabilities = result.detection_probability(run.fap, statistic)
+            for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
+                at = (s, j, i)
+                values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
+                limit = result.closed_form(statistic, template=k).isf(run.fap)
+                if ideal is not None:
+                    values["ideal"][at] = ideal[k, s]
+                if k not in result.blinding:
+                    values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+                if result.fall(statistic, k):
+                    self.lowered.add((statistic, i, j))
 
 
 def _averaged(maps: list[Arrays]) -> Arrays:
@@ -316,25 +331,3 @@ def _cell(case: Case, x: float | str, y: float | str) -> Case:
     """Return the case of a cell."""
     across, along = case.study.map.axes
     return case.with_value(across.quantity, x).with_value(along.quantity, y)
-
-
-def _fill(
-    values: Arrays, cells: list[tuple[int, int]], case: Case, flares: list[Expectation], engine: Engine | Pool
-) -> list[Lowered]:
-    """Compute cells that share the quiescent star of a case, and return the weighted sums that their flares lower."""
-    run, lowered = case.study.run, []
-    result = engine.detect(case.quiet, flares, seed=run.seed, **case.detect_options())
-    ideal = forms.ideal_chances(case, flares, [result.statistic(name) for name in run.statistics])
-    for s, statistic in enumerate(run.statistics):
-        probabilities = result.detection_probability(run.fap, statistic)
-        for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
-            at = (s, j, i)
-            values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
-            limit = result.closed_form(statistic, template=k).isf(run.fap)
-            if ideal is not None:
-                values["ideal"][at] = ideal[k, s]
-            if k not in result.blinding:
-                values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
-            if result.fall(statistic, k):
-                lowered.append((statistic, i, j))
-    return lowered

@@ -126,13 +126,14 @@ class ExpectedMeasurement(InCell):
         """
         kelvin, linear = np.exp(self.perfect.log_k[0]), self.perfect.amplitudes[0]
 
-        def at(factor: float) -> Forecast:
+        ahead = []
+        for factor in factors:
             try:
-                return forecast_model(self.quiet, self.fitted, kelvin, factor * linear, unknown, self.skipped_nm)
+                one = forecast_model(self.quiet, self.fitted, kelvin, factor * linear, unknown, self.skipped_nm)
             except InputError:
-                return replace(self.ahead, errors=np.full_like(self.ahead.errors, np.nan))
-
-        return [at(float(factor)) for factor in factors]
+                one = replace(self.ahead, errors=np.full_like(self.ahead.errors, np.nan))
+            ahead.append(one)
+        return ahead
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
         """Return temperatures of the expected confidence region, with the smallest and largest amplitude at each.
@@ -294,9 +295,8 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
     study, asked = case.study, case.study.measure
     staring, events = case.stare_expectation, case.events
     if asked.joint_fit and len(events) != 1:
-        raise InputError(
-            f"a joint fit needs a stare with a single flare, but it has {len(events)}", key="measure.joint_fit"
-        )
+        fault = f"a joint fit needs a stare with a single flare, but it has {len(events)}"
+        raise InputError(fault, key="measure.joint_fit")
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
     models = models_of(case.one_frame)
     single = [(name, one) for name, one in models.items() if isinstance(one, FlareModel)]
@@ -315,20 +315,18 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
     depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
     raw = kept(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
-    where = case.label, case.at, name, staring, tuple(events)
     joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
-    if asked.snr_per_bin is None:
-        return MeasuredStare(*where, None, None, joint)
-    try:
-        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare,
-                             skipped_nm=asked.skipped_nm)  # fmt: skip
-    except InputError as error:
-        sentence = f"No flare of {case.label} is measured along the stare: {error}."
-        return MeasuredStare(*where, None, None, joint, sentence)
-    perfect = fit_bins(
-        staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count, skipped_nm=asked.skipped_nm
-    )
-    return MeasuredStare(*where, bins, perfect, joint)
+    bins, perfect, unmeasured, skipped = None, None, "", asked.skipped_nm
+    if asked.snr_per_bin is not None:
+        try:
+            bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare,
+                                 skipped_nm=skipped)  # fmt: skip
+        except InputError as error:
+            unmeasured = f"No flare of {case.label} is measured along the stare: {error}."
+    if bins is not None:
+        mean = staring.mean_raw
+        perfect = fit_bins(mean, quiet, model, unknown, stare, bins.first, bins.count, skipped_nm=skipped)
+    return MeasuredStare(case.label, case.at, name, staring, tuple(events), bins, perfect, joint, unmeasured)
 
 
 def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:

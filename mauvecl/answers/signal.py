@@ -88,8 +88,7 @@ class ExposureAnswer(Answer):
     @property
     def headline(self) -> str:
         """The exposure of the first star."""
-        first = self.exposures[0]
-        least = first_of(len(self.exposures), "stars")
+        first, least = self.exposures[0], first_of(len(self.exposures), "stars")
         return (
             f"{first.star} reaches an S/N of {first.wanted:g} per {first.per} at {first.wavelength_nm:g} nm in "
             f"{first.exposure_s:g} s, {first.frames} frame{'' if first.frames == 1 else 's'}{least}."
@@ -168,11 +167,11 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
 
     single = after(1)
     if not single > 0 or (snr / single) ** 2 * case.instrument.frame_s > LONGEST_S:
-        raise InputError(
+        fault = (
             f"{case.one_frame.label} has an S/N of {single:.3g} per {per} at {wavelength_nm:g} nm in one frame, but "
-            f"must reach {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}",
-            key="signal.snr",
+            f"must reach {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}"
         )
+        raise InputError(fault, key="signal.snr")
     # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.
     frames = max(int(np.ceil((snr / single) ** 2)), 1)
     while frames > 1 and after(frames - 1) >= snr:
@@ -262,13 +261,9 @@ class SimulateAnswer(Answer):
 
 @by_keywords("stars")
 def simulate(
-    study: Study,
-    engine: Engine | Pool | None = None,
-    progress: Progress = None,
-    *,
-    realisation: FirstRealisation = 0,
-    flaring: bool = False,
-) -> SimulateAnswer:
+    study: Study, engine: Engine | Pool | None = None, progress: Progress = None, *,
+    realisation: FirstRealisation = 0, flaring: bool = False,
+) -> SimulateAnswer:  # fmt: skip
     """Simulate one observation of every star of a study, by component.
 
     The NumPy reference implementation draws. Usual unknowns are left out: the question is about the noise.

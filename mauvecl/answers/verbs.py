@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from mauvecl.study.keywords import Keyword
     from mauvecl.study.study import Study
 
-    #: Function of a command's flags that returns the study where no file is given.
-    DefaultStudy = Callable[[dict[str, Any]], Study]
-
 #: Function that is called as ``progress(done, total)``; it may raise to stop the work.
 Progress = Callable[[int, int], None] | None
 
@@ -43,6 +40,7 @@ STAR = (
 INSTRUMENT = ("observation.instrument", "observation.temperature_c")
 #: Those of every verb that observes.
 OBSERVATION = (*(f"star.{key}" for key in STAR), "observation.exposure_s", *INSTRUMENT, "sky")
+WITHOUT_EXPOSURE = tuple(key for key in OBSERVATION if key != "observation.exposure_s")
 SIZE = ("star.distance_pc", "star.radius_rsun", "star.effective_temperature_k")
 SIGNAL = ("observation.signal",)
 DRAWS = ("run.realisations", "run.seed")
@@ -75,11 +73,10 @@ class Verb:
     common: tuple[str, ...] = ()  # parameters of flags that `--help` shows in addition to `COMMON`
     counts: str = ""  # what the command line's progress bar counts; empty if a closed form answers at once
     observation: tuple[str, ...] = OBSERVATION  # keys of an observation, or their replacements
-    without: str = ""  # key of the observation that the command does not take
     # Values of keys where neither a study file nor a flag is given, if they differ from the study's.
     defaults: Mapping[str, Any] | None = None
     # Makes the study from the flags where no file is given; the paper's question by default.
-    default: DefaultStudy | None = None
+    default: Callable[[dict[str, Any]], Study] | None = None
     # Whether the page has a tab with this answer; one without a class of its own shows its first view.
     tab: bool = False
     # Module of `mauvecl.answers` that holds the function, if it is not named after it; it is imported at the first use.
@@ -92,12 +89,12 @@ class Verb:
 
     def accepts(self, key: str) -> bool:
         """Return whether the command has the flags of a key or section of the study."""
-        return key != self.without and any(key == prefix or key.startswith(f"{prefix}.") for prefix in self.keys)
+        return any(key == prefix or key.startswith(f"{prefix}.") for prefix in self.keys)
 
     @property
     def keys(self) -> tuple[str, ...]:
         """Keys and sections of the study that the verb takes, in the order of `--help-all`."""
-        return tuple(key for key in (*self.observation, *self.takes) if key != self.without)
+        return (*self.observation, *self.takes)
 
     def study_of(
         self, given: dict[str, Any], keywords: Mapping[str, Keyword], study: Study | None, where: str
@@ -138,8 +135,7 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
     """Return the study of the paper's noise budgets if no flag names a star, else the default one."""
     from mauvecl.study.study import PAPER_BUDGETS, Study
 
-    named = any(given[name] for name in ("star", "magnitude", "exposure", "sweep"))
-    return Study() if named else PAPER_BUDGETS
+    return Study() if any(given[name] for name in ("star", "magnitude", "exposure", "sweep")) else PAPER_BUDGETS
 
 
 def _formula_grid(given: dict[str, Any]) -> Study:
@@ -202,7 +198,7 @@ VERBS: dict[str, Verb] = {
     """,
             ("signal", *SIGNAL),
             common=("snr", "at", "per", "sky"),
-            without="observation.exposure_s",
+            observation=WITHOUT_EXPOSURE,
             home="signal",
         ),
         Verb(
@@ -297,7 +293,7 @@ VERBS: dict[str, Verb] = {
             group="simulate",
             common=("duration", "orbit_gap", "half_width", "energy", "distance", "with_unknowns"),
             counts="stares",
-            without="observation.exposure_s",
+            observation=WITHOUT_EXPOSURE,
         ),
         Verb(
             "inject",
@@ -314,7 +310,7 @@ VERBS: dict[str, Verb] = {
             (*FLARE_LIGHT, *FRAMES, "nuisances.usual", *SIZE, "search", "injections", "run.seed", "sweep"),
             common=("duration", "orbit_gap", "distance", "false_alarms", "alarms_per", "injections", "with_unknowns"),
             counts="injections",
-            without="observation.exposure_s",
+            observation=WITHOUT_EXPOSURE,
             defaults={"stare.duration_s": 86_400.0},
         ),
         Verb(
@@ -333,7 +329,7 @@ VERBS: dict[str, Verb] = {
             group="analyse",
             common=("mapping", "quality_bits", "false_alarms", "alarms_per", "distance", "report"),
             counts="frames",
-            without="observation.exposure_s",
+            observation=WITHOUT_EXPOSURE,
             tab=True,
         ),
         Verb(

@@ -41,7 +41,11 @@ WIDE = 5.0
 
 def _few(answer: DetectAnswer) -> First[Shown]:
     """Limit the number of stars so that each panel stays readable."""
-    return First([star.shown for star in answer.stars], MOST_STARS, "stars")
+    stars = [
+        (star.title, star.detection, [f"flare {100 * amplitude:g} %" for amplitude in star.amplitudes])
+        for star in answer.stars
+    ]
+    return First(stars, MOST_STARS, "stars")
 
 
 @picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))

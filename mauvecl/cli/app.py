@@ -71,10 +71,11 @@ def selftest(
     """
     from dataclasses import asdict
 
-    from mauvecl.answers.answer import make_folder, write_json
+    from mauvecl.answers.files import make_folder, write_document
     from mauvecl.device import selftest
     from mauvecl.device.build import read_outcome, write_outcome
     from mauvecl.device.engine import Engine
+    from mauvecl.host.tables.files import json_text
 
     started = time.perf_counter()
     folder = None if output is None else make_folder(output)
@@ -92,7 +93,7 @@ def selftest(
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:
-        write_json(read_outcome(engine.device), folder / "selftest.json")
+        write_document(f"{json_text(read_outcome(engine.device))}\n".encode, folder / "selftest.json")
     if failed:
         raise typer.Exit(1)
 

@@ -234,7 +234,7 @@ def verify(
 
     Example: mauvecl verify frames.zarr --repair
     """
-    from mauvecl.answers.answer import FAULT_COLUMNS, is_answer, verify_answer
+    from mauvecl.answers.files import FAULT_COLUMNS, is_answer, verify_answer
 
     if is_answer(store):
         if repair or redraw or rows is not None:

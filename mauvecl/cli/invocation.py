@@ -132,7 +132,7 @@ class Session(Options):
     @cached_property
     def folder(self) -> Path:
         """Output folder, which is locked from the first use."""
-        from mauvecl.answers.answer import make_folder
+        from mauvecl.answers.files import make_folder
         from mauvecl.runs.checkpoint import locked
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
@@ -240,7 +240,7 @@ class Session(Options):
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""
-        from mauvecl.answers.answer import write_document, write_record, write_table
+        from mauvecl.answers.files import write_document, write_record, write_table
         from mauvecl.charts.matplotlib import available
 
         for name, table in answer.files.items():

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from mauvecl.answers.answer import has_table, write_table
+from mauvecl.answers.files import write_table
 from mauvecl.answers.verbs import VERBS, Progress
 from mauvecl.schema.columns import View, without_empty
 from mauvecl.schema.errors import InputError
@@ -186,9 +186,7 @@ class Tab:
         """Return whether one of `files` can be downloaded: whether the answer it needs is simulated and has it."""
         needed = self.files[name]
         # An answer may lack tables of what was not asked.
-        return needed is None or (
-            needed in answers and (self.own_table is not None or has_table(answers[needed], name))
-        )
+        return needed is None or (needed in answers and (self.own_table is not None or answers[needed].has_table(name)))
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`."""
