@@ -425,33 +425,29 @@ def expect(
     n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
         raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
-    needed_nm = (instrument.output_min_nm, instrument.output_max_nm)
-    check_covers(source, needed_nm, f"{instrument.name}'s output range ")
+    check_covers(source, (instrument.output_min_nm, instrument.output_max_nm), f"{instrument.name}'s output range ")
     check_level(source, source.name, "magnitude")
     source = continued_to_reach(source, instrument)
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
     electrons = _electrons_per_frame(source, instrument, order)
     nothing = np.zeros(electrons.shape)
     near = nothing if neighbours is None else instrument.frame_s * neighbours.electrons_per_second(instrument, order)
-    asked: dict[str, str] = {"order": order, "signal": signal, "requested exposure": f"{exposure:g} s"}
-    asked["exposure"] = f"{n_frames} x {instrument.frame_s:g} s"
+    asked: dict[str, str] = {"order": order, "signal": signal, "requested exposure": f"{exposure:g} s",
+                             "exposure": f"{n_frames} x {instrument.frame_s:g} s"}  # fmt: skip
     asked |= {} if neighbours is None else neighbours.provenance(instrument)
     x = Expectation(
         **_detector(instrument),
         source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
         sky_electrons=nothing if zodiacal is None else _electrons_per_frame(zodiacal, instrument, order).clip(0.0),
         neighbour_electrons=_faint_enough(near, "a neighbour"),
-        n_frames=n_frames,
-        signal=signal,
-        name=source.name,
+        n_frames=n_frames, signal=signal, name=source.name,
         provenance=_provenance(source, instrument, sky, zodiacal) | asked,
-    )
+    )  # fmt: skip
     drawn = np.sqrt(x.variance_dn2) / (n_frames * x.gain_dn_per_electron)
     messages = [*_saturation(x), *(f"{source.name}: {text}." for text in source.messages)]
     messages += [] if neighbours is None else neighbours.messages(source.name, instrument)
     messages += negative_means_message(source, instrument, electrons, drawn, order)
-    messages += _remarks(x, exposure, source, instrument)
-    return replace(x, messages=tuple(messages))
+    return replace(x, messages=(*messages, *_remarks(x, exposure, source, instrument)))
 
 
 def _electrons_per_frame(light: Source, instrument: Instrument, order: Order) -> Float:

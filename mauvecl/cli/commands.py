@@ -238,11 +238,8 @@ def verify(
 
     if is_answer(store):
         if repair or redraw or rows is not None:
-            raise InputError(
-                f"{str(store)!r} is the folder of an answer, but --repair, --redraw and --rows are for stores; "
-                "give the command of the answer with --restart to write it again",
-                key="store",
-            )
+            text = f"{str(store)!r} is the folder of an answer, but --repair, --redraw and --rows are for stores; "
+            raise InputError(f"{text}give the command of the answer with --restart to write it again", key="store")
         faults: Sequence[Any] = verify_answer(store)
         columns: Sequence[Column] = FAULT_COLUMNS
         left = len(faults)
@@ -255,15 +252,15 @@ def verify(
         with Meter(quiet=quiet or as_json, unit="chunks") as meter:
             faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
         columns, left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
-        source = "with what was written" if not redraw else "with what the engine draws"
-        outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."
+        whole = f"Everything agrees with what {'the engine draws' if redraw else 'was written'}."
+        outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else whole
     found = [asdict(fault) for fault in faults]
     if as_json:
         print(json.dumps(found, indent=2))
-    else:
-        if found:
-            show_view(View(f"Not as it was written: {store}", columns, found))
-        show([outcome] if outcome else [])
+    elif found:
+        show_view(View(f"Not as it was written: {store}", columns, found))
+    if outcome and not as_json:
+        show([outcome])
     if left:
         raise typer.Exit(1)
 
