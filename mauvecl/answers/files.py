@@ -74,10 +74,10 @@ def is_answer(folder: Path) -> bool:
 
 @validated
 def verify_answer(folder: str | Path) -> list[FileFault]:
-    """Compare an answer's folder with the digests in its run record.
+    """Compare an answer's folder, the value of a verb's ``--output``, with the digests in its run record.
 
     Any change of a file of the run, and of the record itself, is detected, unless digests are also recomputed: the
-    digest is not a signature. Other files in the folder, the value of a verb's ``--output``, are ignored.
+    digest is not a signature. Other files in the folder are ignored.
     """
     folder = Path(folder)
     if not is_answer(folder):
