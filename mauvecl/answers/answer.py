@@ -254,6 +254,9 @@ class Answer(Drawable, ContentEquality):
         """Remarks below the tables."""
         return []
 
+    def _line(self) -> str:
+        return repr(self.headline) if self.headline else f"to {self.study!r}"
+
     def __str__(self) -> str:
         """Return what the command prints, without details."""
         parts = [self.headline, *map(str, self.all_views), "Assumed:", *(f"  {clause}" for clause in self.premises)]

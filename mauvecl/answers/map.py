@@ -31,7 +31,7 @@ from mauvecl.study.cases import (
     star_label,
     worst_first,
 )
-from mauvecl.study.questions import QUANTITIES, LimitQuestion, QuantityAxis
+from mauvecl.study.questions import QUANTITIES, Axis, LimitQuestion
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
     return [*messages, *forms.marginal_lines(study.nuisances), *forms.cost_lines([cost], study.nuisances)]
 
 
-def magnitudes_of(case: Case) -> QuantityAxis:
+def magnitudes_of(case: Case) -> Axis:
     """Return the magnitudes over which a star's flares are lost, by the closed form.
 
     They reach from where the least visible flare of the vertical axis is detected, or the star's brightest pixel
@@ -242,7 +242,7 @@ def magnitudes_of(case: Case) -> QuantityAxis:
             break
     high = max(high, low + 1)
     start, stop = (round(float(end * step), 2) for end in (low, high))
-    return QuantityAxis(quantity="magnitude", start=start, stop=stop, steps=int(high - low) + 1)
+    return Axis(quantity="magnitude", start=start, stop=stop, steps=int(high - low) + 1)
 
 
 def _shown(value: float | str) -> str:

@@ -230,19 +230,22 @@ class Quantities:
 
     @classmethod
     def of(cls, file: TableFile, mapping: FrameMapping) -> Quantities:
-        """Find the quantities of a mapping."""
+        """Find the quantities of a mapping, and check their rows before any is read."""
         times = tuple(file.axis(mapping.flux, 2) if name == "wcs" else file.find(name) for name in mapping.times)
         names = {name: getattr(mapping, name) for name in ("flux", "error", "quality", "exposure", "temperature")}
         found: dict[str, Any] = {key: None if name is None else file.find(name) for key, name in names.items()}
-        one = cls(times, **found | {"quality": _flags(found["quality"])}, wavelength=_wavelength(file, mapping))
+        one = cls(times, **found, wavelength=_wavelength(file, mapping))
         nm, flux = one.wavelength, one.flux
         if nm is None or not nm.shape == flux.shape == times[0].shape or isinstance(file, FolderFile):
-            return one
+            _check_rows(file, one)
+            return replace(one, quality=_flags(one.quality))
         if 32 * flux.n_rows > (most := limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")):
             fault = f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}"
             limit = "MAUVECL_LARGEST_CONTENT_MIB"
             raise InputError(f"{fault}; {limit} sets the limit", key=limit)
-        return one._of_frames(nm, file.what)
+        one = replace(one, quality=_flags(one.quality))._of_frames(nm, file.what)
+        _check_rows(file, one)
+        return one
 
     def _of_frames(self, wavelength: Values, what: str) -> Quantities:
         """Return the quantities of a long table with a row for each frame; errors and flags for each pixel.
@@ -387,7 +390,6 @@ def _frames_in(file: TableFile, mapping: FrameMapping, stem: str, reduced: Light
     """Build frames from a file and the names of its quantities; with `reduced` light, which is not read again."""
     what, header = file.what, file.header
     found = Quantities.of(file, mapping)
-    _check_rows(file, found)
     time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
     each = _conditions(file, found, mapping, between_edges_s)
     bits = QualityBits.of(header, mapping.quality_bits, what)

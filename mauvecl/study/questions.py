@@ -131,7 +131,7 @@ Number = Annotated[float, Range()]
 NumberOrName = Annotated[float | str, Accepted("a number or a name")]
 
 
-class QuantityAxis(Section):
+class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
     quantity: Annotated[QuantityName, Help("Quantity that varies")]
@@ -187,14 +187,14 @@ class QuantityAxis(Section):
 class MapQuestion(Section):
     """Axes and contour levels of a map of the detection probability."""
 
-    x: QuantityAxis | None = setting(
+    x: Axis | None = setting(
         None,
         "Horizontal axis of the map; such as magnitude:4:10:16, or exposure=5,50,600",
         flag=Flag("--x", kind=str, read=read_axis),
         usual="the magnitudes over which the flares are lost",
     )
-    y: QuantityAxis = setting(
-        QuantityAxis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True),
+    y: Axis = setting(
+        Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True),
         "Vertical axis of the map; such as amplitude:0.01:1:16:log",
         flag=Flag("--y", kind=str, read=read_axis),
     )
@@ -207,7 +207,7 @@ class MapQuestion(Section):
             )
 
     @property
-    def axes(self) -> tuple[QuantityAxis, QuantityAxis]:
+    def axes(self) -> tuple[Axis, Axis]:
         """The horizontal and the vertical axis of a map that has been computed."""
         assert self.x is not None
         return self.x, self.y
@@ -226,7 +226,7 @@ class Sweep(Section):
             help=Help("Vary the quantities of a sweep together instead of in every combination"),
         ),
     )
-    axes: tuple[QuantityAxis, ...] = setting(
+    axes: tuple[Axis, ...] = setting(
         (),
         "Values of a quantity; as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
         flag=Flag("--sweep", kind=list[str], read=lambda texts, name: [read_axis(text, name) for text in texts]),
@@ -258,9 +258,9 @@ class Sweep(Section):
 
 def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
     """Return the default sweep of `gaussian`, over magnitudes and over exposures, or at a given exposure."""
-    axes = [QuantityAxis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))] if magnitude else []
+    axes = [Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))] if magnitude else []
     exposures = (5.0, 50.0, 600.0) if exposure_s is None else (exposure_s,)
-    return Sweep(axes=(*axes, QuantityAxis(quantity="exposure", values=exposures)))
+    return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
 
 
 def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:

@@ -30,11 +30,11 @@ from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight
 from mauvecl.study.plan import OrbitQuestion, PlanQuestion, PlanTarget
 from mauvecl.study.questions import (
     QUANTITIES,
+    Axis,
     BulkQuestion,
     CampaignQuestion,
     LimitQuestion,
     MapQuestion,
-    QuantityAxis,
     SignalQuestion,
     Sweep,
 )
@@ -421,7 +421,7 @@ def _without_empty(data: Any) -> Any:
 PAPER_BUDGETS = Study(
     star=(Star(library="B2IV", magnitude=3.03), *PAPER_STARS),
     run=Run(realisations=100_000),
-    sweep=Sweep(axes=(QuantityAxis(quantity="exposure", values=(50.0, 600.0)),)),
+    sweep=Sweep(axes=(Axis(quantity="exposure", values=(50.0, 600.0)),)),
 )
 
 

@@ -46,7 +46,7 @@ LIGHT = {
 
 
 def test_every_quantity_is_swept() -> None:
-    axis = Study.model_json_schema()["$defs"]["QuantityAxis"]["properties"]["quantity"]["enum"]
+    axis = Study.model_json_schema()["$defs"]["Axis"]["properties"]["quantity"]["enum"]
     assert set(SWEPT) == set(axis)
 
 

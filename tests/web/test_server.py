@@ -233,7 +233,7 @@ async def test_cancel_ends_every_computation(talk: Talk, server: Server, kind: s
     """Cancel each computation once it has started, and compute the next one; progress never falls."""
     bands = ",".join(f"{start}-{start + 150}" for start in range(210, 450, 12))
     targets = "\n".join(("eps Eri", "AU Mic", "YZ CMi", "AD Leo", "EV Lac", "Vega"))
-    many = link(realisations="4000000", targets=targets, visits="100", changes=bands)
+    many = link(realisations="4000000", targets=targets, days="200", visits="100", changes=bands)
     await talk.answer(many)
     n = await talk.say("simulate", kind=kind, link=many)
     shares, left = [0.0], []
