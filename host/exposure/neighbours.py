@@ -26,14 +26,13 @@ from mauvecl.host.tables.names import (
     divided_unit,
     key_of,
 )
-from mauvecl.host.tables.opening import read_table
-from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.physical import Share
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.tables.table import Rows
 
 Float = NDArray[np.float64]
 
@@ -209,6 +208,10 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     are measured from it; it is needed if there are no separations. Raises InputError if the table has no separations
     and no positions, or a cell is invalid.
     """
+    # Only questions with such a table load the readers of files.
+    from mauvecl.host.tables.opening import read_table
+    from mauvecl.host.tables.table import Rows
+
     path = Path(path)
     named = f"table of neighbours {shortened(path.name)}"
     table = Rows(read_table(path, "table of neighbours"), named, "neighbours")

@@ -88,7 +88,7 @@ class MeasuredFlare(measurements.ExpectedMeasurement):
 
     @property
     def scatter(self) -> Float:
-        """Half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
+        """Half of the width of the central 68.27 % of the estimates, shape (n_derived,); NaN for a single estimate."""
         low, high = np.quantile(self.found.estimates, [0.15865, 0.84135], axis=0)
         return np.asarray((high - low) / 2 if len(self.found.estimates) > 1 else np.full_like(low, np.nan))
 

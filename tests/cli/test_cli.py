@@ -335,7 +335,8 @@ def test_export_to_a_full_disk_keeps_the_earlier_file(name: str, small_disk: Pat
 LIGHT: dict[str, set[str]] = {
     "import mauvecl, mauvecl.cli.app": {"pyopencl", "synphot", "astropy", "scipy"},
     "import mauvecl; mauvecl.expect, mauvecl.Source":
-        {"synphot", "matplotlib", "pyopencl", "specutils", "astropy.table", "astropy.coordinates"},
+        {"synphot", "matplotlib", "pyopencl", "specutils", "astropy.table", "astropy.coordinates",
+         "mauvecl.host.tables.opening"},
     "from mauvecl.cli.app import app; sys.argv[1:] = ['--help']; app(standalone_mode=False)":
         {"pyopencl", "synphot", "astropy", "scipy", "pydantic", "mauvecl.study"},
     "from mauvecl.schema.section import read_ranges; read_ranges(['5:6'], '--gap', expected='', unit='s')": {"astropy"},
