@@ -14,6 +14,9 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -26,7 +29,7 @@ def set_read_only(owner: object, **arrays: ArrayLike) -> None:
         object.__setattr__(owner, name, private)
 
 
-def true_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+def true_runs(flags: Bool) -> NDArray[np.intp]:
     """Return the first index of each run of true values and one past its last, shape (n_run, 2)."""
     return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 

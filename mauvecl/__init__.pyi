@@ -38,9 +38,9 @@ from mauvecl.flares.shapes import SHAPES as SHAPES
 from mauvecl.flares.shapes import TableShape as TableShape
 from mauvecl.flares.stare import Event as Event
 from mauvecl.flares.stare import Stare as Stare
+from mauvecl.host.exposure.background import Sky as Sky
 from mauvecl.host.exposure.expectation import Expectation as Expectation
 from mauvecl.host.exposure.expectation import expect as expect
-from mauvecl.host.exposure.sky import Sky as Sky
 from mauvecl.host.instrument.curves import PixelMap as PixelMap
 from mauvecl.host.instrument.instrument import Instrument as Instrument
 from mauvecl.host.stars.flare import BalmerFlare as BalmerFlare

@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.arrays import ContentEquality, true_runs
+from mauvecl.host.arrays import Bool, ContentEquality, Float, true_runs
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.exposure.neighbours import Neighbours, check_level
+from mauvecl.host.exposure.background import Neighbours, Sky, check_level
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
-from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.spectra.units import SPAN_NM
-from mauvecl.host.stars.coverage import continued
 from mauvecl.host.stars.source import Source, check_covers, listed_star
+from mauvecl.host.stars.spectrum import continued
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
@@ -33,7 +32,6 @@ from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-Float = NDArray[np.float64]
 
 #: Distance of a mean below saturation, in standard deviations of a frame, beyond which saturation is neglected.
 CUT_SIGMA = 8.0
@@ -350,7 +348,7 @@ class Expectation(Drawable, ContentEquality):
         return int(np.floor(self.ceiling_dn))
 
     @cached_property
-    def saturated(self) -> NDArray[np.bool_]:
+    def saturated(self) -> Bool:
         """True for pixels whose mean raw level in a frame reaches `ceiling_dn`, shape (n_pixel,)."""
         return np.asarray(self.mean_raw_dn >= self.ceiling_dn)
 

@@ -20,18 +20,18 @@ from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
-from mauvecl.host.stars.coverage import point_noise
+from mauvecl.host.stars.spectrum import point_noise
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 Order = Literal["paper", "physical"]
-Float = NDArray[np.float64]
 
 #: 1 erg s^-1 cm^-2 A^-1 in W cm^-2 nm^-1.
 W_PER_NM_IN_FLAM = 1e-6

@@ -11,16 +11,14 @@ from typing import Annotated
 
 import astropy.units as u
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from mauvecl.host.arrays import ContentEquality, set_read_only
+from mauvecl.host.arrays import ContentEquality, Float, set_read_only
 from mauvecl.host.tables.files import Numbers, parse_numbers, text_and_name
 from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
-
-Float = NDArray[np.float64]
 
 
 @contextmanager

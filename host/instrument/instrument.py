@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import astropy.units as u
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from numpy.typing import ArrayLike
+from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtr
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.instrument import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.instrument.curves import MAX_PIXELS, PixelMap, SpectralCurve, ThroughputErrors
 from mauvecl.host.tables.files import read_text, toml
@@ -37,39 +38,12 @@ FILE_VERSION = 2
 MAX_EXTENDED = 16
 
 
-#: Class of a value that an instrument file may give as a path.
-Kind = type[SpectralCurve | PixelMap | ThroughputErrors]
-
-
-def _read_entries(path: Path) -> dict[str, tuple[Any, str]]:
-    """Return the values and sources of a file, merged over those of the file that it extends."""
-    entries: dict[str, tuple[Any, str]] = {}
-    for _ in range(MAX_EXTENDED):
-        content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
-        version, extended = content.pop("version", None), content.pop("extends", None)
-        if version not in (None, FILE_VERSION):
-            raise InputError.of("version", version, f"{FILE_VERSION}, or none in files of version 1", where=path.name)
-        if "sources" in content:
-            fault = f"{path.name}: unknown key 'sources'; give each value's source in the value's own table"
-            raise InputError(fault, key="sources")
-        entries = {name: _entry(name, entry, path) for name, entry in content.items()} | entries
-        if extended is None:
-            return entries
-        if version is None and extended == "mauve":
-            extended = FORMERLY_MAUVE
-            warnings.warn(
-                f"{path.name} is read as in version 1, in which mauve was the payload of the paper, now mauvesim; with "
-                f"`version = {FILE_VERSION}` it extends the one that counts electrons.",
-                stacklevel=2,
-            )
-        path = instrument_path(extended, path.parent)
-    fault = f"{path.name} is extended by {MAX_EXTENDED} files one after another, or by itself; the chain must end"
-    raise InputError(fault, key="extends")
-
-
 def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
-    """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path."""
-    kind, source = FILES.get(name), f"A: assumed, no source in {path.name}"
+    """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path.
+
+    The source is empty for a path, whose file states it.
+    """
+    source = f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
         if unknown or "value" not in entry:
@@ -80,19 +54,12 @@ def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
             raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
         source = f"{tag}: {entry.get('source', f'no source in {path.name}')}"
         entry = entry["value"]
-    if kind is not None and isinstance(entry, str):
-        read = kind.read(path.parent / entry)
-        return read, read.source
-    if kind is SpectralCurve and isinstance(entry, int | float) and not isinstance(entry, bool):
-        return SpectralCurve.flat(float(entry), source), source
-    return entry, source
+    return (path.parent / entry, "") if name in PATHS and isinstance(entry, str) else (entry, source)
 
 
 #: Energy of a photon times its wavelength, J nm, and the charge of an electron, C (exact SI values).
 HC_J_NM = 6.62607015e-34 * 299_792_458.0 * 1e9
 ELECTRON_C = 1.602176634e-19
-
-Float = NDArray[np.float64]
 
 
 def _as_curve(value: Any, unit: str) -> Any:
@@ -107,7 +74,7 @@ def _as_curve(value: Any, unit: str) -> Any:
     return _read_path(plain, SpectralCurve)
 
 
-def _read_path(value: Any, kind: Kind) -> Any:
+def _read_path(value: Any, kind: type[SpectralCurve | PixelMap | ThroughputErrors]) -> Any:
     """Read a path as an object of a class; return other values unchanged."""
     return kind.read(value) if isinstance(value, str | Path) else value
 
@@ -250,8 +217,7 @@ class Instrument(Section):
         # Iterating over the instrument would yield its cached properties as well.
         return {name: getattr(self, name) for name in type(self).model_fields}
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Instrument:
+    def _check_values(self) -> None:
         low, high = self.output_min_nm, self.output_max_nm
         if not high > low:
             raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
@@ -281,7 +247,6 @@ class Instrument(Section):
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
             what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm, and all S/N are 0"
             raise InputError(f"some pixel must have a throughput above 0, but {what}", key="throughput")
-        return self
 
     def _check_curves(self, low: float, high: float) -> None:
         """Raise InputError unless all curves cover the output range with possible values."""
@@ -487,11 +452,34 @@ class Instrument(Section):
 
 
 def _from_file(name: str | Path) -> Instrument:
-    path = instrument_path(name, Path())
-    entries = _read_entries(path)
-    values: dict[str, Any] = {name: value for name, (value, _) in entries.items()}
-    values["sources"] = {name: source for name, (_, source) in entries.items() if name not in LABELS}
-    return Instrument.build(values, path.name)
+    """Read a file, whose values and sources go before those of the file that it extends."""
+    path = given = instrument_path(name, Path())
+    entries: dict[str, tuple[Any, str]] = {}
+    for _ in range(MAX_EXTENDED):
+        content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
+        version, extended = content.pop("version", None), content.pop("extends", None)
+        if version not in (None, FILE_VERSION):
+            raise InputError.of("version", version, f"{FILE_VERSION}, or none in files of version 1", where=path.name)
+        if "sources" in content:
+            fault = f"{path.name}: unknown key 'sources'; give each value's source in the value's own table"
+            raise InputError(fault, key="sources")
+        entries = {name: _entry(name, entry, path) for name, entry in content.items()} | entries
+        if extended is None:
+            break
+        if version is None and extended == "mauve":
+            extended = FORMERLY_MAUVE
+            warnings.warn(
+                f"{path.name} is read as in version 1, in which mauve was the payload of the paper, now mauvesim; with "
+                f"`version = {FILE_VERSION}` it extends the one that counts electrons.",
+                stacklevel=2,
+            )
+        path = instrument_path(extended, path.parent)
+    else:
+        fault = f"{path.name} is extended by {MAX_EXTENDED} files one after another, or by itself; the chain must end"
+        raise InputError(fault, key="extends")
+    read = Instrument.build({name: value for name, (value, _) in entries.items()}, given.name)
+    sources = {name: text or getattr(read, name).source for name, (_, text) in entries.items() if name not in LABELS}
+    return read.model_copy(update={"sources": sources})
 
 
 _embedded = cache(_from_file)
@@ -501,12 +489,8 @@ LABELS = ("name", "notice", "sources")
 #: Names of the curves, and of those that are fractions.
 CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is SpectralCurve)
 OPTICS = tuple(name for name in CURVES if name != "quantum_efficiency_a_per_w")
-#: Readers of the values that instrument files may give as paths.
-FILES: dict[str, Kind] = {
-    **dict.fromkeys((*CURVES, "throughput_factor"), SpectralCurve),
-    "pixel_map": PixelMap,
-    "throughput_errors": ThroughputErrors,
-}
+#: Values that instrument files may give as paths.
+PATHS = (*CURVES, "throughput_factor", "pixel_map", "throughput_errors")
 
 
 #: Cut-off of the Gaussian's tails, in sigma; less than 1e-15 lies beyond.

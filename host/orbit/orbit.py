@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
-from mauvecl.host.exposure.sky import parse_position, parse_time
+from mauvecl.host.arrays import Float
+from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.stars.library import by_key, library_text, name_key, near_names
 from mauvecl.host.tables.files import parse_ecsv, read_text
 from mauvecl.host.tables.names import EXPECTED_POSITION, is_missing_position
@@ -40,8 +40,7 @@ LIMB_KM = 6378.137
 #: Radius of the Sun, km (IAU 2015 resolution B3).
 SUN_KM = 695_700.0
 
-Floats = NDArray[np.float64]
-Vectors = NDArray[np.float64]
+Vectors = Float
 
 
 def unit(vectors: Vectors) -> Vectors:
@@ -92,14 +91,14 @@ class TimeGrid:
         return float(midnight), float(fraction - np.floor(fraction))
 
     @cached_property
-    def seconds(self) -> Floats:
+    def seconds(self) -> Float:
         """Middles of the steps, s since the start, shape (n,)."""
         middles = np.asarray((np.arange(self.n, dtype=np.float64) + 0.5) * float(self.step_s))
         middles.setflags(write=False)
         return middles
 
     @property
-    def julian(self) -> tuple[Floats, Floats]:
+    def julian(self) -> tuple[Float, Float]:
         """Julian dates, UTC: the midnight before the start and the days since, shape (n,) each."""
         midnight, fraction = self.first
         return np.full(self.n, midnight, np.float64), np.asarray(fraction + self.seconds / DAY_S)
@@ -128,10 +127,10 @@ class Bodies:
 
     # Unit vectors, shape (n, 3); the parallax at the satellite is below 10 arcsec.
     sun: Vectors
-    sun_km: Floats  # distance, shape (n,)
+    sun_km: Float  # distance, shape (n,)
     # Shape (n, 3). The parallax reaches a degree: subtract the satellite's position to get its view.
     moon_km: Vectors
-    ecliptic_pole: Floats  # north pole at the middle of the plan, shape (3,)
+    ecliptic_pole: Float  # north pole at the middle of the plan, shape (3,)
 
     @classmethod
     def at(cls, times: TimeGrid) -> Bodies:
@@ -143,7 +142,7 @@ class Bodies:
             from astropy.coordinates import GeocentricTrueEcliptic, SkyCoord, get_body, get_sun
             from astropy.time import Time
 
-            def at(days: Floats) -> Time:
+            def at(days: Float) -> Time:
                 return Time(np.full(days.shape, midnight), days, format="jd", scale="utc")
 
             def between(step_d: float, body: str) -> Vectors:
@@ -335,7 +334,7 @@ class Orbit:
         """
         return _track(self, times)
 
-    def states(self, midnight: Floats, days: Floats, kind: Literal["tle", "mean"]) -> tuple[Vectors, Vectors]:
+    def states(self, midnight: Float, days: Float, kind: Literal["tle", "mean"]) -> tuple[Vectors, Vectors]:
         """Return positions (km) and velocities (km/s) in SGP4's frame by SGP4 or in the mean orbit, shape (n, 3) each.
 
         `midnight` and `days` are parts of the Julian dates, UTC, of shape (n,). Raises InputError if SGP4 fails at one
@@ -379,11 +378,11 @@ class Track:
     orbit: Orbit
     times: TimeGrid
     # Position and velocity in SGP4's frame (true equator, mean equinox of date), shape (n, 3).
-    of_date_km: Floats
-    velocity_km_s: Floats
+    of_date_km: Float
+    velocity_km_s: Float
 
     @cached_property
-    def _to_j2000(self) -> Floats:
+    def _to_j2000(self) -> Float:
         """Matrices from SGP4's frame (true equator, mean equinox of date) to J2000, shape (n, 3, 3).
 
         Precession and nutation of 1976 and 1980 (Vallado et al. 2006, AIAA 2006-6753) are computed once a day and
@@ -414,7 +413,7 @@ class Track:
         return unit(np.einsum("nij,nj->ni", self._to_j2000, np.cross(self.of_date_km, self.velocity_km_s)))
 
     @cached_property
-    def subsatellite_deg(self) -> tuple[Floats, Floats]:
+    def subsatellite_deg(self) -> tuple[Float, Float]:
         """Geodetic longitude (-180 to 180) and latitude of the sub-satellite point, shape (n,) each."""
         # The angle from SGP4's frame to the Earth-fixed frame.
         theta = erfa.gmst82(*self.times.julian)
@@ -429,12 +428,12 @@ class Track:
         return Bodies.at(self.times)
 
     @property
-    def limb_angle_rad(self) -> Floats:
+    def limb_angle_rad(self) -> Float:
         """Angular radius of the Earth, a sphere of its equatorial radius, at the satellite, shape (n,)."""
         return np.asarray(np.arcsin(LIMB_KM / np.linalg.norm(self.position_km, axis=-1)))
 
     @property
-    def sunlight(self) -> Floats:
+    def sunlight(self) -> Float:
         """Fraction of the Sun's disk that the Earth does not hide, 0 to 1, shape (n,).
 
         The fraction is linear in angle between the two contacts of the penumbra, which are eight seconds apart.
@@ -446,12 +445,12 @@ class Track:
         return np.asarray(np.clip(seen / (2 * disk), 0, 1))
 
     @property
-    def beta_deg(self) -> Floats:
+    def beta_deg(self) -> Float:
         """Angle of the Sun from the orbital plane, positive towards the angular momentum, shape (n,)."""
         return np.asarray(np.degrees(np.arcsin(np.einsum("ni,ni->n", self.normal, self.bodies.sun))))
 
     @property
-    def local_time_h(self) -> Floats:
+    def local_time_h(self) -> Float:
         """Local mean solar time of the descending node, hours, shape (n,)."""
         momentum = np.cross(self.of_date_km, self.velocity_km_s)
         ascending = np.arctan2(momentum[:, 0], -momentum[:, 1])
@@ -507,7 +506,7 @@ class Target:
         return cls(name or text.strip(), float(place.ra.deg), float(place.dec.deg), "given")
 
     @property
-    def direction(self) -> Floats:
+    def direction(self) -> Float:
         """Unit vector, ICRS, shape (3,)."""
         a, d = np.radians([self.ra_deg, self.dec_deg])
         return np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])

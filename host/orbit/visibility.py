@@ -10,22 +10,19 @@ from importlib import resources
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mauvecl.host.arrays import true_runs
-from mauvecl.host.exposure.sky import zodiacal_brightness
+from mauvecl.host.arrays import Bool, Float, true_runs
+from mauvecl.host.exposure.background import zodiacal_brightness
 from mauvecl.host.orbit import Limits
-from mauvecl.host.orbit.orbit import Bodies, Floats, Orbit, TimeGrid, Track, Vectors, unit
+from mauvecl.host.orbit.orbit import Bodies, Orbit, TimeGrid, Track, Vectors, unit
 from mauvecl.host.tables.files import parse_ecsv
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share
 
-Flags = NDArray[np.bool_]
-
 
 @cache
-def _proton_map(above_mev: int) -> Callable[[Floats], Floats]:
+def _proton_map(above_mev: int) -> Callable[[Float], Float]:
     """Return the map of AP8 at solar maximum, at an altitude of 510 km (see `tools/build_flux_map.py`)."""
     from scipy.interpolate import RegularGridInterpolator
 
@@ -41,7 +38,7 @@ def _proton_map(above_mev: int) -> Callable[[Floats], Floats]:
     return RegularGridInterpolator((latitude, longitude), flux)
 
 
-def proton_flux(track: Track, *, above_mev: Literal[10, 30]) -> Floats:
+def proton_flux(track: Track, *, above_mev: Literal[10, 30]) -> Float:
     """Return the omnidirectional flux of trapped protons above an energy along a track, cm^-2 s^-1, shape (n,)."""
     longitude, latitude = track.subsatellite_deg
     return np.asarray(_proton_map(above_mev)(np.stack([latitude, longitude], axis=-1)))
@@ -60,7 +57,7 @@ class Thermal:
     shadow_c: DetectorTemperature = 13.0  #: Equilibrium temperature in shadow.
     time_constant_s: Duration = 3000.0
 
-    def temperature_c(self, sunlight: Floats, step_s: float, start_c: float | None = None) -> Floats:
+    def temperature_c(self, sunlight: Float, step_s: float, start_c: float | None = None) -> Float:
         """Return the temperature at the end of each step, deg C, shape (n,).
 
         Parameters
@@ -91,7 +88,7 @@ class Particles:
     #: crosses either face of a thin plate.
     share: Share = 0.5
 
-    def rate_per_cm2_s(self, track: Track) -> Floats:
+    def rate_per_cm2_s(self, track: Track) -> Float:
         """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""
         return np.asarray(self.cosmic_per_cm2_s + self.share * proton_flux(track, above_mev=30))
 
@@ -104,12 +101,12 @@ PARTICLES_SOURCE = (
 )
 
 
-def elongation_deg(sun: Vectors, target: Floats) -> Floats:
+def elongation_deg(sun: Vectors, target: Float) -> Float:
     """Return the angle between target and Sun, shape (n,), from unit vectors of shapes (3,) and (n, 3)."""
     return np.asarray(np.degrees(np.arccos(np.clip(sun @ target, -1, 1))))
 
 
-def zodiacal_light(bodies: Bodies, target: Floats) -> Floats:
+def zodiacal_light(bodies: Bodies, target: Float) -> Float:
     """Return the zodiacal light behind a target, V mag arcsec^-2, shape (n,).
 
     The value is NaN near the Sun, where the table has none. One time per day samples a year well enough.
@@ -129,7 +126,7 @@ def zodiacal_light(bodies: Bodies, target: Floats) -> Floats:
 
 
 #: A limit as a function of a slice of steps that returns which targets are allowed, shape (steps or 1, k or 1).
-Rule = Callable[[slice], Flags]
+Rule = Callable[[slice], Bool]
 #: Steps evaluated at once, which keeps the arrays of a hundred targets within tens of MB.
 CHUNK = 1 << 16
 
@@ -138,12 +135,12 @@ CHUNK = 1 << 16
 class Windows:
     """Intervals in which one target is visible; arrays of shape (n_window,)."""
 
-    start_s: Floats  # since the start of the plan, as stop_s
-    stop_s: Floats
-    in_shadow_s: Floats  # part of the window in the Earth's shadow
+    start_s: Float  # since the start of the plan, as stop_s
+    stop_s: Float
+    in_shadow_s: Float  # part of the window in the Earth's shadow
 
     @property
-    def length_s(self) -> Floats:
+    def length_s(self) -> Float:
         """Length of each window."""
         return self.stop_s - self.start_s
 
@@ -160,8 +157,8 @@ class Visibility:
     grid: TimeGrid
     target: Vectors  # unit vectors, shape (k, 3)
     limits: Limits
-    seen: Flags  # shape (n, k), without windows that are too short
-    kept_by: dict[str, Floats]  # fraction of time that each limit alone allows, shape (k,)
+    seen: Bool  # shape (n, k), without windows that are too short
+    kept_by: dict[str, Float]  # fraction of time that each limit alone allows, shape (k,)
 
     @classmethod
     def of(cls, track: Track, target: Vectors, limits: Limits | None = None) -> Visibility:
@@ -191,17 +188,17 @@ class Visibility:
         return self.orbit.track(self.grid)
 
     @cached_property
-    def shadow(self) -> Flags:
+    def shadow(self) -> Bool:
         """True where the satellite is in the Earth's shadow, which hides more than half of the Sun, shape (n,)."""
         return np.asarray(self.track.sunlight < 0.5)
 
     @cached_property
-    def share(self) -> Floats:
+    def share(self) -> Float:
         """Fraction of the time in which each target is visible, without the duty cycle, shape (k,)."""
         return np.asarray(self.seen.mean(axis=0))
 
     @property
-    def hours(self) -> Floats:
+    def hours(self) -> Float:
         """Exposure time of each target with the duty cycle, shape (k,)."""
         return np.asarray(self.share * self.track.times.n * self.track.times.step_s / 3600 * self.limits.duty_cycle)
 
@@ -212,13 +209,13 @@ class Visibility:
         step = np.float64(self.track.times.step_s)
         return Windows(first * step, last * step, (dark[last] - dark[first]) * step)
 
-    def by_day(self, k: int) -> Floats:
+    def by_day(self, k: int) -> Float:
         """Return the hours of exposure on each UTC day from the day of the start, shape (n_day,)."""
         _, days = self.track.times.julian
         number = np.floor(days).astype(int)
         return np.asarray(np.bincount(number, self.seen[:, k]) * self._step_h)
 
-    def by_month(self) -> tuple[list[str], Floats]:
+    def by_month(self) -> tuple[list[str], Float]:
         """Return the calendar months (UTC), such as "2027-01", and the hours of exposure, shape (n_month, k)."""
         times = self.track.times
         day = np.datetime64(times.iso(0.0)[:10], "D") + np.floor(times.julian[1]).astype(int)
@@ -226,7 +223,7 @@ class Visibility:
         hours = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
         return [str(month) for month in months], hours
 
-    def by_orbit(self, k: int) -> Floats:
+    def by_orbit(self, k: int) -> Float:
         """Return the minutes of exposure between ascending nodes, shape (n_orbit,).
 
         The first and last orbit may be incomplete.
@@ -245,7 +242,7 @@ def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
     at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
     stars = target.T.astype(np.float32)
 
-    def far_from(directions: Vectors, angle_rad: Floats | float) -> Flags:
+    def far_from(directions: Vectors, angle_rad: Float | float) -> Bool:
         """Return whether targets are at least an angle from directions, unit vectors of shape (n, 3)."""
         return np.asarray(directions.astype(np.float32) @ stars <= np.float32(np.cos(angle_rad)))
 
@@ -278,7 +275,7 @@ def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
     return rules
 
 
-def _in_polygon(longitude_deg: Floats, latitude_deg: Floats, corners: Vectors) -> Flags:
+def _in_polygon(longitude_deg: Float, latitude_deg: Float, corners: Vectors) -> Bool:
     """Return whether positions lie inside a polygon in the plane of longitude and latitude, deg, shape (n,).
 
     Longitudes may exceed 180 deg, and the polygon, of shape (m, 2) with its corners in order, may cross longitude 180.

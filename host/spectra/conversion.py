@@ -15,8 +15,8 @@ from typing import Any
 
 import astropy.units as u
 import numpy as np
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.spectra.columns import Role, as_typed, choose, listed, numbered, role_of
 from mauvecl.host.spectra.units import Medium, check_assumed_unit, unit_and_medium, vacuum_wavelengths
 from mauvecl.host.tables.names import divided_unit, key_of
@@ -51,7 +51,6 @@ class SpectrumTable:
         return self.known_roles or [role_of(one.name, one.unit, one.ucd) for one in self.columns]
 
 
-Float = NDArray[np.float64]
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 
 #: Names of columns that qualify arrays: their step, their length, and the validity of points.

@@ -19,20 +19,11 @@ import numpy as np
 from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
 from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
 from mauvecl.host.spectra.units import stated_units
+from mauvecl.host.tables import text_tables
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
 from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, text_at, unit_at
 from mauvecl.host.tables.opening import open_content, text_in, votables
 from mauvecl.host.tables.table import MemoryTable, Values, number_in
-from mauvecl.host.tables.text_tables import (
-    PROSE,
-    NumberLines,
-    bracketed,
-    divided_names,
-    is_described,
-    keywords_of,
-    numbered_names,
-    text_table,
-)
 from mauvecl.host.tables.units import is_stated, time_in_name
 from mauvecl.schema.errors import InputError, shortened
 
@@ -53,9 +44,9 @@ def table_of_text(
     The user's words in `asked` are the numbers of columns if these have no names. The units of wavelength and flux are
     searched in the header if requested.
     """
-    lines = NumberLines(text, "wavelength and flux")
+    lines = text_tables.NumberLines(text, "wavelength and flux")
     if any(cell[:1] in ("(", "[") for cell in lines.cells[0]):
-        return _table_of_arrays(MemoryTable(text_table(text, "it", commas=True), "it"), name, origin)
+        return _table_of_arrays(MemoryTable(text_tables.text_table(text, "it", commas=True), "it"), name, origin)
     names, units = _names(lines)
     titles = names or [str(k + 1) for k in range(max(lines.n, 2))]
     columns = [lines.column(k, title, units[k] if units else "") for k, title in enumerate(titles)]
@@ -70,14 +61,14 @@ def table_of_text(
     )
     said = dict.fromkeys(AXES, axis_unit) | dict.fromkeys(lights, flux_unit)
     roles = [role if role.unit else replace(role, unit=said.get(role.kind)) for role in roles]
-    keywords = keywords_of([f"# {line}" for line, _ in lines.header])
+    keywords = text_tables.keywords_of([f"# {line}" for line, _ in lines.header])
     return SpectrumTable(
         columns, name, origin, implied_units=TEXT_UNITS, remarks=lines.comments, messages=tuple(lines.messages),
         headers=(keywords,), known_roles=roles,
     )  # fmt: skip
 
 
-def _roles_by_number(lines: NumberLines, asked: Sequence[str]) -> list[Role]:
+def _roles_by_number(lines: text_tables.NumberLines, asked: Sequence[str]) -> list[Role]:
     """Return the roles of columns without names: the first two are the spectrum, or those selected by the user."""
     n = lines.n
     indices = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
@@ -113,33 +104,33 @@ def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable
     )  # fmt: skip
 
 
-def _names(lines: NumberLines) -> tuple[list[str], list[str]]:
+def _names(lines: text_tables.NumberLines) -> tuple[list[str], list[str]]:
     """Return the names of columns and the units below them; empty if there are none."""
     # Lines such as "column 2: flux"; columns without such a line are named by number.
-    found = numbered_names((line for line, _ in lines.header), lines.n)
+    found = text_tables.numbered_names((line for line, _ in lines.header), lines.n)
     numbered = [found.get(k, str(k + 1)) for k in range(lines.n)]
     if len(found) > 1 and _recognised(numbered):
         return numbered, []
-    rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := divided_names(line, lines.n))}
+    rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := text_tables.divided_names(line, lines.n))}
     # The last of the lines that name most columns.
     score, k = max(((_recognised(cells), k) for k, cells in rows.items()), default=(0, 0))
     if score > 0:
         return rows[k], _units(lines, k)
     unmarked = [k for k, (line, is_comment) in enumerate(lines.header) if not is_comment and line]
-    if len(unmarked) == 1 and _may_name(lines.header[unmarked[0]][0], cells := rows.get(unmarked[0], [])):
-        return cells, _units(lines, unmarked[0])
+    if len(unmarked) == 1:
+        # The only line that is no comment may name columns, some of them unknown.
+        cells = rows.get(unmarked[0], [])
+        is_marked = bool(re.search(r"[,;|\t]", lines.header[unmarked[0]][0].strip()))
+        kinds = {role_of(cell).kind for cell in cells}
+        if len(cells) == 2:
+            # A light curve has no wavelengths.
+            times = [one.lower() == "phase" or time_in_name(f"time {one}") or "time" in words_of(one) for one in cells]
+            is_named = is_marked and (bool(kinds & set(AXES)) or any(times))
+        else:
+            is_named = is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
+        if is_named:
+            return cells, _units(lines, unmarked[0])
     return _of_another_length(lines), []
-
-
-def _may_name(line: str, cells: Sequence[str]) -> bool:
-    """Return whether the only line that is no comment names columns, some of them unknown."""
-    is_marked = bool(re.search(r"[,;|\t]", line.strip()))
-    kinds = {role_of(cell).kind for cell in cells}
-    if len(cells) == 2:
-        # A light curve has no wavelengths.
-        times = [one.lower() == "phase" or time_in_name(f"time {one}") or "time" in words_of(one) for one in cells]
-        return is_marked and (bool(kinds & set(AXES)) or any(times))
-    return is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
 
 
 def _recognised(cells: Sequence[str]) -> int:
@@ -154,10 +145,10 @@ def _recognised(cells: Sequence[str]) -> int:
     return sum(1 if is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
 
 
-def _units(lines: NumberLines, names_at: int) -> list[str]:
+def _units(lines: text_tables.NumberLines, names_at: int) -> list[str]:
     """Return the cells of the line of units below the names, if any; IPAC tables have types in between."""
     for k, (line, _) in enumerate(lines.header[names_at + 1 : names_at + 3]):
-        cells = divided_names(line, lines.n)
+        cells = text_tables.divided_names(line, lines.n)
         is_all = any(is_unit(cell) for cell in cells) and all(is_unit(c) or not is_stated(c) for c in cells)
         # "A star" is not a unit, and "nm banana" contains an unknown unit.
         is_some = any(len(cell) > 1 and is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
@@ -166,12 +157,12 @@ def _units(lines: NumberLines, names_at: int) -> list[str]:
     return []
 
 
-def _of_another_length(lines: NumberLines) -> list[str]:
+def _of_another_length(lines: text_tables.NumberLines) -> list[str]:
     """Return the names of a comment with fewer cells than the rows; raise InputError for another number of names."""
     for line, is_comment in reversed(lines.header):
         cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
-        cells = cells if len(cells) > 1 else bracketed(line)
-        if not all(cells) or PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
+        cells = cells if len(cells) > 1 else text_tables.bracketed(line)
+        if not all(cells) or text_tables.PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
             continue
         kinds = [role_of(cell).kind if words_of(divided(cell)[0]) else "unknown" for cell in cells]
         if "flux" not in kinds or not any(kind in AXES for kind in kinds):
@@ -429,8 +420,8 @@ def read_spectrum(
                           for number, one in enumerate(votables(content.read(), "it"), 1)]  # fmt: skip
             else:
                 text = text_in(form, content.read(), "it")
-                if form == "ECSV" or is_described(text):
-                    table = MemoryTable(text_table(text, "it", commas=False), "it")
+                if form == "ECSV" or text_tables.is_described(text):
+                    table = MemoryTable(text_tables.text_table(text, "it", commas=False), "it")
                     own = table.header.get("name")
                     name = own.strip()[:80] if isinstance(own, str) and own.strip() else name
                     tables = [_in_memory(table, name, origin)]

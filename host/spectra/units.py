@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.host.tables.units import balanced, is_spectral, unit_of
 from mauvecl.schema.errors import InputError
 
@@ -115,8 +115,6 @@ def _distinct(names: list[str]) -> list[str]:
     return list(units.values())
 
 
-Float = NDArray[np.float64]
-
 #: Range of the nominal instrument, nm (the paper's abstract).
 NEEDED_NM = (200.0, 700.0)
 #: The same, extended by the reach of the line spread function (the paper, section "Preparing the input spectrum").
@@ -139,9 +137,9 @@ def measured_part(nm: Float) -> float:
     return float(steps.sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
 
 
-def is_gap(steps: Float) -> NDArray[np.bool_]:
+def is_gap(steps: Float) -> Bool:
     """Return which of the steps between wavelengths, nm, are gaps."""
-    wide: NDArray[np.bool_] = (steps > GAP_NM) & (steps > GAP_TIMES * np.median(steps))
+    wide: Bool = (steps > GAP_NM) & (steps > GAP_TIMES * np.median(steps))
     return wide
 
 

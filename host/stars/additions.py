@@ -20,6 +20,7 @@ from mauvecl.host import VERSION
 from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept
 from mauvecl.host.stars.source import Source, check_covers
 from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, write_whole
+from mauvecl.host.tables.names import key_of
 from mauvecl.schema.errors import InputError
 
 #: Unit of the fluxes of kept stars.
@@ -98,8 +99,7 @@ def _place_of(name: str, *, replace: bool) -> Path:
         if not replace:
             raise InputError(f"star {name!r} is kept already: give another name, or use `replace=True`", key="name")
         return there.path
-    alike = re.sub(r"[\s_]+", "_", name.casefold())
-    if any(re.sub(r"[\s_]+", "_", star.name.casefold()) == alike for star in kept()):
+    if any(key_of(star.name) == key_of(name) for star in kept()):
         raise InputError(f"star name {name!r} is too much like another kept star's: give another", key="name")
     place = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
     if place.exists():
@@ -243,15 +243,30 @@ def _folder(address: str) -> str:
 
 
 def _download(url: str, max_bytes: int, show_progress: bool) -> bytes:
-    """Download a file within limits of size and time; raises FileNotFoundError if the server has none."""
+    """Download a file within limits of size and time; raises FileNotFoundError if the server has none.
+
+    It is read in pieces, since a server may state no size or a wrong one and never stop sending.
+    """
     # Imported here because TLS is slow to import and most runs download nothing.
     import http.client
     import urllib.error
+    import urllib.request
 
+    from astropy.utils.console import ProgressBarOrSpinner
+
+    latest, content = time.monotonic() + MAX_DOWNLOAD_S, bytearray()
+    request = urllib.request.Request(url, headers={"User-Agent": f"mauvecl/{VERSION}"})
+    shown = sys.stderr if show_progress else io.StringIO()
     try:
-        return _received(url, max_bytes, show_progress)
-    except InputError:
-        raise
+        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
+            length = answer.headers.get("Content-Length", "")
+            size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else 0
+            with ProgressBarOrSpinner(size or None, f"Fetching {url}", file=shown) as bar:
+                while max(size, len(content)) <= max_bytes and (piece := answer.read1(1 << 16)):
+                    content += piece
+                    bar.update(len(content))
+                    if time.monotonic() > latest:
+                        raise TimeoutError(f"it takes more than {MAX_DOWNLOAD_S:.0f} s")
     except urllib.error.HTTPError as error:
         if error.code in (403, 404, 410):
             # Object stores answer 403 for a missing file.
@@ -259,35 +274,14 @@ def _download(url: str, max_bytes: int, show_progress: bool) -> bytes:
         raise InputError(f"{url} answers {error.code} {error.reason}: try again later", key="base") from error
     except (OSError, ValueError, http.client.HTTPException) as error:
         # Invalid host names raise ValueError (IDNA codec), malformed responses HTTPException.
-        fault = f"{url} cannot be reached ({getattr(error, 'reason', error)})"
+        fault = f"{url} cannot be downloaded ({getattr(error, 'reason', error)})"
         remedy = f"without a network give the file: mauvecl library add {url.rsplit('/', 1)[1] or 'FILE'}"
         raise InputError(f"{fault}; {remedy}", key="base") from error
-
-
-def _received(url: str, max_bytes: int, show_progress: bool) -> bytes:
-    """Return a response, read in pieces, since a server may state no size or a wrong one and never stop sending."""
-    import urllib.request
-
-    from astropy.utils.console import ProgressBarOrSpinner
-
-    latest, content = time.monotonic() + MAX_DOWNLOAD_S, bytearray()
-    request = urllib.request.Request(url, headers={"User-Agent": f"mauvecl/{VERSION}"})
-    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
-        length = answer.headers.get("Content-Length", "")
-        size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
-        shown = sys.stderr if show_progress else io.StringIO()
-        with ProgressBarOrSpinner(size, f"Fetching {url}", file=shown) as bar:
-            while max(size or 0, len(content)) <= max_bytes and (piece := answer.read1(1 << 16)):
-                content += piece
-                bar.update(len(content))
-                if time.monotonic() > latest:
-                    fault = f"the download of {url} takes more than {MAX_DOWNLOAD_S:.0f} s: try again later"
-                    raise InputError(fault, key="base")
-    if max(size or 0, len(content)) > max_bytes:
+    if max(size, len(content)) > max_bytes:
         limit = "MAUVECL_LARGEST_FILE_MIB"
         fault = f"{url} has more than {max_bytes >> 20} MiB; {limit} may set a higher limit for files"
         raise InputError(fault, key=limit)
-    if size is not None and len(content) < size:
+    if len(content) < size:
         fault = f"the download of {url} ended early ({len(content)} of {size} bytes received): try again"
         raise InputError(fault, key="base")
     return bytes(content)

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import astropy.units as u
 import numpy as np
 from astropy.constants import c, h, k_B
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from mauvecl.host.arrays import ContentEquality, array_cache, set_read_only
+from mauvecl.host.arrays import ContentEquality, Float, array_cache, set_read_only
 from mauvecl.host.spectra.units import NEEDED_NM
-from mauvecl.host.stars.bands import ANGSTROM, photons
-from mauvecl.host.stars.coverage import attached, check_points, supplemented
+from mauvecl.host.stars.spectrum import ANGSTROM, attached, check_points, photons, supplemented
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened, shown
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
 Geometry = Literal["added", "replaces"]
-Float = NDArray[np.float64]
 Wavelengths = Annotated[Float, Unit("nm")]
 LineFlux = Annotated[float, Range(0)]
 
@@ -77,7 +75,7 @@ ROUNDING = 1e-12
 
 
 @array_cache(32)
-def blackbody(wavelength_nm: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:
+def blackbody(wavelength_nm: Float, temperature_k: float) -> Float:
     """Return the surface flux pi B_lambda of a blackbody, erg s-1 cm-2 A-1, shape (n,)."""
     # The steps of astropy's BlackBody to the last bit, without the slow import of its models.
     metre = u.m.to(u.AA)

@@ -45,31 +45,22 @@ _NAME = re.compile(
 class ModelStar:
     """Blackbody of a temperature, or else power law of an index."""
 
+    name: str  # which gives this star again
+    origin: str  # formula of the spectrum
     temperature_k: float | None
     index: float = 0.0
 
-    @classmethod
-    def named(cls, text: str) -> ModelStar | None:
-        """Return the star of a name such as "blackbody 9000 K" or "power law -2", or None for another name.
 
-        Raises InputError if the number is out of range.
-        """
-        found = _NAME.fullmatch(text)
-        if found is None:
-            return None
-        if found["body"] is not None:
-            return cls(checked(Temperature, "temperature of the blackbody", float(found["kelvin"])))
-        return cls(None, number("index of the power law", float(found["index"]), "", INDEX))
-
-    @property
-    def name(self) -> str:
-        """Name that gives this star again."""
-        return f"blackbody {self.temperature_k:.15g} K" if self.temperature_k else f"power law {self.index:.15g}"
-
-    @property
-    def origin(self) -> str:
-        """Formula of the spectrum."""
-        return "Planck's law" if self.temperature_k else f"flux per wavelength proportional to its power {self.index:g}"
+def _model_star(text: str) -> ModelStar | None:
+    """Return the star of a name such as "blackbody 9000 K" or "power law -2", or None for another name."""
+    found = _NAME.fullmatch(text)
+    if found is None:
+        return None
+    if found["body"] is not None:
+        kelvin = checked(Temperature, "temperature of the blackbody", float(found["kelvin"]))
+        return ModelStar(f"blackbody {kelvin:.15g} K", "Planck's law", kelvin)
+    index = number("index of the power law", float(found["index"]), "", INDEX)
+    return ModelStar(f"power law {index:.15g}", f"flux per wavelength proportional to its power {index:g}", None, index)
 
 
 @dataclass(frozen=True)
@@ -122,7 +113,7 @@ def _read(path: Path) -> Table:
     return read_ecsv(path, "kept star", "use `mauvecl library remove` to take it away")
 
 
-def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
+def own_spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
     """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1; raises InputError if the file was changed."""
     import numpy as np
 
@@ -137,19 +128,17 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
 def remove(name: str) -> None:
     """Delete a kept star; raises InputError for an unknown name."""
     wanted = name.strip().casefold()
-    found, damaged = [], []
-    for path in sorted(folder().glob("*.ecsv")):
+    # A damaged file has no name but that of the file; whole ones have precedence.
+    stem, found = re.sub(r"[^a-z0-9.+-]", "_", wanted), []
+    for path in folder().glob("*.ecsv"):
         star = None
         with contextlib.suppress(InputError):
             star = _described(path)
-        if star is not None and star.name.casefold() == wanted:
-            found.append(path)
-        # A damaged file has no name but that of the file.
-        elif star is None and path.stem.casefold() == re.sub(r"[^a-z0-9.+-]", "_", wanted):
-            damaged.append(path)
-    if not found and not damaged:
+        if (path.stem.casefold() == stem) if star is None else (star.name.casefold() == wanted):
+            found.append((star is None, path))
+    if not found:
         raise InputError.of("name", name, f"one of: {', '.join(star.name for star in kept()) or 'no star is kept'}")
-    [*found, *damaged][0].unlink()
+    min(found)[1].unlink()
 
 
 #: Abbreviations of Greek letters in catalogues.
@@ -349,7 +338,7 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     A text is a name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral
     type, or a formula ("blackbody 9000 K", "power law -2"). The user's own stars are searched if `own` is true.
     """
-    model = ModelStar.named(text)
+    model = _model_star(text)
     if model is not None:
         return NamedStar(model.name, light=model)
     star = by_key().get(name_key(text))

@@ -12,32 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import astropy.units as u
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from mauvecl.host.arrays import ContentEquality, set_read_only
+from mauvecl.host.arrays import ContentEquality, Float, set_read_only
 from mauvecl.host.spectra.units import NEEDED_NM, SPAN_NM, measured_part
-from mauvecl.host.stars import bands
-from mauvecl.host.stars.coverage import (
-    check_flux,
-    check_measured,
-    check_points,
-    continued,
-    extended,
-    means,
-    remarks,
-    supplemented,
-    without_undefined_ends,
-)
+from mauvecl.host.stars import library
+from mauvecl.host.stars import spectrum as points
 from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbody, with_flare
-from mauvecl.host.stars.library import (
-    ModelStar,
-    OwnStar,
-    listed_note,
-    listed_values,
-    named_star,
-    spectrum,
-    spectrum_table,
-)
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
@@ -77,9 +58,9 @@ class Source(Drawable, ContentEquality):
 
     #: Vacuum wavelengths, strictly increasing, shape (n,), that cover at least a third of 200-700 nm; `expect` requires
     #: the range of the instrument's pixels.
-    wavelength_nm: Annotated[NDArray[np.float64], Unit("nm")]
+    wavelength_nm: Annotated[Float, Unit("nm")]
     #: Flux density, erg s-1 cm-2 A-1, finite, linear between points. Negative values are measured noise.
-    flux_flam: NDArray[np.float64]
+    flux_flam: Float
     name: str
     origin: str  #: Includes the citation.
     notes: tuple[str, ...] = ()  #: Remarks for reports.
@@ -94,9 +75,9 @@ class Source(Drawable, ContentEquality):
 
     def __post_init__(self) -> None:
         set_read_only(self, wavelength_nm=self.wavelength_nm, flux_flam=self.flux_flam)
-        check_points(self.name, self.wavelength_nm, self.flux_flam)
-        check_measured(self.name, self.wavelength_nm)
-        check_flux(self.name, self.wavelength_nm, self.flux_flam)
+        points.check_points(self.name, self.wavelength_nm, self.flux_flam)
+        points.check_measured(self.name, self.wavelength_nm)
+        points.check_flux(self.name, self.wavelength_nm, self.flux_flam)
 
     @cached_property
     def digest(self) -> str:
@@ -111,22 +92,22 @@ class Source(Drawable, ContentEquality):
         `library_table` lists the names. Another spectral type, and a well-known star without a spectrum, have that of
         the nearest type, with a message. For an unknown name the error suggests the nearest ones.
         """
-        star = named_star(name, "name")
+        star = library.named_star(name, "name")
         light = star.light
         if light is None:
             nearest = cls.from_library(star.nearest)
-            return replace(nearest, name=star.name, messages=(listed_note(name), *nearest.messages))
-        if isinstance(light, ModelStar):
+            return replace(nearest, name=star.name, messages=(library.listed_note(name), *nearest.messages))
+        if isinstance(light, library.ModelStar):
             nm, kelvin = np.geomspace(*GRID), light.temperature_k
             flux = (nm / PIVOT_NM) ** light.index if kelvin is None else blackbody(nm, kelvin)
             level = "a formula has no absolute level"
             return cls(nm, flux, light.name, light.origin, unscaled=level, temperature_k=kelvin)
-        if isinstance(light, OwnStar):
+        if isinstance(light, library.OwnStar):
             return cls(
-                *spectrum(light), light.name, light.origin, light.notes,
+                *library.own_spectrum(light), light.name, light.origin, light.notes,
                 messages=light.messages, measured_nm=light.measured_nm, unscaled=light.unscaled,
             )  # fmt: skip
-        table, noisy = spectrum_table(light["file"]), light["noisy_below_nm"]
+        table, noisy = library.spectrum_table(light["file"]), light["noisy_below_nm"]
         limit = f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit"
         return cls(
             table["wavelength"],
@@ -185,25 +166,25 @@ class Source(Drawable, ContentEquality):
     def _made(cls, given: ReadSpectrum, extend: str | Source | None) -> Self:
         """Check a user's spectrum, drop undefined ends, continue others, and make it a source."""
         name, wavelength, flux = given.name, given.wavelength_nm, given.flux_flam
-        check_points(name, wavelength, flux)
-        check_measured(name, wavelength, given.axis_unit or "nm")
-        wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
+        points.check_points(name, wavelength, flux)
+        points.check_measured(name, wavelength, given.axis_unit or "nm")
+        wavelength, flux, cut = points.without_undefined_ends(name, wavelength, flux)
         messages = given.messages
         if given.axis_unit or extend is not None:
             part = measured_part(wavelength)
             share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
             messages += (f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}",)
-        messages += remarks(wavelength, flux)
+        messages += points.remarks(wavelength, flux)
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
             ultraviolet = other.messages if isinstance(extend, str) else ()
-            wavelength, flux, added = extended(
+            wavelength, flux, added = points.extended(
                 name, wavelength, flux, (other.name, other.wavelength_nm, other.flux_flam), ultraviolet=ultraviolet
             )
             messages += added
-        check_flux(name, wavelength, flux)
+        points.check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
-        wavelength, flux, added = continued(name, wavelength, flux, dark_only=True)
+        wavelength, flux, added = points.continued(name, wavelength, flux, dark_only=True)
         return cls(
             wavelength, flux, name, given.origin, (*given.notes, *cut), messages=(*messages, *added),
             measured_nm=measured if added else None, unscaled=given.unscaled,
@@ -219,7 +200,7 @@ class Source(Drawable, ContentEquality):
         """
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
         edges = np.append(np.arange(first, last - width_nm / 2, width_nm), last)
-        flux = means(self.wavelength_nm, self.flux_flam, edges)
+        flux = points.means(self.wavelength_nm, self.flux_flam, edges)
         nm = np.concatenate([[first], (edges[1:] + edges[:-1]) / 2, [last]])
         flux = np.concatenate([flux[:1], flux, flux[-1:]])
         return replace(self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, f"binned to {width_nm:g} nm"))
@@ -266,7 +247,7 @@ class Source(Drawable, ContentEquality):
         if own is None:
             raise InputError(f"{name} defines no wavelengths; use a spectrum with a waveset", key="spectrum")
         # A point of the grid within 1e-3 nm of one of the spectrum's own adds no information.
-        grid = supplemented(np.unique(own.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
+        grid = points.supplemented(np.unique(own.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
         flux = spectrum(grid * u.nm, flux_unit=FLAM).value
         return cls.from_arrays(grid, flux, name=name, origin=f"synphot {type(spectrum).__name__}")
 
@@ -321,7 +302,7 @@ class Source(Drawable, ContentEquality):
         span = f"{self.wavelength_nm[0]:.0f}-{self.wavelength_nm[-1]:.0f} nm, {self.wavelength_nm.size} points"
         return f"<b>{html.escape(self.name)}</b>, {span}{notes}"
 
-    def magnitude(self, band: str = "V", system: bands.System = "catalogue") -> float:
+    def magnitude(self, band: str = "V", system: points.System = "catalogue") -> float:
         """Return the synthetic magnitude in a band; raises InputError if the measured spectrum does not cover it.
 
         Parameters
@@ -333,9 +314,9 @@ class Source(Drawable, ContentEquality):
         low, high = self.measured_nm or (0.0, np.inf)
         # Continued ends are assumptions, so they do not count.
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
-        return bands.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
+        return points.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
-    def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: bands.System = "catalogue") -> Self:
+    def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: points.System = "catalogue") -> Self:
         """Return the star scaled to a magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
 
         Parameters
@@ -347,9 +328,9 @@ class Source(Drawable, ContentEquality):
             See `magnitude`.
         """
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
-        history = (*self.history, f"scaled to {bands.band(band).name} = {magnitude:g}")
+        history = (*self.history, f"scaled to {points.band(band).name} = {magnitude:g}")
         scaled = replace(self, flux_flam=self.flux_flam * factor, history=history)
-        return replace(scaled, scale=bands.scale(band, system), unscaled="")
+        return replace(scaled, scale=points.scale(band, system), unscaled="")
 
     def flaring(
         self,
@@ -380,7 +361,7 @@ class Source(Drawable, ContentEquality):
         light = Blackbody(temperature) if spectrum is None else spectrum
         photosphere = self.temperature_k if photosphere_temperature is None else photosphere_temperature
         nm, flux = with_flare(self.wavelength_nm, self.flux_flam, amplitude, light, band, geometry, photosphere)
-        title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {light.describe()}, {geometry}"
+        title = f"flare of {100 * amplitude:g} % in {points.band(band).name} at {light.describe()}, {geometry}"
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
         history, messages = (*self.history, title), (*self.messages, *light.messages)
@@ -430,13 +411,13 @@ def check_covers(source: Source, needed_nm: tuple[float, float] = NEEDED_NM, of:
 def listed_star(name: str) -> Source:
     """Return the star of a name; one of the embedded list at its V there, with a message."""
     source = Source.from_library(name)
-    if not (values := listed_values(name)):
+    if not (values := library.listed_values(name)):
         return source
     return with_listed_note(source, name, **values).at_magnitude(values["magnitude"])
 
 
 def with_listed_note(source: Source, name: str, **used: float | None) -> Source:
     """Return a source with a message on the values of the embedded list that are used; see `listed_note`."""
-    others = (text for text in source.messages if text != listed_note(name))
-    note = listed_note(name, **used)
+    others = (text for text in source.messages if text != library.listed_note(name))
+    note = library.listed_note(name, **used)
     return replace(source, messages=(*([note] if note else []), *others))

@@ -118,11 +118,10 @@ def open_regular(path: Path, what: str) -> io.BufferedReader:
 
 def read_bytes(path: Path, what: str) -> bytes:
     """Read a regular file of limited size, without unpacking it."""
-    check_size(path, what)
-    most = limit_bytes("MAUVECL_LARGEST_FILE_MIB")
     with open_regular(path, what) as file:
+        _limited(os.fstat(file.fileno()).st_size, path, what)
         try:
-            content = file.read(most + 1)
+            content = file.read(limit_bytes("MAUVECL_LARGEST_FILE_MIB") + 1)
         except OSError as error:
             shown = shortened(str(path))
             raise InputError(f"{what} {shown} must be readable, but is not ({error.strerror})", key="file") from error

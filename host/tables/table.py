@@ -12,8 +12,8 @@ from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.tables.names import ANGLES, angle, angle_unit, divided_unit, first_of, is_missing, key_of, matched
 from mauvecl.host.tables.units import time_unit, unit_of
 from mauvecl.schema.errors import InputError, printable, shortened
@@ -21,7 +21,6 @@ from mauvecl.schema.errors import InputError, printable, shortened
 if TYPE_CHECKING:
     from astropy.table import Table
 
-Float = NDArray[np.float64]
 
 #: Key of the statements on how a file is read, in the metadata of its table.
 REMARKS = "mauvecl remarks"

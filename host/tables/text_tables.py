@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.tables.files import check_cells, parse_ecsv, parsing, read_text, reading
 from mauvecl.host.tables.names import angle_unit, in_brackets, is_missing
 from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unit_in, unquoted
@@ -48,12 +48,12 @@ MARKS = ("\t", ";", "|", ",")
 SAMPLE = 50
 
 
-def read_columns(what: str, kind: str, path: Path, unit: str = "") -> NDArray[np.float64]:
+def read_columns(what: str, kind: str, path: Path, unit: str = "") -> Float:
     """Read times and values, of a `kind` for messages, from a file, shape (n, 2); see `columns`."""
     return columns(f"{what} {shortened(path.name)}", read_text(path, what), f"times and {kind}", unit)
 
 
-def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.float64]:
+def columns(what: str, text: str, expected: str, unit: str = "") -> Float:
     """Parse rows of two numbers in any form of text, shape (n, 2).
 
     The first column of the result is in `unit`, as is that of the text unless its header states another one. `what` and
@@ -74,7 +74,7 @@ def columns(what: str, text: str, expected: str, unit: str = "") -> NDArray[np.f
 _UNIT_WORD = re.compile(r"[\[(]\s*([^\[\](),;\s]+)|(?:\bin\s+|_|\bunits?\s*[:=]\s*)([A-Za-zµÅ]+)(?!\w)")
 
 
-def _in_unit(values: NDArray[np.float64], header: str, unit: str) -> NDArray[np.float64]:
+def _in_unit(values: Float, header: str, unit: str) -> Float:
     """Return times or wavelengths in a unit; raise InputError if a header states several."""
     import astropy.units as u
 
@@ -431,7 +431,7 @@ def _distinct(names: list[str]) -> list[str]:
 
 def _is_cell_of_row(cell: str) -> bool:
     """Return whether a cell is a number, a date or missing, and no name."""
-    return is_dated(cell) or is_missing(cell) or _is_finite(cell) or _DECIMAL_COMMA.fullmatch(cell) is not None
+    return is_dated(cell) or is_missing(cell) or _is_finite(cell)
 
 
 def _is_finite(cell: str) -> bool:

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import DAY_S
@@ -178,8 +178,6 @@ def flux_kind(unit: Any) -> FluxKind:
         return "total"
     return "surface brightness" if (unit * u.sr).is_equivalent(densities + per_area) else "other"
 
-
-Float = NDArray[np.float64]
 
 #: Epochs by name, as modified Julian dates: of TESS and Kepler (their archive manuals), GPS and Unix seconds.
 EPOCHS_MJD = {"mjd": 0.0, "rjd": -0.5, "jd": -2_400_000.5, "bjd": -2_400_000.5, "btjd": 56_999.5, "bkjd": 54_832.5,

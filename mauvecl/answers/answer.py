@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
 from mauvecl.answers.files import make_folder, write_document, write_table
 from mauvecl.host.arrays import ContentEquality
-from mauvecl.host.exposure.neighbours import rate_of
+from mauvecl.host.exposure.background import rate_of
 from mauvecl.host.instrument import shipped_names
 from mauvecl.schema.columns import Column, Drawable, View, percent, records, stacked, table_of
 from mauvecl.study.cases import assumptions_of, cases, full_label, place_columns

@@ -16,7 +16,7 @@ from mauvecl.fits.profile import Profile
 from mauvecl.fits.spectrum import Forecast, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars import flare as spectra
-from mauvecl.host.stars.bands import photons
+from mauvecl.host.stars.spectrum import photons
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError

@@ -26,7 +26,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.flares.stare import Event, coefficients, temperatures_of
 from mauvecl.host import VERSION
-from mauvecl.host.exposure.sky import parse_position, parse_time
+from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, kept
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error

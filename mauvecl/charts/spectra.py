@@ -16,8 +16,8 @@ from mauvecl.schema.columns import First, with_error
 if TYPE_CHECKING:
     from mauvecl.answers.calibrate import CalibrateAnswer
     from mauvecl.answers.change import ChangeAnswer
+    from mauvecl.host.exposure.background import Sky
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
 

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.host.exposure.response import Order, response_matrix
-from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import (
     BALMER_EDGE_NM,
     ELECTRON_TEMPERATURE_K,
@@ -38,6 +37,7 @@ from mauvecl.host.stars.flare import (
     balmer_continuum,
     blackbody,
 )
+from mauvecl.host.stars.spectrum import photons
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import range_of

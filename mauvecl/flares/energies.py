@@ -29,8 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.host.arrays import set_read_only
-from mauvecl.host.stars.bands import band as find_band
-from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import (
     PARSEC_CM,
     STEFAN_BOLTZMANN,
@@ -42,6 +40,8 @@ from mauvecl.host.stars.flare import (
     blackbody,
     check_scales,
 )
+from mauvecl.host.stars.spectrum import band as find_band
+from mauvecl.host.stars.spectrum import photons
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
@@ -288,7 +288,7 @@ class Rates(ABC):
         """Return the rates with all energies multiplied by a factor."""
 
     def in_band(self, band: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> Self:
-        """Return the rates with energies in another band of `host.stars.bands`, or "bolometric" ones.
+        """Return the rates with energies in another band of `host.stars.library`, or "bolometric" ones.
 
         The flares are blackbodies of a temperature, or have another spectrum.
         """

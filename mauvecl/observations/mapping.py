@@ -112,7 +112,7 @@ class FrameMapping(Record):
             return None
         if self.epoch.lower() in EPOCHS_MJD:
             return EPOCHS_MJD[self.epoch.lower()]
-        from mauvecl.host.exposure.sky import parse_time
+        from mauvecl.host.exposure.background import parse_time
 
         with offline():
             try:

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
 
+from mauvecl.host.exposure.background import Sky
 from mauvecl.host.exposure.expectation import continued_to_reach, expect
 from mauvecl.host.exposure.response import Order, response_matrix
-from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.detector import CalibrationFrames, DarkFit, PhotonTransfer
 from mauvecl.schema.errors import InputError

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.fits.flare_model import variance_of
 from mauvecl.host.exposure.response import W_PER_NM_IN_FLAM, Order, electrons_per_second
-from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import BALMER_EDGE_NM, EmissionLine
+from mauvecl.host.stars.spectrum import photons
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Range, Unit

@@ -131,7 +131,7 @@ def without_empty(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> tu
 
 
 def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) -> QTable:
-    """Return the table of rows for files and JSON, with units and descriptions."""
+    """Return the table of rows for files and JSON, with units and descriptions; missing quantities are NaN."""
     import astropy.units as u
     import numpy as np
     from astropy.table import QTable
@@ -143,7 +143,9 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
         values = np.concatenate([part[k].ravel() for part in parts] or [np.array([], column.kind or float)])
         if values.dtype == object:
             missing = np.array([value is None for value in values])
-            values = np.ma.MaskedArray(np.where(missing, 0, values).astype(column.kind or float), missing)
+            # A quantity has no mask.
+            filled = np.where(missing, np.nan if column.unit else 0, values).astype(column.kind or float)
+            values = filled if column.unit else np.ma.MaskedArray(filled, missing)
         elif column.kind is not None:
             values = values.astype(column.kind)
         table[column.name] = values * unit_of(column.unit) if column.unit else values
@@ -155,21 +157,26 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
 def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **meta: object) -> QTable:
     """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`.
 
-    Columns that a table lacks are masked.
+    Columns that a table lacks are masked, or NaN if they have a unit.
     """
+    import numpy as np
+
     every = list(parts)
     tables = [table for _, table in every]
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
 
     def values(part: tuple[object, Table], name: str) -> Any:
-        return getattr(part[1][name], "value", part[1][name]) if name in part[1].colnames else None
+        if name not in part[1].colnames:
+            return None
+        cells = getattr(part[1][name], "value", part[1][name])
+        return np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
 
     def taken(name: str) -> Column:
         having = [table[name] for table in tables if name in table.colnames]
         (unit, *others) = dict.fromkeys(str(column.unit or "") for column in having)
         if others:
             raise ValueError(f"column {name} has several units")
-        kind = None if len(having) == len(tables) else having[0].dtype.type
+        kind = np.result_type(*(column.dtype for column in having)).type
         text = having[0].info.description or ""
         return Column(name, lambda part: values(part, name), unit, text, kind=kind)
 

@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from mauvecl.detection.statistics import Setting
     from mauvecl.flares.frames import StareExpectation
     from mauvecl.flares.stare import Event, Stare
+    from mauvecl.host.exposure.background import Neighbours, Sky
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.exposure.neighbours import Neighbours
-    from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.study.observation import Observation, SkyLight

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.host.exposure.background import Sky
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.instrument.instrument import Instrument
 
 
@@ -148,7 +148,7 @@ class SkyLight(Section):
 
     def sky(self) -> Sky:
         """Return the sky for the host."""
-        from mauvecl.host.exposure.sky import Sky
+        from mauvecl.host.exposure.background import Sky
 
         if self.target is not None and self.time is not None:
             return Sky.at(self.target, self.time)

@@ -74,7 +74,7 @@ class OrbitQuestion(Section):
     def _time(cls, given: str) -> str:
         # The default is a time, for which astropy need not be loaded.
         if given != cls.model_fields["start"].default:
-            from mauvecl.host.exposure.sky import parse_time
+            from mauvecl.host.exposure.background import parse_time
             from mauvecl.host.tables.units import offline
 
             with offline():

@@ -17,7 +17,7 @@ from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
 from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
 
 if TYPE_CHECKING:
-    from mauvecl.host.exposure.neighbours import Neighbours
+    from mauvecl.host.exposure.background import Neighbours
     from mauvecl.host.stars.flare import FlareSpectrum
     from mauvecl.host.stars.source import Source
 
@@ -198,7 +198,7 @@ class Star(Section):
         """Read the star's neighbours, or return None if it has none."""
         if self.neighbours is None:
             return None
-        from mauvecl.host.exposure.neighbours import Neighbours, read_neighbours
+        from mauvecl.host.exposure.background import Neighbours, read_neighbours
 
         stars, notes = read_neighbours(self.neighbours, self.neighbours_of)
         return Neighbours(stars, self.neighbour_share, notes)

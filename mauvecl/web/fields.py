@@ -147,7 +147,7 @@ def star_name(text: str) -> str:
 
 def day(text: str) -> str:
     """Parse a day such as 2027-01-31."""
-    from mauvecl.host.exposure.sky import YEARS
+    from mauvecl.host.exposure.background import YEARS
 
     remedy = f"give a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
     try:
@@ -192,14 +192,14 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 
 def neighbours(text: str) -> str | None:
     """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
-    from mauvecl.host.exposure.neighbours import FILES
+    from mauvecl.host.exposure.background import SPECTRUM_FILES
 
     if not text.strip():
         return None
     if text.startswith("# %ECSV"):
         raise InputError("the table of neighbours is ECSV, but must be CSV on this page; the command line reads both")
     names = {name.strip().lower() for name in text_table(text, "the table of neighbours", commas=True).colnames}
-    if files := names & {*FILES}:
+    if files := names & {*SPECTRUM_FILES}:
         raise InputError(
             f"the table of neighbours has a column {min(files)}, but must have spectral_type instead; the command line "
             "reads files of spectra"

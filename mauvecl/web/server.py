@@ -33,7 +33,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 
 from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
-from mauvecl.host.exposure.neighbours import KNOWN
+from mauvecl.host.exposure.background import NEIGHBOUR_COLUMNS
 from mauvecl.host.stars.library import all_names, library_names, well_known_stars
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.study.plan import TARGET_COLUMNS
@@ -350,7 +350,7 @@ def _words() -> dict[str, Any]:
             for name, upload in UPLOADS.items()
         },
         "withFile": fields.WITH_FILE,
-        "columns": sorted({*KNOWN}),
+        "columns": sorted({*NEIGHBOUR_COLUMNS}),
         "needs": {name: tab.needs for name, tab in SIMULATIONS.items() if tab.needs},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,

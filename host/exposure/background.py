@@ -1,40 +1,244 @@
-"""Neighbouring stars, whose light enters the fibre together with the target's, and tables of them."""
+"""Light that enters the fibre besides the star's: zodiacal light by position and time, and neighbouring stars."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
+from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.response import Order, electrons_per_second
-from mauvecl.host.exposure.sky import parse_position
-from mauvecl.host.stars.library import embedded, known_band, library_table, nearest_spectrum
-from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.names import (
-    BANDS,
-    DECLINATIONS,
-    RIGHT_ASCENSIONS,
-    SPECTRAL_TYPES,
-    STARS,
-    band_in_name,
-    divided_unit,
-    key_of,
+from mauvecl.host.stars.library import (
+    by_key,
+    embedded,
+    known_band,
+    library_table,
+    name_key,
+    near_names,
+    nearest_spectrum,
 )
+from mauvecl.host.stars.source import Source
+from mauvecl.host.tables import names
+from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.physical import Share
+from mauvecl.schema.physical import Share, SkyBrightness, SolidAngle
 
 if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.tables.table import Rows
 
-Float = NDArray[np.float64]
+
+#: Calendar years in which errors of UTC and ephemeris are far smaller than a cell of the zodiacal table.
+YEARS = (1990, 2100)
+
+
+def helioecliptic(target: SkyCoord | str, time: Time | str) -> tuple[float, float, float]:
+    """Return a target's position relative to the Sun in the true geocentric ecliptic of date, deg.
+
+    It is the absolute difference of their longitudes, 0-180, the absolute latitude, and the angle between them. The
+    arguments are those of `Sky.at`.
+    """
+    with offline():
+        from astropy.coordinates import GeocentricTrueEcliptic, get_sun
+
+        moment = parse_time(time)
+        position = parse_position(target)
+        frame = GeocentricTrueEcliptic(equinox=moment, obstime=moment)
+        sun = get_sun(moment).transform_to(frame)
+        try:
+            star = position.transform_to(frame)
+        except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
+            fault = f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic; use ICRS"
+            raise InputError(fault, key="target") from None
+        difference = float((star.lon - sun.lon).wrap_at("180d").deg)
+        return abs(difference), abs(float(star.lat.deg)), float(star.separation(sun).deg)
+
+
+def parse_time(time: Time | str, name: str = "time") -> Time:
+    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`.
+
+    The time is called `name` in errors.
+    """
+    from astropy.time import Time
+
+    moment = time
+    if isinstance(moment, str):
+        with contextlib.suppress(ValueError):
+            moment = Time(moment.strip().removesuffix("Z"), scale="utc")
+    if isinstance(moment, Time) and not moment.isscalar:
+        raise InputError(f"{name} must be a single time, but holds {moment.size} times", key=name)
+    if not isinstance(moment, Time) or np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
+        raise InputError.of(name, time, "a UTC time such as '2026-03-01T12:00:00'")
+    year = float(moment.decimalyear)
+    if not YEARS[0] <= year < YEARS[1]:
+        raise InputError.of(name, moment.utc.isot, f"between {YEARS[0]} and {YEARS[1]}")
+    return moment
+
+
+def parse_position(target: SkyCoord | str) -> SkyCoord:
+    """Return a single finite position; text is a name, or ICRS in degrees or sexagesimal hours and degrees."""
+    from astropy.coordinates import SkyCoord
+    from astropy.coordinates.baseframe import BaseCoordinateFrame
+
+    if isinstance(target, str):
+        if (star := by_key().get(name_key(target))) is not None:
+            return SkyCoord(star.ra_deg, star.dec_deg, unit="deg")
+        try:
+            return SkyCoord(*names.position(target), unit="deg")
+        except InputError as error:
+            if not re.match(r"\s*[^\W\d]", target):
+                raise
+            like = ", ".join(near_names(target, stars_only=True))
+            expected = f"a name such as {like}, or {names.EXPECTED_POSITION}"
+            raise InputError.of("target", target, expected) from error
+    position = SkyCoord(target) if isinstance(target, SkyCoord | BaseCoordinateFrame) else None
+    if position is not None and not position.isscalar:
+        raise InputError(f"target must be a single position, but holds {position.size} positions", key="target")
+    if position is None or not np.isfinite([position.spherical.lon.deg, position.spherical.lat.deg]).all():
+        raise InputError.of("target", target, names.EXPECTED_POSITION)
+    return position
+
+
+Lookup = Literal["bilinear", "nearest"]
+
+
+@validated
+@dataclass(frozen=True)
+class Sky:
+    """Zodiacal light of uniform surface brightness.
+
+    Examples
+    --------
+    >>> from mauvecl import Sky
+    >>> round(Sky.at("290.68 +11.12", "2026-09-01T12:00").surface_brightness, 2)
+    22.96
+    """
+
+    surface_brightness: SkyBrightness | None  #: V mag arcsec^-2 (Vega); None means no sky.
+    description: str  #: Origin of the value, for reports.
+
+    @classmethod
+    def none(cls) -> Sky:
+        """Return a sky without light."""
+        return cls(None, "no sky")
+
+    @classmethod
+    def of_brightness(cls, brightness: SkyBrightness) -> Sky:
+        """Return a sky of fixed surface brightness.
+
+        Parameters
+        ----------
+        brightness : Quantity or float
+            V mag arcsec^-2, 5 to 35.
+        """
+        return cls(brightness, f"fixed V = {brightness:.2f} mag/arcsec2")
+
+    @classmethod
+    def at(cls, target: SkyCoord | str, time: Time | str, lookup: Lookup = "bilinear") -> Sky:
+        """Return the zodiacal light towards a target, from the table of the MauveSim paper (COS Instrument Handbook).
+
+        The table has a cell every 15 deg. Magnitudes are interpolated bilinearly, or taken from the nearest cell as in
+        the paper. Cells in the solar avoidance zone have no value: the other corners share their weight, which makes
+        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel). Raises InputError if the nearest cell is
+        in the zone.
+
+        Parameters
+        ----------
+        target : SkyCoord or str
+            Single position; a string is a well-known star ("AU Mic"), or ICRS in degrees ("290.0 -11.2") or sexagesimal
+            ("19h22m00s -11d12m00s").
+        time : Time or str
+            Single time in 1990-2100; a string is ISO 8601, UTC.
+        lookup : {"bilinear", "nearest"}
+        """
+        longitude, latitude, separation = helioecliptic(target, time)
+        brightness = zodiacal_brightness(longitude, latitude, separation, lookup)
+        return cls(
+            brightness,
+            f"zodiacal light V = {brightness:.2f} mag/arcsec2 at helio-ecliptic longitude {longitude:.1f} deg, "
+            f"latitude {latitude:.1f} deg, {separation:.1f} deg from the Sun ({lookup})",
+        )
+
+    def total_magnitude(self, field_of_view_arcsec2: SolidAngle) -> float | None:
+        """Return the V magnitude of the whole field of view, or None without a sky."""
+        if self.surface_brightness is None:
+            return None
+        return float(self.surface_brightness - 2.5 * np.log10(field_of_view_arcsec2))
+
+    def spectrum(self, field_of_view_arcsec2: SolidAngle) -> Source | None:
+        """Return the spectrum of the whole field of view, or None without a sky.
+
+        Zodiacal light is scattered sunlight with little reddening, so the spectrum is that of the Sun (CALSPEC) at the
+        total magnitude. The paper uses HD 87646, a G2V star.
+
+        Parameters
+        ----------
+        field_of_view_arcsec2 : Quantity or float
+            Solid angle, arcsec^2.
+        """
+        total = self.total_magnitude(field_of_view_arcsec2)
+        return None if total is None else _sunlight(total)
+
+
+@lru_cache(maxsize=16)
+def _sunlight(magnitude: float) -> Source:
+    return Source.from_library("Sun").at_magnitude(magnitude)
+
+
+#: Steps of helio-ecliptic longitude and latitude in the table of the zodiacal light, deg.
+STEP_DEG = 15.0
+
+
+@lru_cache(maxsize=1)
+def zodiacal_table() -> Float:
+    """Return the table of the MauveSim paper, V mag arcsec^-2; NaN in the solar avoidance zone.
+
+    Rows are longitudes from 0 to 180 deg, columns are latitudes from 0 to 90 deg.
+    """
+    from astropy.table import Table
+
+    path = resources.files(__package__).joinpath("zodiacal.ecsv")
+    table = Table.read(path.read_text(encoding="utf-8"), format="ascii.ecsv")
+    names = [name for name in table.colnames if name.startswith("latitude_")]
+    return np.stack([np.ma.filled(np.ma.asarray(table[name], np.float64), np.nan) for name in names], axis=1)
+
+
+def zodiacal_brightness(
+    longitude_deg: float, latitude_deg: float, separation_deg: float, lookup: Lookup = "bilinear"
+) -> float:
+    """Return the surface brightness of the zodiacal light at a position of `helioecliptic`, V mag arcsec^-2.
+
+    Raises InputError if the nearest cell (of two equally near, the one farther from the Sun) is in the solar avoidance
+    zone.
+    """
+    table = zodiacal_table()
+    row, column = longitude_deg / STEP_DEG, latitude_deg / STEP_DEG
+    nearest = float(table[int(np.floor(row + 0.5)), int(np.floor(column + 0.5))])
+    if np.isnan(nearest):
+        place = f"helio-ecliptic longitude {longitude_deg:.1f} deg, latitude {latitude_deg:.1f} deg"
+        fault = f"the Sun is {separation_deg:.1f} deg from the target ({place})"
+        needed = "which must be outside the zone of solar avoidance, some 50 deg"
+        raise InputError(f"{fault}, {needed}", key="target")
+    if lookup == "nearest":
+        return nearest
+    i, j = (min(int(at), size - 2) for at, size in zip((row, column), table.shape, strict=True))
+    along, across = row - i, column - j
+    weights = np.outer([1 - along, along], [1 - across, across])
+    corners = table[i : i + 2, j : j + 2]
+    weights[np.isnan(corners)] = 0.0
+    return float(np.sum(weights * np.nan_to_num(corners)) / weights.sum())
+
 
 #: Distance up to which a row of a table may be the target itself, which a message then says, arcsec.
 SAME_STAR_ARCSEC = 2.0
@@ -180,20 +384,22 @@ def _typical() -> dict[str, tuple[float, float]]:
     return {star.name: (star.temperature_k or np.nan, colour) for star, colour in zip(stars, colours, strict=True)}
 
 
-#: Names of columns: those of the Gaia archive, astroquery, VizieR and CDS X-Match, and plain ones.
+#: Names of columns of neighbours: those of the Gaia archive, astroquery, VizieR and CDS X-Match, and plain ones.
 SEPARATIONS = ("separation", "separation_arcsec", "sep", "sep_arcsec", "angdist", "dstarcsec",
                "target_separation (deg)", "dist", "_r")  # fmt: skip
 #: Columns of magnitudes, with their bands; the first that a row has counts. Gmag is Gaia's in VizieR.
 MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "flux_v": "V", "phot_g_mean_mag": "Gaia G",
               "gmag": "Gaia G"}  # fmt: skip
-TYPES = (*SPECTRAL_TYPES, "type")
-FILES = ("file", "spectrum", "spectrum_file")
+TYPES = (*names.SPECTRAL_TYPES, "type")
+SPECTRUM_FILES = ("file", "spectrum", "spectrum_file")
 TEMPERATURES = ("teff_gspphot", "teff", "teff_val", "temperature", "temperature_k")
 COLOURS = ("bp_rp", "bp-rp", "bprp")
-#: All names of columns that are read, with that of a magnitude's band.
-KNOWN = (*STARS, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, *BANDS, *TYPES, *FILES, *TEMPERATURES,
-         *COLOURS)  # fmt: skip
-_KEYS = {key_of(name) for name in KNOWN} | {key_of("target_separation")}
+#: All names of columns of neighbours that are read, with that of a magnitude's band.
+NEIGHBOUR_COLUMNS = (
+    *names.STARS, *SEPARATIONS, *names.RIGHT_ASCENSIONS, *names.DECLINATIONS, *MAGNITUDES, *names.BANDS, *TYPES,
+    *SPECTRUM_FILES, *TEMPERATURES, *COLOURS,
+)  # fmt: skip
+_KEYS = {names.key_of(name) for name in (*NEIGHBOUR_COLUMNS, "target_separation")}
 #: Largest number of rows; a fibre holds far fewer stars.
 MOST_ROWS = 100_000
 
@@ -217,11 +423,13 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     table = Rows(read_table(path, "table of neighbours"), named, "neighbours")
     if not 1 <= table.n <= MOST_ROWS:
         raise InputError(f"{named} must hold 1 to {MOST_ROWS} stars, not {table.n}", key="neighbours")
-    name = table.first(STARS)
-    names = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
-    own = None if target is None else next((k for k, name in enumerate(names) if name == target.strip()), None)
+    name = table.first(names.STARS)
+    titles = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
+    own = None if target is None else next((k for k, title in enumerate(titles) if title == target.strip()), None)
     separations, notes = _separations(table, own, target)
-    bands, kind, file, temperature, colour = map(table.first, (BANDS, TYPES, FILES, TEMPERATURES, COLOURS))
+    bands, kind, file, temperature, colour = map(
+        table.first, (names.BANDS, TYPES, SPECTRUM_FILES, TEMPERATURES, COLOURS)
+    )
     # Gmag is Gaia's in VizieR, gmag that of other surveys.
     magnitudes = {
         column: band
@@ -229,15 +437,16 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
         if (column := table.first((name,))) and (name != "gmag" or column == "Gmag")
     }
     stars = []
-    for k, name in enumerate(names):
+    for k, title in enumerate(titles):
         if k != own:
             spectrum = table.text(file, k)
             stars.append(Neighbour(
-                name, float(separations[k]), *_magnitude(table, k, magnitudes, bands), table.text(kind, k),
+                title, float(separations[k]), *_magnitude(table, k, magnitudes, bands), table.text(kind, k),
                 path.parent / spectrum if spectrum else None, table.number(temperature, k, "K", above=0.0),
                 table.number(colour, k, "mag"),
             ))  # fmt: skip
-    notes += table.unused([name for name in table.names if not {key_of(name), key_of(divided_unit(name)[0])} & _KEYS])
+    keys = {name: {names.key_of(name), names.key_of(names.divided_unit(name)[0])} for name in table.names}
+    notes += table.unused([name for name in table.names if not keys[name] & _KEYS])
     return tuple(sorted(stars, key=lambda star: star.separation_arcsec)), notes
 
 
@@ -249,7 +458,7 @@ def _magnitude(table: Rows, row: int, columns: dict[str, str], bands: str | None
     for name, band in columns.items():
         value = table.number(name, row, "mag")
         if value is not None:
-            stated = band or band_in_name(name) or table.text(bands, row) or "V"
+            stated = band or names.band_in_name(name) or table.text(bands, row) or "V"
             # Only stars within the fibre need a band with a passband.
             with contextlib.suppress(InputError):
                 return value, known_band(stated)
@@ -259,7 +468,7 @@ def _magnitude(table: Rows, row: int, columns: dict[str, str], bands: str | None
 
 def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:
     """Return the separations from the target, arcsec, shape (n_row,), and statements on how they were found."""
-    ra, dec = table.first(RIGHT_ASCENSIONS), table.first(DECLINATIONS)
+    ra, dec = table.first(names.RIGHT_ASCENSIONS), table.first(names.DECLINATIONS)
     if ra is not None and dec is not None and target is not None:
         return _from_positions(table, ra, dec, own, target), ()
     name = table.first(SEPARATIONS)
@@ -274,7 +483,7 @@ def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Floa
     if target is not None and own is None:
         fault = f"{table.named} has no row named {shortened(target)}, and no positions"
         raise InputError(f"{fault}; give the name of a row, which is then left out", key="neighbours_of")
-    stated, key = getattr(table.table[name], "unit", None) is not None, key_of(name)
+    stated, key = getattr(table.table[name], "unit", None) is not None, names.key_of(name)
     if not stated and key == "_r":
         remedy = "use a table with units (ECSV, FITS, VOTable), or the column separation, arcsec"
         raise table.error(f"the column {name} states no unit; {remedy}", name)
