@@ -135,13 +135,7 @@ class Sky:
 
     @classmethod
     def of_brightness(cls, brightness: SkyBrightness) -> Sky:
-        """Return a sky of fixed surface brightness.
-
-        Parameters
-        ----------
-        brightness : Quantity or float
-            V mag arcsec^-2, 5 to 35.
-        """
+        """Return a sky of fixed surface brightness, 5 to 35 V mag arcsec^-2."""
         return cls(brightness, f"fixed V = {brightness:.2f} mag/arcsec2")
 
     @classmethod
@@ -181,11 +175,6 @@ class Sky:
 
         Zodiacal light is scattered sunlight with little reddening, so the spectrum is that of the Sun (CALSPEC) at the
         total magnitude. The paper uses HD 87646, a G2V star.
-
-        Parameters
-        ----------
-        field_of_view_arcsec2 : Quantity or float
-            Solid angle, arcsec^2.
         """
         total = self.total_magnitude(field_of_view_arcsec2)
         return None if total is None else _sunlight(total)

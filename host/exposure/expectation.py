@@ -319,12 +319,9 @@ class Expectation(Drawable, ContentEquality):
     def noise_budget(self) -> QTable:
         """Return the noise of the exposure by origin, DN rms per pixel.
 
-        Returns
-        -------
-        QTable
-            Columns `wavelength`, `source_photon`, `zodiacal_photon`, with neighbours `neighbour_photon`, `dark`, `read`
-            and `total`. The total is their quadratic sum, so `snr` is signal_dn / total. The ADC's rounding, 0.29 DN
-            per frame, is not included.
+        The columns are `wavelength`, `source_photon`, `zodiacal_photon`, with neighbours `neighbour_photon`, `dark`,
+        `read` and `total`. The total is their quadratic sum, so `snr` is signal_dn / total. The ADC's rounding, 0.29 DN
+        per frame, is not included.
         """
         n, gain = self.n_frames, self.gain_dn_per_electron
         # Fraction of the light that saturation leaves.

@@ -180,13 +180,8 @@ class PixelMap(ContentEquality):
     ) -> PixelMap:
         """Draw a map with assumed scatter, to test pipelines; it describes no real detector.
 
-        Parameters
-        ----------
-        pixels, seed : int
-        response_rms, dark_rms : float
-            Relative scatter, log-normal.
-        hot_share, hot_dark : float
-            Fraction of hot pixels, and the factor on their dark current.
+        Response and dark have a relative scatter, log-normal. `hot_share` is the fraction of hot pixels, and `hot_dark`
+        the factor on their dark current.
         """
         generator = np.random.default_rng(seed)
         response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)

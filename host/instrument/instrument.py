@@ -199,11 +199,7 @@ class Instrument(Section):
     def with_(self, **changes: Any) -> Instrument:
         """Return a copy with changed values, each marked as the user's in `sources`.
 
-        Parameters
-        ----------
-        **changes
-            Values by name: Quantities, or plain numbers in the unit of the name. A curve may be a `Curve`, a path or
-            one number.
+        Values are Quantities, or plain numbers in the unit of the name. A curve may be a `Curve`, a path or one number.
         """
         changed = Instrument.build({**self._values(), **changes}, self.name)
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
@@ -343,15 +339,8 @@ class Instrument(Section):
     def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
 
-        This is the paper's efficiency times (1 - pointing_loss). Raises InputError outside the curves (`curves_nm`).
-
-        Parameters
-        ----------
-        wavelength_nm : Quantity, or array_like in nm
-
-        Returns
-        -------
-        ndarray, shape of `wavelength_nm`
+        This is the paper's efficiency times (1 - pointing_loss), in the shape of the wavelengths, a Quantity or numbers
+        in nm. Raises InputError outside the curves (`curves_nm`).
         """
         return self._optics(self._within(wavelength_nm, *self.curves_nm))
 
@@ -384,7 +373,7 @@ class Instrument(Section):
     def throughput(self, wavelength_nm: Wavelengths) -> Float:
         """Return the end-to-end throughput, electrons per photon, including the quantum efficiency.
 
-        Parameters and errors as for `efficiency`.
+        Wavelengths and errors as for `efficiency`.
 
         Examples
         --------
@@ -399,19 +388,15 @@ class Instrument(Section):
     def effective_area_cm2(self, wavelength_nm: Wavelengths) -> Float:
         """Return the effective area, cm^2: collecting area times throughput.
 
-        Parameters and errors as for `efficiency`.
+        Wavelengths and errors as for `efficiency`.
         """
         return self.collecting_area_cm2 * self.throughput(wavelength_nm)
 
     def electrons_per_joule_cm2(self, wavelength_nm: Wavelengths, *, held: bool = False) -> Float:
         """Return the electrons per fluence at the telescope, e- / (J cm^-2): area * efficiency * QE[A/W] / e.
 
-        Parameters and errors as for `efficiency`, and
-
-        Parameters
-        ----------
-        held : bool
-            Whether to extend a curve beyond its ends by its end value (an assumption) instead of raising InputError.
+        Wavelengths and errors as for `efficiency`; if `held`, curves keep their end values beyond their ends (an
+        assumption) instead of raising InputError.
         """
         nm = self._within(wavelength_nm, *((0.0, np.inf) if held else self.curves_nm))
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C

@@ -478,16 +478,10 @@ class Target:
 
     @classmethod
     def of(cls, text: str, *, name: str | None = None, simbad: bool = False) -> Target:
-        """Resolve a name of the embedded list or coordinates.
+        """Resolve a name of the embedded list, or ICRS coordinates: "290.0 -11.2" (deg) or "19h22m00s -11d12m00s".
 
-        Parameters
-        ----------
-        text : str
-            A name, or ICRS coordinates: degrees ("290.0 -11.2") or sexagesimal ("19h22m00s -11d12m00s").
-        name : str, optional
-            Name of the target in reports. The default is the list's name, or `text`.
-        simbad : bool
-            Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
+        Reports call it by `name`, by default that of the list or the text. With `simbad`, SIMBAD is asked for a name
+        that is not embedded, which needs `mauvecl[names]` and a network.
         """
         if is_missing_position(text):
             raise InputError(f"target {shortened(text)} holds missing values; give {EXPECTED_POSITION}", key="target")
@@ -513,13 +507,7 @@ class Target:
 
 
 def target_table() -> Table:
-    """Return the embedded stars.
-
-    Returns
-    -------
-    Table
-        Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type, other_names and source.
-    """
+    """Return the embedded stars: name, ra, dec (deg, ICRS), distance (pc), V, spectral_type, other_names and source."""
     return parse_ecsv(library_text("well_known.ecsv"), "the embedded list of stars")
 
 

@@ -60,14 +60,8 @@ class Thermal:
     def temperature_c(self, sunlight: Float, step_s: float, start_c: float | None = None) -> Float:
         """Return the temperature at the end of each step, deg C, shape (n,).
 
-        Parameters
-        ----------
-        sunlight : ndarray, shape (n,)
-            Visible fraction of the Sun's disk in each step, 0 to 1.
-        step_s : float
-            Length of a step. Sunlight is constant within a step, for which the solution is exact.
-        start_c : float, optional
-            Temperature before the first step. The default is the equilibrium for the mean sunlight.
+        Sunlight, the visible fraction of the Sun's disk, shape (n,), is constant within a step, for which the solution
+        is exact. The temperature before the first step is by default the equilibrium for the mean sunlight.
         """
         from scipy.signal import lfilter
 

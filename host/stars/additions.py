@@ -37,23 +37,11 @@ def add(
     flux_unit: str | None = None,
     extend: str | None = None,
 ) -> OwnStar:
-    """Keep a spectrum from a file under a name.
+    """Keep a spectrum from a file, as `Source.read` reads it, under a name: by default that in its header or its own.
 
+    Reports state its `origin`, by default the file name. With `replace`, a kept star of the same name is replaced.
     Raises InputError if the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be
     written.
-
-    Parameters
-    ----------
-    path : str or Path
-        File of any format that `formats.read_spectrum` supports.
-    name : str, optional
-        Name of the star. The default is that of the file's header, or the file name.
-    origin : str, optional
-        Origin of the spectrum, for reports. The default is the file name.
-    replace : bool
-        Whether to replace a kept star of the same name.
-    wavelength_unit, flux_unit, extend : str, optional
-        As for `Source.read`.
     """
     from astropy.table import Table
 
@@ -184,21 +172,11 @@ def fetch(
     show_progress: bool = True,
     extend: str | None = None,
 ) -> OwnStar:
-    """Download a star from a public collection and keep it.
+    """Download a star from a public collection and keep it, as `add` does.
 
-    Raises InputError if the network fails, the star is unknown, or its file holds no usable spectrum.
-
-    Parameters
-    ----------
-    name : str
-        A name such as ``"HD 37202"``, which is searched for in all collections, or ``"ngsl:HD 37202"``.
-    base : str, optional
-        Address of a mirror of the collection's files. `name` must then include the collection.
-    replace : bool
-        Whether to replace a kept star of the same name.
-    show_progress : bool
-    extend : str, optional
-        Library spectrum that continues the star's beyond its end.
+    A name such as ``"HD 37202"`` is searched for in all collections, ``"ngsl:HD 37202"`` in one, of whose files `base`
+    may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end. Raises
+    InputError if the network fails, the star is unknown, or its file holds no usable spectrum.
     """
     word, colon, star = (part.strip() for part in name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)

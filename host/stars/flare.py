@@ -346,15 +346,9 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         continue_at_k: Temperature | None = None,
         messages: tuple[str, ...] = (),
     ) -> Self:
-        """Return a flare from wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of the flare alone.
+        """Return a flare from wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of the flare alone, shape (n,) each.
 
-        Parameters
-        ----------
-        wavelength_nm, flux_flam : array_like, shape (n,)
-        name : str
-        continue_at_k : float, optional
-            Temperature of the blackbody that continues the spectrum where it ends, scaled to its last 20 nm.
-        messages : tuple of str
+        A blackbody of the temperature `continue_at_k` continues the spectrum where it ends, scaled to its last 20 nm.
         """
         nm, flux = np.asarray(wavelength_nm, np.float64), np.asarray(flux_flam, np.float64)
         check_points(name, nm, flux)
@@ -380,21 +374,11 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         flux_unit: str | None = None,
         continue_at_k: Temperature | None = None,
     ) -> Self:
-        """Read the spectrum of a flare, and subtract its star's quiescent spectrum from it.
+        """Read the spectrum of a star with its flare, and subtract its quiescent one, on the same scale, from it.
 
-        Raises InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700
-        nm.
-
-        Parameters
-        ----------
-        path : str or Path
-            Star and flare, or the flare alone where `quiescent` is None; formats as `Source.read`.
-        quiescent : str or Path, optional
-            The star without the flare, on the same scale.
-        wavelength_unit, flux_unit : str, optional
-            Override what both files state.
-        continue_at_k : float, optional
-            Temperature of the blackbody that continues the spectrum where it ends.
+        Without `quiescent` the file has the flare alone. Formats are those of `Source.read`; the units override what
+        both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends. Raises
+        InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
         """
         from mauvecl.host.spectra.formats import read_spectrum
 
@@ -560,18 +544,10 @@ MAX_FLARES = 500
 
 
 def read_flares(path: str | Path) -> QTable:
-    """Read amplitudes, and times if present, from a table of flares.
+    """Read amplitudes, and times if present, from a table of flares, with a column named as in `AMPLITUDES`.
 
-    Parameters
-    ----------
-    path : str or Path
-        CSV, ECSV or FITS file with a column named as in `AMPLITUDES`, in any case.
-
-    Returns
-    -------
-    QTable
-        ``amplitude``, and ``start`` and ``stop`` in days of the table's own time system. Columns that are not used are
-        named in ``meta["comments"]``.
+    The file is CSV, ECSV or FITS. The columns are ``amplitude``, and ``start`` and ``stop`` in days of the table's own
+    time system. Columns that are not used are named in ``meta["comments"]``.
     """
     from mauvecl.host.tables.opening import read_table
 
@@ -581,12 +557,7 @@ def read_flares(path: str | Path) -> QTable:
 def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     """Extract amplitudes and times from a table in memory; see `read_flares`.
 
-    Parameters
-    ----------
-    table : Table or DataFrame
-        An astropy table, or a DataFrame such as AltaiPony's ``flares``.
-    name : str
-        Name of the table in error messages.
+    It is an astropy table, or a DataFrame such as AltaiPony's ``flares``; errors call it by `name`.
     """
     from astropy.table import QTable, Table
 

@@ -257,11 +257,8 @@ OWN_COLUMNS = (
 def library_table() -> Table:
     """Return the embedded spectra, followed by the user's own.
 
-    Returns
-    -------
-    astropy.table.Table
-        Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality and kept. All are
-        text; the last is "embedded" or "yours".
+    The columns are name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality and kept. All are
+    text; the last is "embedded" or "yours".
     """
     from astropy.table import Table, vstack
 

@@ -191,13 +191,7 @@ class Source(Drawable, ContentEquality):
         )  # fmt: skip
 
     def binned(self, width_nm: BinWidth) -> Self:
-        """Return the spectrum averaged over bins from its first wavelength on, which reduces noise.
-
-        Parameters
-        ----------
-        width_nm : Quantity or float
-            Width of the bins, nm, 0.01 to 50.
-        """
+        """Return the spectrum averaged over bins, 0.01 to 50 nm wide from its first wavelength on, with less noise."""
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
         edges = np.append(np.arange(first, last - width_nm / 2, width_nm), last)
         flux = points.means(self.wavelength_nm, self.flux_flam, edges)
@@ -305,11 +299,7 @@ class Source(Drawable, ContentEquality):
     def magnitude(self, band: str = "V", system: points.System = "catalogue") -> float:
         """Return the synthetic magnitude in a band; raises InputError if the measured spectrum does not cover it.
 
-        Parameters
-        ----------
-        band : str
-        system : {"catalogue", "vega", "ab"}
-            The system of catalogues in the band, Vega at zero in every band, or AB.
+        The system is that of catalogues in the band, "vega" for Vega at zero in every band, or "ab".
         """
         low, high = self.measured_nm or (0.0, np.inf)
         # Continued ends are assumptions, so they do not count.
@@ -317,15 +307,9 @@ class Source(Drawable, ContentEquality):
         return points.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
     def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: points.System = "catalogue") -> Self:
-        """Return the star scaled to a magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
+        """Return the star scaled to a magnitude, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1).
 
-        Parameters
-        ----------
-        magnitude : Quantity or float in mag
-            Magnitude in the band, -30 to 40.
-        band : str
-        system : {"catalogue", "vega", "ab"}
-            See `magnitude`.
+        Band and system are those of `magnitude`.
         """
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         history = (*self.history, f"scaled to {points.band(band).name} = {magnitude:g}")
@@ -368,18 +352,10 @@ class Source(Drawable, ContentEquality):
         return replace(self, wavelength_nm=nm, flux_flam=flux, history=history, messages=messages)
 
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
-        """Return the star reddened by dust (needs the extra ``extinction``).
+        """Return the star reddened by dust of a colour excess E(B-V), 0 to 10 mag (needs the extra ``extinction``).
 
-        Raises InputError if the law does not cover 180-750 nm, or the extra is missing.
-
-        Parameters
-        ----------
-        ebv : Quantity or float in mag
-            Colour excess E(B-V), 0 to 10 mag.
-        rv : float
-            A_V / E(B-V).
-        law : {"G23", "F19", "CCM89"}
-            Extinction law of dust_extinction.
+        The law is one of dust_extinction, and `rv` is A_V / E(B-V). Raises InputError if the law does not cover
+        180-750 nm, or the extra is missing.
         """
         try:
             from dust_extinction import parameter_averages
