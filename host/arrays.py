@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -34,12 +35,6 @@ def true_runs(flags: Bool) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 
 
-class _Digest(bytes):
-    """Digest of arguments, by which these compare; they are released after the call."""
-
-    arguments: Any = None
-
-
 def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Cache the latest results of a function of arrays and plain values.
 
@@ -47,9 +42,11 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        given = threading.local()
+
         @lru_cache(maxsize=maxsize)
-        def computed(given: _Digest) -> R:
-            (arguments, named), given.arguments = given.arguments, None
+        def computed(digest: bytes) -> R:
+            arguments, named = given.call
             value = function(*arguments, **named)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -64,9 +61,8 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
                     hashed.update(np.ascontiguousarray(value).data)
                 else:
                     hashed.update(repr(value).encode())
-            given = _Digest(hashed.digest())
-            given.arguments = arguments, named
-            return computed(given)
+            given.call = arguments, named
+            return computed(hashed.digest())
 
         return wrapper
 

@@ -15,15 +15,7 @@ import numpy as np
 
 from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.response import Order, electrons_per_second
-from mauvecl.host.stars.library import (
-    by_key,
-    embedded,
-    known_band,
-    library_table,
-    name_key,
-    near_names,
-    nearest_spectrum,
-)
+from mauvecl.host.stars import library
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables import names
 from mauvecl.host.tables.units import offline
@@ -92,14 +84,14 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     from astropy.coordinates.baseframe import BaseCoordinateFrame
 
     if isinstance(target, str):
-        if (star := by_key().get(name_key(target))) is not None:
+        if (star := library.by_key().get(library.name_key(target))) is not None:
             return SkyCoord(star.ra_deg, star.dec_deg, unit="deg")
         try:
             return SkyCoord(*names.position(target), unit="deg")
         except InputError as error:
             if not re.match(r"\s*[^\W\d]", target):
                 raise
-            like = ", ".join(near_names(target, stars_only=True))
+            like = ", ".join(library.near_names(target, stars_only=True))
             expected = f"a name such as {like}, or {names.EXPECTED_POSITION}"
             raise InputError.of("target", target, expected) from error
     position = SkyCoord(target) if isinstance(target, SkyCoord | BaseCoordinateFrame) else None
@@ -257,10 +249,10 @@ class Neighbour:
         if self.file is not None:
             return self.file.name, ""
         if self.spectral_type:
-            entry = embedded(self.spectral_type)
+            entry = library.embedded(self.spectral_type)
             if entry is not None:
                 return entry["name"], ""
-            nearest = nearest_spectrum(self.spectral_type)
+            nearest = library.nearest_spectrum(self.spectral_type)
             return nearest, f"of type {self.spectral_type}: {nearest}, the nearest type of the library"
         if self.temperature_k is not None:
             wanted = self.temperature_k
@@ -286,7 +278,7 @@ class Neighbour:
         star = Source.from_library(name) if self.file is None else Source.read(self.file)
         if self.magnitude is not None:
             try:
-                star = star.at_magnitude(self.magnitude, known_band(self.band))
+                star = star.at_magnitude(self.magnitude, library.known_band(self.band))
             except InputError as error:
                 raise error.within(self._place) from error
         check_level(star, f"neighbour {self.name}", "neighbours")
@@ -367,7 +359,7 @@ def rate_of(neighbour: Neighbour, instrument: Instrument, order: Order) -> Float
 @cache
 def _typical() -> dict[str, tuple[float, float]]:
     """Return temperature and synthetic Gaia colour BP - RP of the embedded spectra that represent a spectral type."""
-    rows = [row for row in library_table() if row["kept"] == "embedded" and row["name"] == row["spectral_type"]]
+    rows = [row for row in library.library_table() if row["kept"] == "embedded" and row["name"] == row["spectral_type"]]
     stars = [Source.from_library(str(row["name"])) for row in rows]
     colours = [star.magnitude("Gaia BP") - star.magnitude("Gaia RP") for star in stars]
     return {star.name: (star.temperature_k or np.nan, colour) for star, colour in zip(stars, colours, strict=True)}
@@ -450,7 +442,7 @@ def _magnitude(table: Rows, row: int, columns: dict[str, str], bands: str | None
             stated = band or names.band_in_name(name) or table.text(bands, row) or "V"
             # Only stars within the fibre need a band with a passband.
             with contextlib.suppress(InputError):
-                return value, known_band(stated)
+                return value, library.known_band(stated)
             return value, stated
     return None, "V"
 

@@ -24,7 +24,7 @@ from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.source import Source, check_covers, listed_star
 from mauvecl.host.stars.spectrum import continued
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, Drawable, table_of
+from mauvecl.schema.columns import Column, Drawable, number, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
@@ -53,7 +53,7 @@ ORIGINS = (
 BUDGET_COLUMNS = (
     Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element", heading="nm",
            format=".1f"),
-    *(Column(name, unit="DN", description=text, heading=heading, format=".2f") for name, heading, text in ORIGINS),
+    *(Column(name, unit="DN", description=text, heading=title, format=number(".2f")) for name, title, text in ORIGINS),
 )  # fmt: skip
 
 

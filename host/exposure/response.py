@@ -86,11 +86,9 @@ def electrons_per_second(
         return cast(Float, response_matrix(instrument, nodes, order) @ flux)
     # Efficiencies act at the wavelength of the light, or else at that of the pixel.
     by_light = instrument if order == "physical" else None
-    landing = _line_landing(LineSpread.of(instrument), _knots(by_light))
-    gathered = np.zeros(landing.shape[1])
-    for part in _gathering(LineSpread.of(instrument), nodes, by_light):
-        gathered += part @ flux
-    rate = landing @ gathered
+    line = LineSpread.of(instrument)
+    gathered = np.sum([part @ flux for part in _gathering(line, nodes, by_light)], axis=0)
+    rate = _line_landing(line, _knots(by_light)) @ gathered
     return np.asarray(rate if by_light else rate * _efficiencies(instrument))
 
 

@@ -143,9 +143,11 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
         values = np.concatenate([part[k].ravel() for part in parts] or [np.array([], column.kind or float)])
         if values.dtype == object:
             missing = np.array([value is None for value in values])
-            # A quantity has no mask.
-            filled = np.where(missing, np.nan if column.unit else 0, values).astype(column.kind or float)
-            values = filled if column.unit else np.ma.MaskedArray(filled, missing)
+            if column.unit:
+                # A quantity has no mask.
+                values = np.where(missing, np.nan, values).astype(float)
+            else:
+                values = np.ma.MaskedArray(np.where(missing, 0, values).astype(column.kind or float), missing)
         elif column.kind is not None:
             values = values.astype(column.kind)
         table[column.name] = values * unit_of(column.unit) if column.unit else values

@@ -14,7 +14,7 @@ from synphot.models import BlackBodyNorm1D
 from synphot.units import FLAM
 
 import mauvecl
-from mauvecl import Expectation, Source, Study, expect, simulate, visible
+from mauvecl import Expectation, Source, Study, expect, simulate, snr, visible
 
 LIBRARY = Path(mauvecl.__file__).parent / "host" / "stars" / "library"
 KNOWN = Table.read(LIBRARY / "well_known.ecsv", format="ascii.ecsv")
@@ -163,3 +163,11 @@ def test_messages_on_neighbours(tmp_path: Path) -> None:
         ("A,0.3,7.2,G2V", "neighbours_of"),
     ):
         assert said in " ".join(seen(tmp_path, row).messages)
+
+
+def test_noise_by_origin_has_no_number_where_a_star_has_no_neighbour(tmp_path: Path) -> None:
+    (tmp_path / "near.csv").write_text(f"name,separation,V,sptype\n{B}\n")
+    alone = {"library": "G2V", "magnitude": 7.4}
+    both = [alone | {"neighbours": str(tmp_path / "near.csv")}, alone]
+    noise = snr(Study.build({"star": both, "observation": {"exposure_s": 50.0}}, "test")).views[1].table
+    assert np.isnan(noise["neighbour_photon"].value).tolist() == [False] * 4 + [True] * 4
