@@ -378,37 +378,26 @@ def text_and_name(path: str | Path, what: str) -> tuple[str, str]:
 def parse_numbers(text: str, what: str) -> Numbers:
     """Parse an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
     import numpy as np
+    import yaml  # comes with astropy
 
     lines = text.splitlines()
     check_header(lines, what)
-    numbers = _plain_numbers(lines)
-    if numbers is not None:
-        return numbers
+    header, rows = [line[2:] for line in lines if line[:1] == "#"], [line for line in lines if line[:1] != "#"]
+    # Numbers that single blanks separate need no import of astropy's tables.
+    with contextlib.suppress(yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError):
+        said = yaml.load("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        types = {one["name"]: one["datatype"] for one in said["datatype"] if "subtype" not in one}
+        is_numeric = len(types) == len(said["datatype"]) and all(k[:3] in ("flo", "int", "uin") for k in types.values())
+        if is_numeric and "delimiter" not in said and rows[0].split(" ") == [*types]:
+            values = np.array([row.split(" ") for row in rows[1:] if row], np.float64).reshape(-1, len(types))
+            units = {one["name"]: str(one.get("unit", "")) for one in said["datatype"]}
+            return Numbers(dict(zip(types, values.T.copy(), strict=True)), units, dict(said.get("meta") or {}))
     table = parse_ecsv(text, what)
     for name in table.colnames:
         if table[name].dtype.kind not in "iuf" or np.ma.is_masked(table[name]) or table[name].ndim != 1:
             raise InputError(f"{what}: {name} must hold numbers only, but has missing or other values", key=name)
     columns = {name: np.asarray(table[name], np.float64) for name in table.colnames}
     return Numbers(columns, {name: str(table[name].unit or "") for name in table.colnames}, dict(table.meta))
-
-
-def _plain_numbers(lines: list[str]) -> Numbers | None:
-    """Parse numbers separated by single blanks without importing astropy's tables; return None for anything else."""
-    import numpy as np
-    import yaml  # comes with astropy
-
-    header, rows = [line[2:] for line in lines if line[:1] == "#"], [line for line in lines if line[:1] != "#"]
-    try:
-        said = yaml.load("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        names = [one["name"] for one in said["datatype"]]
-        numeric = all(one["datatype"][:3] in ("flo", "int", "uin") and "subtype" not in one for one in said["datatype"])
-        if not numeric or "delimiter" in said or rows[0].split(" ") != names:
-            return None
-        values = np.array([row.split(" ") for row in rows[1:] if row], np.float64).reshape(-1, len(names))
-        units = {one["name"]: str(one.get("unit", "")) for one in said["datatype"]}
-        return Numbers(dict(zip(names, values.T.copy(), strict=True)), units, dict(said.get("meta") or {}))
-    except (yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError):
-        return None
 
 
 def check_header(lines: list[str], what: str) -> None:

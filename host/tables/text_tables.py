@@ -199,7 +199,10 @@ def rows_of_text(
     dashes, may stand below the names. If nothing else shows how, cells are divided at `commas`.
 
     A text that continues a table has rows only, with the `layout` of the `first` rows above it, which messages count.
+    Raises InputError for a row with another number of cells than columns.
     """
+    from astropy.table import Table
+
     lines = [line for line in text.splitlines() if not _RULE.fullmatch(line)]
     n_marked = next((k for k, line in enumerate(lines) if not re.match(r"c(?:\s+[a-z]|\s*$)", line, re.I)), 0)
     if n_marked > 1:
@@ -220,13 +223,6 @@ def rows_of_text(
         cells = [row[:-1] for row in cells]
     if layout.decimal:
         cells = _with_points(cells)
-    return _table_of_cells(cells, layout, comments, what, first), layout
-
-
-def _table_of_cells(cells: list[list[str]], layout: Layout, comments: list[str], what: str, first: int) -> Table:
-    """Return cells as a table; raise InputError for the first row with another number of cells than columns."""
-    from astropy.table import Table
-
     n = len(layout.names)
     if odd := next(((number, len(row)) for number, row in enumerate(cells, first + 1) if len(row) != n), None):
         # The file may be cut short.
@@ -241,7 +237,7 @@ def _table_of_cells(cells: list[list[str]], layout: Layout, comments: list[str],
         table.meta[REMARKS] = (DECIMAL_COMMAS,)
     for name, unit in zip(layout.names, layout.units, strict=False):
         table[name].unit = unit or None
-    return table
+    return table, layout
 
 
 def _divided(
