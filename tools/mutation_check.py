@@ -137,7 +137,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("for index in np.flatnonzero(outside).tolist():", "for index in ():"),
     ),
     "far S/N lost": (
-        "test_snr_equals_that_of_sorting[16-0]",
+        "test_snr_equals_that_of_sorting[16-0-net]",
         ("tile.pieces(RAW_BATCH) if outside.size else ()", "()"),
     ),
     "7 rounds": (
@@ -157,7 +157,7 @@ MUTATIONS: dict[str, Mutation] = {
         SWAPPED,
     ),
     "rounded normal for the dark": (
-        "test_pearson_of_the_expansion",
+        "test_pearson_of_draws",
         ("nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
         (
             'nearest(fma(z, fma(z, curve, source["slope"]), source["offset"]))',
@@ -203,7 +203,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
     ),
     "the sky counted as signal": (
-        "test_snr_includes_photon_noise_of_sky",
+        "test_snr_equals_that_of_sorting[16-3-net]",
         ("        signal -= (floatv)element.sky;\n", ""),
         ("    signal = signal - sky\n", ""),
     ),

@@ -1,6 +1,7 @@
 """Campaigns: bounds, independence, overlap, and false-alarm probabilities of single tests, as a detection says them."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,9 +74,7 @@ def test_long_campaigns_are_joined_from_stretches(engine: Engine) -> None:
 
 @pytest.mark.parametrize("wanted", [0.01, 0.5])
 @pytest.mark.parametrize(("frames", "stack"), [(17_280, 1), (17_280, 10), (7, 7)])
-def test_false_alarm_probability_per_test_is_the_inverse(
-    engine: Engine, wanted: float, frames: int, stack: int
-) -> None:
+def test_false_alarm_probability_per_test_is_the_inverse(engine: Any, wanted: float, frames: int, stack: int) -> None:
     _, (asked, tests, independent, at_least, *overlap) = said(engine, frames, stack, fap=wanted)
     assert (asked, tests) == (wanted, frames // stack)
     assert 1 - (1 - independent) ** tests == pytest.approx(wanted, rel=1e-3)

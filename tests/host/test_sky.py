@@ -24,10 +24,8 @@ CELLS = {
 
 
 def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, float]:
-    """Return helio-ecliptic longitude, latitude and the Sun's separation, degrees, to 0.03 deg for 1950-2050.
-
-    The Astronomical Almanac's low-precision Sun (page C5), a rotation by the obliquity of J2000, general precession.
-    """
+    """Return helio-ecliptic longitude, latitude and the Sun's separation by a low-precision Sun, to 0.03 deg."""
+    # Page C5 of the Astronomical Almanac, for 1950-2050, the obliquity of J2000 and general precession.
     n = (datetime.fromisoformat(utc) - datetime(2000, 1, 1, 12)).total_seconds() / 86400
     anomaly = np.radians(357.528 + 0.9856003 * n)
     sun = 280.460 + 0.9856474 * n + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly)

@@ -7,12 +7,13 @@ import pytest
 from marks import long_but
 from scipy import integrate, stats
 
-from mauvecl.noise import reference, unknowns
+from mauvecl import Study
+from mauvecl.noise import reference
 
 #: Three statistical tests of 4.5 sigma and KS tests at 1e-5: about one run in 10 000 fails by chance. Seeds were fixed
 #: before the first run.
 SIGMA, LEAST_P, SEED = 4.5, 1e-5, 11
-DRIFTS = unknowns.STARE_PROCESSES["pointing"](rate_per_h=6.0, duration_s=200.0, depth=0.8)
+DRIFTS = Study().with_settings(["stare.pointing={rate_per_h=6.0, duration_s=200.0, depth=0.8}"]).stare.pointing
 drifts, losses = (partial(function, DRIFTS) for function in (reference.pointing_drifts, reference.pointing_losses))
 WAIT_S = 600.0
 NUMBERS = np.arange(20_000, dtype=np.uint64)

@@ -54,17 +54,14 @@ def amplitude_of(snr: float, half_width_s: float) -> float:
     return float(1e-4 * snr / faint_snr() * np.sqrt(100.0 / half_width_s))
 
 
-def test_bright_flare_is_found_once() -> None:
+def test_bright_flare_is_found_once_and_another_shape_leaves_at_most_a_small_residual() -> None:
     """S/N of 400: its fit leaves no second alarm in any template. A false alarm: once in 7e4 runs."""
     for seed in (1, 2):
         (row,) = found([Event(3000.0, 60.0, 1.0)], seed, BRIGHT)
         assert abs(row["peak_time"].value - 3000.0) < 5.0
         assert row["value"] > 300
         assert row["event"] == 1
-
-
-def test_unfitted_shape_leaves_at_most_a_small_residual() -> None:
-    """The other published shape: its fit is wrong, but its rests are no flares."""
+    # The fit of the other published shape is wrong, but its rests are no flares.
     several = found([Event(3000.0, 60.0, 1.0, shape="tovarmendoza2022")], 1, BRIGHT)
     assert several["value"][0] > 300
     assert len(several) <= 2
