@@ -363,7 +363,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("covariance.log_determinant + np.log(information)", "covariance.log_determinant"),
     ),
     "steps taken for flares": (
-        "test_a_flare_is_found_at_its_time_and_a_step_is_a_step",
+        "test_steps_single_frames_and_dips_are_no_flares_and_three_frames_are_one",
         (
             "return whole - float(gain.max()) < least - STEP_GAIN",
             "return whole - float(gain.max()) > least - STEP_GAIN",

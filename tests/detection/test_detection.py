@@ -9,22 +9,8 @@ from answers import STATISTICS, small, twice
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl import (
-    Comparison,
-    Detection,
-    Engine,
-    Instrument,
-    Linear,
-    Normal,
-    Nuisances,
-    Processes,
-    Sky,
-    Source,
-    Uniform,
-    departures,
-    detect,
-    expect,
-)
+import mauvecl
+from mauvecl import Comparison, Detection, Engine, Linear, Normal, Nuisances, Processes, Uniform, departures, detect
 
 N = 1_000_000
 #: The paper's G2V star, with flares around the edge of detection for one statistic or another.
@@ -141,16 +127,13 @@ def scene(number: int) -> tuple:
     """Draw a star, magnitude, exposure, temperature, sky, instrument and 12 nm of spectrum at random."""
     generator = np.random.default_rng([2026, number])
     first = generator.uniform(200.0, 330.0)
-    payload = Instrument.load(str(generator.choice(["mauvesim", "mauve"]))).with_(
-        temperature_c=float(generator.uniform(-10.0, 25.0)),
-        output_min_nm=float(first),
-        output_max_nm=float(first + 12.0),
-    )
-    source = Source.from_library(str(generator.choice(STARS))).at_magnitude(float(generator.uniform(3.0, 10.0)))
-    sky = Sky.of_brightness(float(generator.uniform(18.0, 23.0)))
+    name, celsius = str(generator.choice(["mauvesim", "mauve"])), float(generator.uniform(-10.0, 25.0))
+    payload = instrument(name, temperature_c=celsius, output_min_nm=float(first), output_max_nm=float(first + 12.0))
+    source = mauvecl.Source.from_library(str(generator.choice(STARS))).at_magnitude(float(generator.uniform(3.0, 10.0)))
+    sky = mauvecl.Sky.of_brightness(float(generator.uniform(18.0, 23.0)))
     exposure = 5.0 * int(generator.integers(1, 60))
     return tuple(
-        expect(s, payload, exposure=exposure, sky=sky)
+        mauvecl.expect(s, payload, exposure=exposure, sky=sky)
         for s in (source, source.flaring(float(generator.uniform(0.01, 1.0))))
     )
 

@@ -12,21 +12,8 @@ from refusals import refused
 from scenes import paper, through
 from scipy.integrate import quad
 
-from mauvecl import (
-    SHAPES,
-    Blackbody,
-    Cooling,
-    EnergyScale,
-    Instrument,
-    Sinusoid,
-    Sky,
-    Source,
-    Stare,
-    Study,
-    expect,
-    stare,
-    visible,
-)
+import mauvecl
+from mauvecl import SHAPES, Cooling, EnergyScale, Instrument, Sinusoid, Sky, Source, Stare, Study, expect, stare
 
 MAUVE = Instrument.load("mauvesim")
 STARS = ("A0V", "A7V", "F5V", "G2V", "K1V", "K5V", "M0V", "M3V", "M5V", "Sun")
@@ -136,7 +123,7 @@ def test_stated_energies_are_those_of_the_light(seed: int) -> None:
             light = source.flaring(1.0, one, band=band).flux_flam - source.flux_flam
             drawn_erg["band"] += seconds * sphere * through(band, nm, light)
             # The light beyond the spectrum is that of the blackbody, by the law of Stefan and Boltzmann.
-            share = float(light[near] / Blackbody(one).flux(nm[[near]])[0])
+            share = float(light[near] / mauvecl.Blackbody(one).flux(nm[[near]])[0])
             drawn_erg["bolometric"] += seconds * sphere * share * 5.670374419e-5 * one**4
         assert stated == pytest.approx(drawn_erg, rel=0.03 if law else 5e-4)
 
@@ -147,7 +134,7 @@ def test_replacing_flare_carries_the_energy_it_adds(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
     name, star_k, flare_k = str(rng.choice(BANDS)), float(rng.uniform(3000, 9000)), float(rng.uniform(9500, 30_000))
     nm, small = np.geomspace(20, 300_000, 60_001), 1e-4
-    source = Source.from_arrays(nm, 1e-19 * Blackbody(star_k).flux(nm))
+    source = Source.from_arrays(nm, 1e-19 * mauvecl.Blackbody(star_k).flux(nm))
     how: Any = {"band": name, "geometry": "replaces"}
     flaring = source.flaring(small, flare_k, photosphere_temperature=star_k, **how)
     light = (flaring.flux_flam - source.flux_flam) / small
@@ -239,7 +226,7 @@ def night() -> Stare:
 
 
 def test_frames_are_those_of_the_windows(night: Stare) -> None:
-    windows = visible(asked()).tables["windows"]
+    windows = mauvecl.visible(asked()).tables["windows"]
     first = Time(START).mjd
     ends = [(Time(list(windows[name])).mjd - first) * 86_400 for name in ("start", "stop")]
     np.testing.assert_allclose(night.gtis, np.column_stack(ends), atol=1.0)
@@ -253,7 +240,7 @@ def test_frames_are_those_of_the_windows(night: Stare) -> None:
 def test_temperature_follows_the_orbit(night: Stare) -> None:
     """Check ends, shadow as in the table of windows up to the penumbra of 8 s, and independence of the start time."""
     assert ((night.temperature_c > 13) & (night.temperature_c < 21)).all()
-    windows = visible(asked()).tables["windows"]
+    windows = mauvecl.visible(asked()).tables["windows"]
     for (start, stop), minutes in zip(night.gtis, windows["in_shadow"].value, strict=True):
         inside = (night.start_s >= start) & (night.start_s < stop)
         falls = np.diff(night.temperature_c[inside]) < 0

@@ -22,14 +22,9 @@ def test_philox_gives_the_known_answers(probes: Probes, counter: Words, key: Wor
     np.testing.assert_array_equal(np.array(twin), answer)
 
 
-def random_counters(n: int) -> tuple[np.ndarray, np.ndarray]:
-    generator = np.random.default_rng(20_261)
-    counters = generator.integers(0, 2**32, (n, 4), dtype=np.uint32)
-    return counters, generator.integers(0, 2**32, (n, 2), dtype=np.uint32)
-
-
 def test_device_numpy_and_an_independent_implementation_give_equal_words(probes: Probes) -> None:
-    counters, keys = random_counters(5000)
+    generator = np.random.default_rng(20_261)
+    counters, keys = (generator.integers(0, 2**32, (5000, n), dtype=np.uint32) for n in (4, 2))
     ours = probes.philox(counters, keys)
     np.testing.assert_array_equal(ours[:, :4], ours[:, 4:], err_msg="the loop-invariant form")
     for counter, key, words in zip(counters[:200], keys, ours[:, :4], strict=False):

@@ -15,20 +15,7 @@ from scenes import paper
 from scenes import source as star
 
 import mauvecl
-from mauvecl import (
-    Expectation,
-    FlareModel,
-    Frames,
-    Instrument,
-    Sky,
-    Source,
-    Study,
-    calibrate,
-    expect,
-    fit,
-    measure,
-    plan,
-)
+from mauvecl import Expectation, FlareModel, Frames, Instrument, Sky, Source, Study, calibrate, expect, measure, plan
 
 NOMINAL = Instrument.load("mauvesim")
 SKY = Sky.of_brightness(22.1)
@@ -343,7 +330,7 @@ def deviations(added: np.ndarray, right: QTable, file: Path) -> dict[str, float]
     """Return a flare's fit and a plan through a true instrument, less a fitted one's, in errors of the throughput."""
     fitted = Instrument.load(file)
     quiet = light(fitted, 0.0)
-    measured = fit(quiet.recorded_dn + added, quiet, FlareModel.of(star("M3V", 9.0), fitted, quiet))
+    measured = mauvecl.fit(quiet.recorded_dn + added, quiet, FlareModel.of(star("M3V", 9.0), fitted, quiet))
     table, found = measure(with_([*FLARE, "run.realisations=10"], file)).table, {}
     for name in ("temperature", "flux 200-320 nm", "flux 200-700 nm"):
         (row,) = table[table["quantity"] == name]

@@ -11,20 +11,8 @@ from scenes import analysed, noisy
 from scipy import stats
 from scripts import loaded
 
-from mauvecl import (
-    SHAPES,
-    Frames,
-    Instrument,
-    ObservedFlare,
-    Source,
-    Stares,
-    Study,
-    analyse,
-    expect,
-    inject,
-    read_frames,
-    stare,
-)
+import mauvecl
+from mauvecl import SHAPES, Frames, Instrument, Source, Stares, Study, analyse, expect, read_frames, stare
 from mauvecl.observations import detection, events
 from mauvecl.observations import level as levels
 from mauvecl.observations import search as searches
@@ -202,7 +190,7 @@ def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: St
     free = {name: "free" for name, sd in series.jitters.items() if np.isinf(sd)}
     level = {"slope": False, "cycle": False, "window_s": 40_000.0}
     alike = SECTIONS["search"] | {"frame": free} | level
-    expected = inject(Study(**sections | {"search": alike}, injections=injections), stares)
+    expected = mauvecl.inject(Study(**sections | {"search": alike}, injections=injections), stares)
     there = float(expected.tables["limits"]["e50"][0].value) / float(expected.tables["search"]["threshold"][0])
     assert np.mean(ratios) / there == pytest.approx(1.0, abs=0.1)
 
@@ -239,7 +227,7 @@ def test_temperatures_and_luminosities_are_those_of_the_spectra() -> None:
     quiet = expect(star, mauve, exposure=FRAME_S)
     light = np.tile(quiet.light_dn, (N, 1))
     for seconds, path in FILES.items():
-        flare = ObservedFlare.read(path, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0)
+        flare = mauvecl.ObservedFlare.read(path, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0)
         grid = flare.grid(star.wavelength_nm)
         both = Source(grid, np.interp(grid, star.wavelength_nm, star.flux_flam) + flare.flux(grid), "AD Leo", "test")
         light += np.outer(COURSE[seconds], expect(both, mauve, exposure=FRAME_S).light_dn - quiet.light_dn)

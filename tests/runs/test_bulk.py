@@ -100,12 +100,6 @@ def test_separate_frames_sum_to_the_exposure(tmp_path: Path, engine: Engine, pro
         np.testing.assert_array_equal(two.values, every.values[:, [0, 7]])
 
 
-def swap(one: Path, other: Path) -> None:
-    content = one.read_bytes()
-    one.write_bytes(other.read_bytes())
-    other.write_bytes(content)
-
-
 DESCRIBED, LISTED = "star-1/flare-1/zarr.json", "star-1/quiescent/digests.txt"
 FIRST, THIRD = "star-1/quiescent/c/0/0", "star-1/quiescent/c/2/0"
 #: What happens to a store, and the states of its files that are then found; "?" for any.
@@ -114,7 +108,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
     "flipped CRC": (lambda p: flip(p / LAST, -1), {LAST: "damaged"}),
     "cut short": (lambda p: (p / CHUNK).write_bytes((p / CHUNK).read_bytes()[:-10]), {CHUNK: "damaged"}),
     "missing": (lambda p: (p / CHUNK).unlink(), {CHUNK: "missing"}),
-    "swapped": (lambda p: swap(p / CHUNK, p / THIRD), {CHUNK: "foreign", THIRD: "foreign"}),
+    "misplaced": (lambda p: shutil.copy(p / CHUNK, p / THIRD), {THIRD: "foreign"}),
     "flipped byte in the list": (lambda p: flip(p / LISTED, 5), {FIRST: "unlisted"}),
     "flipped byte in the study": (lambda p: flip(p / "zarr.json", 40), {"zarr.json": "?"}),
     "a missing description": (lambda p: (p / DESCRIBED).unlink(), {DESCRIBED: "missing"}),
