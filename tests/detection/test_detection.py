@@ -225,7 +225,6 @@ def test_estimated_variances_are_predicted(engine: Engine) -> None:
 
 
 def test_undrawn_unknowns_are_reported(engine: Engine) -> None:
-    """Report fewer false alarms than in the closed form if a prior is not drawn."""
     quiet, flare = star(amplitudes=(0.24,))
     departed = engine.detect(quiet, [flare], realisations=100_000, seed=1, nuisances={"dark": 0.1})
     rows = {d.statistic: d for d in departures(departed, 0.01)}

@@ -168,7 +168,6 @@ def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare:
     (16, 3, "net"), (16, 3, "paper"),
 ))  # fmt: skip
 def test_snr_equals_that_of_sorting(width: int, number: int, signal: Any) -> None:
-    """Compare means, spreads and quantiles of pixels and elements with the S/N of the raw spectra."""
     (quiet, *_), how = study(number)
     if number == 3:
         # A sky as bright as the star.

@@ -14,7 +14,6 @@ DOF = 48
 
 
 def exact(k: int, n: int) -> tuple[float, float]:
-    """Return Clopper and Pearson's interval."""
     found = stats.binomtest(int(k), n).proportion_ci(method="exact")
     return found.low, found.high
 

@@ -66,7 +66,6 @@ COMPARED: list[tuple[str, dict[str, Any]]] = [
 
 
 def case(name: str) -> tuple[list, dict]:
-    """Return the expectations of a case and the options of their draw."""
     options = dict(CASES[name])
     how = {key: options.pop(key) for key in ("mode", "recipe", "processes") if key in options}
     exposure, magnitude = options.pop("exposure", 50.0), options.pop("magnitude", 7.4)

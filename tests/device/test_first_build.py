@@ -46,20 +46,17 @@ ACTS = {
 
 
 def run(cache: Path | str, before: str = "", **environment: str) -> dict[str, str]:
-    """Run a separate process and return what it prints."""
     return printed(forked(RUN.format(before=before), cache=cache, **environment))
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
-    """Return the cache after a first start, and what this start printed."""
     cache = tmp_path_factory.mktemp("plain")
     return cache, run(cache)
 
 
 @pytest.fixture
 def chooses(plain: tuple[Path, dict[str, str]]) -> None:
-    """Skip the test if mauvecl does not choose the processor name."""
     if plain[1]["level"] == "None":
         pytest.skip("the default device chooses what it compiles for by itself")
 

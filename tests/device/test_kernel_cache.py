@@ -46,7 +46,6 @@ def run(cache: Path | str, before: str = "") -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Return a cache that one process has filled, and the digest that it printed."""
     cache = tmp_path_factory.mktemp("filled")
     first = run(cache)
     assert first["restored"].startswith("0 of")
@@ -69,7 +68,6 @@ DAMAGE = {
 @pytest.mark.long
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_damaged_program_is_not_restored(filled: tuple[Path, str], tmp_path: Path, kind: str) -> None:
-    """Keep damaged files of every kind out of the folder that PoCL reads."""
     (store,) = filled[0].glob("*/store")
     shutil.copytree(store, tmp_path / "store")
     cache = drivers.KernelCache(tmp_path / "store", tmp_path / "work")
@@ -100,7 +98,6 @@ def test_second_process_builds_nothing_unless_the_store_is_damaged(filled: tuple
 
 
 def build_in(cache: drivers.KernelCache, number: int, size: int = 100) -> Path:
-    """Build a made-up program of this size and return its folder."""
     with cache.building(f"key{number}"):
         folder = cache.work / "AA" / f"program{number}"
         folder.mkdir(parents=True)

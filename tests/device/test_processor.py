@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pyopencl as cl
@@ -167,10 +168,7 @@ def test_compiler_prints_nothing(tmp_path: Path) -> None:
 
 
 def test_error_names_processor_unknown_to_compiler(engine: Engine, monkeypatch: Any) -> None:
-    def refuse(*_: Any) -> Any:
-        raise cl.RuntimeError("error: unknown target CPU 'generic'")
-
-    monkeypatch.setattr(cl, "Program", refuse)
+    monkeypatch.setattr(cl, "Program", Mock(side_effect=cl.RuntimeError("error: unknown target CPU 'generic'")))
     with pytest.raises(RuntimeError) as caught:
         build.build(engine.open_device.context, "__kernel void nothing() {}")
     assert (caught.value.kind, "\n" in str(caught.value)) == ("processor", False)

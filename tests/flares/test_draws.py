@@ -150,7 +150,6 @@ def test_sums_by_cumulants_are_distributed_as_by_pixels(stares: Stares, payload:
 
 
 def test_components_equal_the_expectations(stares: Stares) -> None:
-    """Compare means and variances of mixtures of star, sky, dark and flares with their expectations."""
     quiet, *flares = star(amplitudes=(0.5, 2.0), exposure=5.0, payload=instrument(part=True), neighbours=NEAR)
     assert quiet.target_share < 0.7
     rng = np.random.default_rng(2)

@@ -37,12 +37,10 @@ def light_of(amplitude: float = 0.0, kelvin: float = 10_000.0) -> dict[str, floa
 
 
 def excess(table: QTable, name: str) -> np.ndarray:
-    """Return the light of the flares in each frame, DN/s."""
     return np.asarray(table[name].value - light_of()[name])
 
 
 def course(table: QTable, event: dict[str, Any]) -> np.ndarray:
-    """Return a flare's mean over each frame, by its shape."""
     edges = np.asarray(table["time"].value)[:, None] + [-2.5, 2.5]
     return SHAPES[event.get("shape", "davenport2014")].mean_over(edges, event["peak_s"], event["half_width_s"])
 

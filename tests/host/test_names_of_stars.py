@@ -189,7 +189,6 @@ def test_each_spectrum_is_usable_and_has_an_origin(entry: Any) -> None:
 
 
 def mean(name: str, low: float, high: float) -> float:
-    """Return the mean flux of a star in a range of wavelengths, nm."""
     star = Source.from_library(name)
     return float(star.flux_flam[(star.wavelength_nm >= low) & (star.wavelength_nm < high)].mean())
 

@@ -48,7 +48,6 @@ def archive_file(**header: Any) -> bytes:
 
 
 def library(folder: Path, *words: str | Path, code: int = 0) -> str:
-    """Run a command of the library and return what it says."""
     done = run("library", *words, folder=folder, code=code)
     return done.stdout + done.stderr
 
@@ -149,7 +148,6 @@ class Archive(http.server.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def archive() -> Iterator[str]:
-    """Serve the archives' files locally and return the address."""
     calspec = WHOLE.read_bytes()
     ngsl = archive_file(TARGNAME="HD037202", DATAQUAL="good", OFFSETPX=0.1)
     names = ("18sco_stis_004.fits", "18sco_stis_006.fits", "18sco_stis_005.fits", "18sco_mod_009.fits",

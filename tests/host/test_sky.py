@@ -5,6 +5,7 @@ import socket
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import astropy.units as u
 import numpy as np
@@ -112,10 +113,7 @@ def test_equivalent_targets_and_times() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_no_network_access_and_no_global_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("the network was asked")
-
-    monkeypatch.setattr(socket, "socket", refuse)
+    monkeypatch.setattr(socket, "socket", Mock(side_effect=AssertionError("the network was asked")))
     before = (iers.conf.auto_download, solar_system_ephemeris.get())
     # Decades past the bundled tables of Earth rotation.
     assert Sky.at("290 -11", "2085-07-01").surface_brightness == pytest.approx(22.4, abs=0.1)

@@ -53,7 +53,6 @@ EDGES = np.array(
 
 
 def words(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return every pair of edges, then random words."""
     radius, angle = (grid.ravel() for grid in np.meshgrid(EDGES, EDGES))
     generator = np.random.default_rng(5)
     extra = generator.integers(0, 2**32, (2, n - radius.size), dtype=np.uint32)

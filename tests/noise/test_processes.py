@@ -122,7 +122,6 @@ def test_charge_has_moments_of_compound_poisson_sum() -> None:
 
 
 def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
-    """Check that a process changes no bit of pixels on which it has no effect."""
     (x,) = star(exposure=5.0)
     clean = engine.realise(x, count=200, seed=4)
     # Hits only: pixels without one are as they were.

@@ -25,7 +25,6 @@ FAR = 4.0
 
 
 def curve(nm: Any, values: Any) -> Any:
-    """Return a quantity of the instrument against wavelength."""
     return replace(NOMINAL.quantum_efficiency_a_per_w, wavelength_nm=tuple(nm), value=tuple(values))
 
 
@@ -314,7 +313,6 @@ PLAN = ["plan.targets=[{name='eps Eri'}, {name='YZ CMi'}]", "orbit.days=2", "pla
 
 
 def with_(settings: list[str], instrument: Path | Instrument) -> Study:
-    """Return a study with a fitted instrument's file, or with the values of a true one."""
     study = paper(*settings)
     if isinstance(instrument, Path):
         return study.with_settings([f"observation.instrument={instrument}"])

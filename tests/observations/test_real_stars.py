@@ -16,16 +16,16 @@ from mauvecl.observations import search as searches
 
 DAVENPORT = SHAPES["davenport2014"]
 CASES = Path(__file__).parent.parent / "data" / "cases"
-#: Rotation and correlated noise, in standard deviations of a frame.
-ROTATOR = processes.Process(
-    (
-        processes.ProcessTerm("rotation", tuple(np.log([20.0, 40_000.0, 10.0, 1.0, 0.3]))),
-        processes.ProcessTerm("correlated", tuple(np.log([0.5, 1000.0]))),
-    ),
-    1.0,
-)
-#: A sinusoid that keeps its phase for longer than the light curve.
-LASTING = processes.Process((processes.ProcessTerm("rotation", tuple(np.log([4.0, 40_000.0, 1e4, 2.0, 0.1]))),), 1.0)
+
+
+def process(**terms: list[float]) -> processes.Process:
+    made = (processes.ProcessTerm(kind, tuple(np.log(values))) for kind, values in terms.items())
+    return processes.Process(tuple(made), 1.0)
+
+
+#: Rotation and correlated noise, in standard deviations of a frame, and a sinusoid that keeps its phase for long.
+ROTATOR = process(rotation=[20.0, 40_000.0, 10.0, 1.0, 0.3], correlated=[0.5, 1000.0])
+LASTING = process(rotation=[4.0, 40_000.0, 1e4, 2.0, 0.1])
 
 
 @pytest.mark.parametrize("n", [100, 2**14 + 1])

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -38,7 +39,6 @@ def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory, engine: Engine) -> Path:
-    """Return a store that the engine drew, which no test changes."""
     path = tmp_path_factory.mktemp("drawn") / "frames.zarr"
     bulk.realise(study(), path, engine)
     return path
@@ -223,20 +223,15 @@ def test_no_chunk_is_being_written_when_a_stopped_run_has_ended(tmp_path: Path, 
         except BlockingIOError:
             is_locked.append(True)
 
-    def stop(done: int, total: int) -> None:
-        if done:
-            raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
         patch.setattr(stored.Store, "write", slow)
         with pytest.raises(KeyboardInterrupt):
-            bulk.realise(study(1000), path, PAINTER, progress=stop)
+            bulk.realise(study(1000), path, PAINTER, progress=Mock(side_effect=[None, KeyboardInterrupt]))
     assert all(is_locked)
     assert len(is_locked) == len(stored.Store.open(path).digests) > 4
-    seen: list[int] = []
-    bulk.realise(study(1000), path, PAINTER, progress=lambda done, total: seen.append(done))
-    assert seen[0] >= 64 * len(is_locked), "it went on from where it was"
-    assert (seen[-1], tree(path)) == (2000, painted)
+    bulk.realise(study(1000), path, PAINTER, progress=(seen := Mock()))
+    assert seen.call_args_list[0].args[0] >= 64 * len(is_locked), "it went on from where it was"
+    assert (seen.call_args.args[0], tree(path)) == (2000, painted)
 
 
 def test_fits_export_contains_the_rows_and_any_study(tmp_path: Path, engine: Engine) -> None:

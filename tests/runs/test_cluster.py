@@ -210,7 +210,6 @@ def dask(folder: Path, *words: str | Path) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextmanager
 def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """Start a scheduler and a worker; return the scheduler and its file."""
     file = folder / "scheduler.json"
     with dask(folder, "scheduler", "--port", "0", "--host", "127.0.0.1") as scheduler:
         while not file.exists() or not file.read_text().strip():
@@ -221,7 +220,6 @@ def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
 
 @pytest.fixture(scope="module")
 def scheduler_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Start a scheduler and a worker for all tests that end neither."""
     with by_hand(tmp_path_factory.mktemp("started")) as (_, file):
         yield file
 

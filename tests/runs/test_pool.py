@@ -153,7 +153,6 @@ class Failing:
 
 
 def working(make: Callable[[], Any]) -> Pool:
-    """Return a pool of one engine, which is made anew after each failure."""
     return Pool(LocalWorkers([None], make=lambda device, progress: make()))
 
 
@@ -298,7 +297,6 @@ SCENE = star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
 
 @pytest.fixture(scope="module")
 def whole(engine: Engine) -> Detection:
-    """Return the answer of a run that nothing interrupts."""
     return detected(engine, SCENE)
 
 
