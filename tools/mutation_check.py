@@ -391,7 +391,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("squared - slope * (flux - level)", "squared + slope * (flux - level)"),
     ),
     "flares of three frames taken for rays": (
-        "test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not",
+        "test_steps_single_frames_and_dips_are_no_flares_and_three_frames_are_one",
         (" & (np.abs(sigmas[after]) < NEAR)", ""),
     ),
     "means that scatter like frames": (
@@ -504,7 +504,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("slope, bend = (wide - narrow) / (2 * step)", "slope, bend = (narrow - wide) / (2 * step)"),
     ),
     "the light of a second for that of a frame": (
-        "test_fit_recovers_throughput",
+        "test_fit_recovers_values_and_throughput",
         ("self.transfer.noise.gain * electrons * one.exposure_s", "self.transfer.noise.gain * electrons"),
     ),
     "a colour relative to a known star": (
