@@ -264,10 +264,7 @@ DRAWN = {
 @pytest.mark.long
 @pytest.mark.parametrize("case", DRAWN)
 def test_closed_forms_integrate_over_drawn_unknowns(engine: Engine, case: str) -> None:
-    """Compare false alarms and detections at the closed forms' thresholds, within 4.5 standard errors and 1e-5.
-
-    Some 40 values in each of five cases, many of them tied: by chance less than one run in 1000 fails.
-    """
+    """Compare false alarms and detections at the closed forms' thresholds: by chance one run in 1000 fails."""
     (name, magnitude, amplitudes), nuisances, processes = DRAWN[case]
     quiet, *flares = star(name, magnitude, amplitudes=amplitudes)
     n = 100_000

@@ -1,8 +1,4 @@
-"""Fits of flares whose light has an unknown factor, that saturate pixels, or that have two temperatures.
-
-Draws of the first are normal, with seeds fixed beforehand. They multiply star, flare and sky by a factor, as the
-kernels do.
-"""
+"""Fits of flares whose light has an unknown factor, that saturate pixels, or that have two temperatures."""
 
 from functools import cache
 from typing import Any

@@ -205,10 +205,7 @@ def intervals(
     [(0.1, 1000, 2000, (0.3, 0.7, 0.97)), (0.01, 10_000, 1000, (0.05, 0.3, 0.97)), (1e-3, 100_000, 100, (0.3,))],
 )
 def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int, probabilities: tuple) -> None:
-    """Check 94-97 % within 5 standard errors of the seeds; one of the 21 fails in 8e4 runs.
-
-    The interval that it takes the place of is wider in all of them, and up to twice as wide.
-    """
+    """Check 94-97 % and less width than the former interval; one of the 21 fails in 8e4 runs by chance."""
     for probability in probabilities:
         above, found = intervals(kind, fap, probability, n, seeds)
         covered = np.mean([x.low <= probability <= x.high for x in found])

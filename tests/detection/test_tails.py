@@ -157,10 +157,7 @@ def atom(values: np.ndarray, fap: float) -> tuple[float, float]:
 
 
 def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine) -> None:
-    """Compare 20 stars near saturation, with and without a threshold, with an independent count of raw values.
-
-    Values of one pixel are whole DN, many to a bin of the histogram at most: compared where they are clearly apart.
-    """
+    """Compare 20 stars near saturation, of which one pixel counts, with raw values, where whole DN are apart."""
     kinds = set()
     for seed in range(20):
         quiet, flare = nearly_saturated(seed)
@@ -278,10 +275,7 @@ def test_overlap_lies_between_the_bounds(engine: Engine, stack: int, step: int) 
 
 
 def test_two_overlapping_stacks_equal_the_exact_probability(engine: Engine) -> None:
-    """Compare two stacks of two frames that share one with a bivariate normal of correlation 1/2.
-
-    Within four standard errors of 20 000 simulated campaigns, and three printed digits.
-    """
+    """Compare with a bivariate normal of correlation 1/2: four standard errors of 20 000 campaigns, and 3 digits."""
     (found,) = said(engine, 3, 2, 0.05, step=1)
     cut = stats.norm.isf(0.05)
     both = stats.multivariate_normal([0, 0], [[1, 0.5], [0.5, 1]]).cdf([cut, cut])

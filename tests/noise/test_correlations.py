@@ -41,11 +41,7 @@ ROWS = 50_000
 @pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_draws_are_uncorrelated(engine: Engine, name: str) -> None:
-    """Correlate values, squares and neighbours' products of 64 pixels in two frames.
-
-    The limit |z| < 6.5 for 73 000 correlations fails once in 1e5 seeds per scene, and 1.5 times as often with the long
-    tails of squares.
-    """
+    """Correlate values, squares and neighbours' products of 64 pixels in two frames; each fails once in 6e4 seeds."""
     x, how = SCENES[name]
     values = []
     for frame in (0, 1):

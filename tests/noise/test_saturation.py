@@ -36,10 +36,7 @@ def bright(seed: int) -> tuple[Expectation, Expectation]:
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(12))
 def test_closed_forms_follow_simulation(engine: Engine, seed: int) -> None:
-    """Compare means, variances and statistics of random bright stars and flares, in single frames and sums.
-
-    Five standard errors for 8 statistics, six for 198 pixels: by chance once in 1e5 seeds.
-    """
+    """Compare means, variances and statistics of random bright stars and flares; one seed in 1e5 fails by chance."""
     quiet, flare = bright(seed)
     assert flare.cut_share.max() > 0
     for x in (quiet, flare):
@@ -173,11 +170,7 @@ def drawn_by_numpy(x: Expectation, rays: CosmicRays, rng: np.random.Generator) -
 
 @pytest.mark.parametrize("seed", long_but(range(SEEDS), *range(6)))
 def test_sums_of_frames_with_hits_equal_independent_draws(engine: Engine, seed: int) -> None:
-    """Compare the engine's sums with independent draws of each frame, in 60 classes of equal count.
-
-    A class holds pixels of one exposure, which are independent but for their means; p < 1e-7 in 24 tests: a false
-    failure in 4e5.
-    """
+    """Compare with independent draws of each frame, in 60 classes of equal count: 24 tests fail once in 4e5 seeds."""
     x, rays = with_hits(seed)
     ours = engine.realise(x, count=DRAWS, seed=seed, processes=Processes(cosmic_rays=rays))
     theirs = drawn_by_numpy(x, rays, np.random.default_rng(1000 + seed))

@@ -233,29 +233,21 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
 
     base, stares = asked(), flaring_stares()
     unlit, how = replace(stares, flare=None, amplitudes=None), {"jitters": {"light": 0.01}}
-    others = [
-        asked(seed=6),
-        asked(statistics=("chi2",)),
-        *(asked(statistics=("chi2", one)) for one in own),
-        asked(flares[::-1]),
-        asked([flares[0], brighter]),
-        asked(comparison=Comparison.of("exposure")),
-        asked(processes=mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.01))),
-        asked(mode="frames"),
-        *(asked(nuisances={"dark": sd}) for sd in (0.1, 0.2)),
-        stares,
-        replace(stares, seed=6),
-        replace(stares, method="pixels"),
-        replace(stares, stare=Stare.of(30.0, **how, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21, 22))),
-        replace(stares, stare=Stare.of(30.0, **how, offsets={"star": 0.1}, temperature_c=21.0)),
-        replace(stares, components=replace(stares.components, weights=2 * stares.components.weights)),
-        replace(stares, flare=np.nextafter(stares.flare, 9)),
-        replace(stares, amplitudes=stares.amplitudes[:1]),
-        *(replace(stares, reduction=one) for one in (Largest(), Above(1.0), Above(2.0))),
-        # Rows belong to stares: from another first one on they mean something else.
-        replace(stares, start=stares.start + 64),
-        unlit,
-    ]
+    asks: list[dict[str, Any]] = [
+        {"seed": 6}, {"mode": "frames"}, {"flares": flares[::-1]}, {"flares": [flares[0], brighter]},
+        {"statistics": ("chi2",)}, *({"statistics": ("chi2", one)} for one in own),
+        {"comparison": Comparison.of("exposure")}, *({"nuisances": {"dark": sd}} for sd in (0.1, 0.2)),
+        {"processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.01))},
+    ]  # fmt: skip
+    # Rows belong to stares: from another first one on they mean something else.
+    changes: list[dict[str, Any]] = [
+        {}, {"seed": 6}, {"method": "pixels"}, {"flare": np.nextafter(stares.flare, 9)}, {"start": stares.start + 64},
+        {"stare": Stare.of(30.0, **how, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21, 22))},
+        {"stare": Stare.of(30.0, **how, offsets={"star": 0.1}, temperature_c=21.0)},
+        {"components": replace(stares.components, weights=2 * stares.components.weights)},
+        {"amplitudes": stares.amplitudes[:1]}, *({"reduction": one} for one in (Largest(), Above(1.0), Above(2.0))),
+    ]  # fmt: skip
+    others = [*(asked(**one) for one in asks), *(replace(stares, **one) for one in changes), unlit]
     names = [shards.fingerprint(one) for one in (base, *others)]
     assert len(set(names)) == len(names)
     reported = replace(quiet, provenance={"from": "elsewhere"}, messages=())
