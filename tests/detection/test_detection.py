@@ -168,18 +168,14 @@ def test_false_alarms_are_as_requested(engine: Engine) -> None:
         assert 2 * min(scatter, 1 - scatter) > 1e-6 / tests
 
 
-COMPARED = 500_000
-RARE = 1e-3
-
-
 def departed(engine: Engine, *, magnitude: float = 7.4, exposure: float = 5.0, **options: object) -> dict[str, Any]:
     """Return the departures of a faint flare on a part of the pixels, by statistic."""
     comparison = options.pop("comparison", Comparison())
     statistics = options.pop("statistics", ("chi2", "chi2_element", "uv_excess"))
     payload = instrument(part=True, **options)
     quiet, flare = star(magnitude=magnitude, amplitudes=(0.3,), exposure=exposure, payload=payload)
-    kind = {"realisations": COMPARED, "seed": 3, "statistics": statistics, "comparison": comparison}
-    return {d.statistic: d for d in departures(engine.detect(quiet, [flare], **kind), RARE)}
+    kind = {"realisations": 500_000, "seed": 3, "statistics": statistics, "comparison": comparison}
+    return {d.statistic: d for d in departures(engine.detect(quiet, [flare], **kind), 1e-3)}
 
 
 @pytest.mark.long

@@ -182,7 +182,6 @@ def test_damaged_files_raise_or_are_read(name: str, tmp_path: Path) -> None:
 HERE = Path(__file__).parents[1] / "data" / "spectra"
 ENTRIES = tomllib.loads((CORPUS / "archive_files.toml").read_text(encoding="utf-8"))
 RIGHT, SHORT = ([pytest.param(one, id=one["file"]) for one in ENTRIES[key]] for key in ("right", "short"))
-ANGSTROM = {"wavelength_unit": "Angstrom"}
 
 
 def by_hand(name: str, flux: str = "FLUX", skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -252,7 +251,7 @@ def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
     mauve = Instrument.load("mauvesim")
     lamost = written(dict(cases(CORPUS / "surveys.toml"))["surveys LAMOST table of DR8 fits"], tmp_path)
     model, ngsl = HERE / "ckp00_5750.fits[g45]", HERE / "h_stis_ngsl_hd095735_v2.txtA"
-    for star in (Source.read(model), Source.read(ngsl, **ANGSTROM), Source.read(lamost, extend="K5V")):
+    for star in (Source.read(model), Source.read(ngsl, wavelength_unit="Angstrom"), Source.read(lamost, extend="K5V")):
         with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0

@@ -13,7 +13,6 @@ from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 
 N = 4000
-STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
 
 
 def bright(seed: int) -> tuple[Expectation, Expectation]:
@@ -50,7 +49,7 @@ def test_closed_forms_follow_simulation(engine: Engine, seed: int) -> None:
         error = square.std(axis=0)[some] / np.sqrt(N)
         assert np.all(np.abs(square.mean(axis=0) - x.variance_dn2)[some] < 6 * error)
         np.testing.assert_allclose(x.recorded_light_dn, x.recorded_dn - x.n_frames * (x.bias_dn + x.dark_dn), rtol=1e-9)
-    found = engine.detect(quiet, [flare], realisations=N, seed=4, statistics=STATISTICS[:3])
+    found = engine.detect(quiet, [flare], realisations=N, seed=4, statistics=("chi2", "chi2_element", "matched"))
     for statistic in found.statistics:
         for k in (None, 0):
             seen, form = found.distribution(statistic, k), found.closed_form(statistic, k)
@@ -131,7 +130,6 @@ def test_rare_saturation_is_reported_and_entire_saturation_refused() -> None:
 
 
 DRAWS = 2000
-SEEDS = 24
 
 
 def with_hits(seed: int) -> tuple[Expectation, CosmicRays]:
@@ -168,7 +166,7 @@ def drawn_by_numpy(x: Expectation, rays: CosmicRays, rng: np.random.Generator) -
     return total
 
 
-@pytest.mark.parametrize("seed", long_but(range(SEEDS), *range(6)))
+@pytest.mark.parametrize("seed", long_but(range(24), *range(6)))
 def test_sums_of_frames_with_hits_equal_independent_draws(engine: Engine, seed: int) -> None:
     """Compare with independent draws of each frame, in 60 classes of equal count: 24 tests fail once in 4e5 seeds."""
     x, rays = with_hits(seed)

@@ -40,7 +40,6 @@ SHAPE = SHAPES["davenport2014"]
 CADENCE_S, LEVEL, SD = 20.0, 10_000.0, 10.0
 SHORT, LONG = 80_000, 320_000
 SMOOTH = processes.Process((processes.ProcessTerm("smooth", (np.log(2.0), np.log(40_000.0))),), 1.0)
-WHITE = processes.Process((), 1.0)
 
 
 def survey_of(n: int, model: processes.Process) -> searches.SeriesSurvey:
@@ -73,7 +72,7 @@ def test_general_family_has_the_same_bits_in_each_process() -> None:
     assert weights() == weights() == weights()
 
 
-@pytest.mark.parametrize("model", [SMOOTH, WHITE], ids=["smooth", "white"])
+@pytest.mark.parametrize("model", [SMOOTH, processes.Process((), 1.0)], ids=["smooth", "white"])
 def test_work_of_an_event_does_not_grow_with_the_light_curve(model: processes.Process, monkeypatch: Any) -> None:
     sizes, measured, work = list[tuple[str, int]](), [], []
     watch(monkeypatch, event_windows, "_bins", 0, sizes)

@@ -22,12 +22,11 @@ from mauvecl.observations import frames as observed
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
 FLUX = 1000 + RNG.normal(0, 5, 100)
-ERROR = np.full(100, 5.0)
 
 
 def test_frames_are_sorted_and_numbered_over_gaps_and_slow_changes_of_the_times() -> None:
     order = RNG.permutation(100)
-    frames = Frames.of(TIME[order], FLUX[order], ERROR[order])
+    frames = Frames.of(TIME[order], FLUX[order], np.full(100, 5.0))
     np.testing.assert_array_equal(frames.flux, FLUX)
     assert len(frames.remarks) == 1
     assert Frames.of(TIME, FLUX).remarks == ()

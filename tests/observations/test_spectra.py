@@ -17,14 +17,12 @@ from mauvecl.observations import detection, spectra
 from mauvecl.observations import frame_model as models
 from mauvecl.observations import search as searches
 
-SHAPE = SHAPES["davenport2014"]
 N, FRAME_S = 720, 5.0
 TIME = (np.arange(N) + 0.5) * FRAME_S
 # Ten false alarms per star-day need few simulated frames.
 OFTEN: Any = {"false_alarms": 10.0, "per": "day"}
 STAR: Any = [{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}]
 STUDY = Study(star=STAR, search=OFTEN)
-Prepared = tuple[Any, Any, Any]
 
 
 def element_frames(flux: np.ndarray, error: np.ndarray | None = None) -> Frames:
@@ -59,9 +57,9 @@ def drawn(rng: np.random.Generator, added: np.ndarray | float = 0.0, scale: floa
     return element_frames(mean + photons * scale * rng.standard_normal(mean.shape), np.tile(quiet, (N, 1)))
 
 
-def prepared(frames: Frames, **how: Any) -> Prepared:
+def prepared(frames: Frames, **how: Any) -> tuple[Any, Any, Any]:
     cleaned = models.clean_spectra(frames, model())
-    survey, series, _ = spectra.survey_spectra(cleaned, SHAPE, 3, 1, **how)
+    survey, series, _ = spectra.survey_spectra(cleaned, SHAPES["davenport2014"], 3, 1, **how)
     return cleaned, survey, series
 
 
