@@ -212,18 +212,13 @@ def study(magnitude: float, **sections: object) -> Study:
     return study_of_g2v(**given, flare={"amplitudes": [1e-5]}, observation=observation, **sections).paper()
 
 
-def at_the_rail() -> float:
-    """Return the magnitude at which the faintest pixel of `study` reaches saturation on average."""
-
+def test_answers_report_missing_thresholds(engine: Engine) -> None:
     def faintest(magnitude: float) -> float:
         x = expectations(study(magnitude))[0]
         return float((x.mean_raw_dn - x.ceiling_dn).min())
 
-    return float(optimize.brentq(faintest, -5.0, 10.0))
-
-
-def test_answers_report_missing_thresholds(engine: Engine) -> None:
-    magnitude = at_the_rail() + 0.001
+    # The faintest pixel reaches saturation on average.
+    magnitude = float(optimize.brentq(faintest, -5.0, 10.0)) + 0.001
     answer = detect(study(magnitude), engine)
     assert np.isnan(answer.table["probability"]).all()
     assert of_kind(answer.messages, "no threshold")

@@ -18,20 +18,14 @@ SMALLEST_EXPANDED = 1000.0
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
 
-def words_per_column(table: layout.AliasTable) -> np.ndarray:
-    """Return the number of the 2**32 words that give each column: its exact probability."""
-    shift = 32 - table.bits
-    threshold = table.entries.astype(np.int64) & ((1 << shift) - 1)
-    words = threshold.copy()
-    np.add.at(words, table.entries.astype(np.int64) >> shift, (1 << shift) - threshold)
-    return words
-
-
 @pytest.mark.parametrize("mean", [*MEANS, 1e-9, 0.01, 1.0, 999.5, 1e6, 1e7])
 def test_alias_table_has_the_probabilities_of_scipy(mean: float) -> None:
     """Count the words of each outcome exactly and compare with scipy to one word in 2**32."""
     table = layout.alias_table(mean)
-    words = words_per_column(table)
+    shift, entries = 32 - table.bits, table.entries.astype(np.int64)
+    threshold = entries & ((1 << shift) - 1)
+    words = threshold.copy()
+    np.add.at(words, entries >> shift, (1 << shift) - threshold)
     assert words.sum() == 2**32
     counts = table.low + np.arange(words.size)
     np.testing.assert_allclose(words / 2**32, stats.poisson.pmf(counts, mean), rtol=0, atol=2.0**-32 * 1.01)

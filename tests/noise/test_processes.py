@@ -387,12 +387,6 @@ def test_waits_durations_and_depths_have_their_distributions() -> None:
     assert np.abs(rank).max() * np.sqrt(4000) < SIGMA
 
 
-def occupied(time_s: float) -> float:
-    """Return the probability of a drift at a time after the start: a Markov chain of two states, first without one."""
-    rates = 1 / WAIT_S + 1 / 200.0
-    return 200.0 / (200.0 + WAIT_S) * float(-np.expm1(-rates * time_s))
-
-
 @pytest.mark.parametrize(
     ("time_s", "later_s"), long_but([(50.0, 100.0), (500.0, 30.0), (3000.0, 300.0)], (3000.0, 300.0))
 )
@@ -400,11 +394,11 @@ def test_occupation_and_its_correlation_in_time(time_s: float, later_s: float) -
     """P(drift at t) and P(drift at t and t + h) follow in closed form."""
     at = np.array([time_s, time_s + later_s])
     lost = losses(NUMBERS, at, 1e-6, SEED) > 0
-    n, p = len(NUMBERS), occupied(time_s)
+    # A Markov chain of two states, first without a drift.
+    n, share, rates = len(NUMBERS), 200.0 / (200.0 + WAIT_S), 1 / WAIT_S + 1 / 200.0
+    p = -share * np.expm1(-rates * time_s)
     assert abs(lost[:, 0].mean() - p) < SIGMA * np.sqrt(p * (1 - p) / n)
-    share = 200.0 / (200.0 + WAIT_S)
-    stays = share + (1 - share) * np.exp(-later_s * (1 / WAIT_S + 1 / 200.0))
-    both = p * stays
+    both = p * (share + (1 - share) * np.exp(-rates * later_s))
     assert abs((lost[:, 0] & lost[:, 1]).mean() - both) < SIGMA * np.sqrt(both * (1 - both) / n)
 
 
