@@ -124,6 +124,12 @@ def through(name: str, nm: Float, flux: Float) -> float:
     return float(np.trapezoid(response * np.interp(fine, nm, flux, left=0, right=0), fine)) * 10
 
 
+def noisy(rng: Any, time_s: Float, light: Float, noise: float, **more: Any) -> Frames:
+    """Return frames of light with normal noise, which is stated, by a generator or a seed."""
+    flux = light + noise * np.random.default_rng(rng).standard_normal(time_s.size)
+    return Frames.of(time_s, flux, np.full(time_s.size, noise), **more)
+
+
 def analysed(frames: Frames, **search: Any) -> Any:
     """Return the answer of `analyse` for one false alarm a day, or as the study's section says."""
     return analyse(Study.build({"search": {"per": "day"} | search}, "test"), frames=frames)

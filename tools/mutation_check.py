@@ -137,7 +137,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("for index in np.flatnonzero(outside).tolist():", "for index in ():"),
     ),
     "far S/N lost": (
-        "test_snr_equals_that_of_sorting[16-0]",
+        "test_snr_equals_that_of_sorting[16-0-net]",
         ("tile.pieces(RAW_BATCH) if outside.size else ()", "()"),
     ),
     "7 rounds": (
@@ -157,7 +157,7 @@ MUTATIONS: dict[str, Mutation] = {
         SWAPPED,
     ),
     "rounded normal for the dark": (
-        "test_pearson_of_the_expansion",
+        "test_pearson_of_draws",
         ("nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
         (
             'nearest(fma(z, fma(z, curve, source["slope"]), source["offset"]))',
@@ -203,7 +203,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
     ),
     "the sky counted as signal": (
-        "test_snr_includes_photon_noise_of_sky",
+        "test_snr_equals_that_of_sorting[16-3-net]",
         ("        signal -= (floatv)element.sky;\n", ""),
         ("    signal = signal - sky\n", ""),
     ),
@@ -363,7 +363,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("covariance.log_determinant + np.log(information)", "covariance.log_determinant"),
     ),
     "steps taken for flares": (
-        "test_a_flare_is_found_at_its_time_and_a_step_is_a_step",
+        "test_steps_single_frames_and_dips_are_no_flares_and_three_frames_are_one",
         (
             "return whole - float(gain.max()) < least - STEP_GAIN",
             "return whole - float(gain.max()) > least - STEP_GAIN",
@@ -391,7 +391,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("squared - slope * (flux - level)", "squared + slope * (flux - level)"),
     ),
     "flares of three frames taken for rays": (
-        "test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not",
+        "test_steps_single_frames_and_dips_are_no_flares_and_three_frames_are_one",
         (" & (np.abs(sigmas[after]) < NEAR)", ""),
     ),
     "means that scatter like frames": (
@@ -504,7 +504,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("slope, bend = (wide - narrow) / (2 * step)", "slope, bend = (narrow - wide) / (2 * step)"),
     ),
     "the light of a second for that of a frame": (
-        "test_fit_recovers_throughput",
+        "test_fit_recovers_values_and_throughput",
         ("self.transfer.noise.gain * electrons * one.exposure_s", "self.transfer.noise.gain * electrons"),
     ),
     "a colour relative to a known star": (

@@ -1,8 +1,4 @@
-"""Fits of flares whose light has an unknown factor, that saturate pixels, or that have two temperatures.
-
-Draws of the first are normal, with seeds fixed beforehand. They multiply star, flare and sky by a factor, as the
-kernels do.
-"""
+"""Fits of flares whose light has an unknown factor, that saturate pixels, or that have two temperatures."""
 
 from functools import cache
 from typing import Any
@@ -172,16 +168,10 @@ def test_tilt_of_the_response_tilts_the_flare() -> None:
     assert abs(other.estimates[0, 0] - 10_000.0) > 2 * found.errors[0, 0]
 
 
-@pytest.mark.parametrize(
-    ("library", "magnitude", "amplitude", "kelvin", "jump"),
-    [
-        ("K2.5V", 2.0, 5.0, 10_000.0, 1.0),
-        ("K2.5V", 2.0, 2.0, 9500.0, 2.0),
-        ("G2V", 0.75, 0.3, 9000.0, 1.0),
-        ("G2V", -1.0, 0.3, 9000.0, 1.0),
-        ("M3V", 5.0, 30.0, 20_000.0, 1.0),
-    ],
-)
+@pytest.mark.parametrize(("library", "magnitude", "amplitude", "kelvin", "jump"), [
+    ("K2.5V", 2.0, 5.0, 10_000.0, 1.0), ("K2.5V", 2.0, 2.0, 9500.0, 2.0), ("G2V", 0.75, 0.3, 9000.0, 1.0),
+    ("G2V", -1.0, 0.3, 9000.0, 1.0), ("M3V", 5.0, 30.0, 20_000.0, 1.0),
+])  # fmt: skip
 def test_intervals_cover_where_pixels_saturate(
     engine: Engine, library: str, magnitude: float, amplitude: float, kelvin: float, jump: float
 ) -> None:

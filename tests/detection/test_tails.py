@@ -1,17 +1,21 @@
-"""Rare false alarms by importance sampling, compared with brute force and closed forms."""
+"""Rare false alarms by importance sampling, nulls without a threshold, and false alarms of whole campaigns."""
 
+import math
+import re
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
-from answers import STATISTICS
+from answers import STATISTICS, expectations, of_kind
 from marks import long_but
 from refusals import refused
-from scenes import instrument, star
-from scipy import special
+from scenes import instrument, paper, star, study_of_g2v
+from scipy import optimize, special, stats
 
-from mauvecl import Comparison, Engine, Linear, Normal, Processes, Uniform
+from mauvecl import Comparison, Engine, Expectation, InputError, Linear, Normal, Processes, Study, Uniform, detect
+from mauvecl import map as detection_map
 
 #: A sixth of the pixels, of which brute force can draw 1e7 realisations, and a twelfth.
 PART = {"output_min_nm": 330.0, "output_max_nm": 360.0}
@@ -125,3 +129,192 @@ def test_detection_reports_sampled_tails(engine: Engine) -> None:
     with refused("fap", "`tails='sampled'`"):
         counted.table(fap=1e-9)
     assert sampled.threshold(1e-9) == engine.detect(quiet, flares, tails="sampled", **kind).threshold(1e-9)
+
+
+FEW = 20_000
+PAYLOAD = instrument(part=True, output_min_nm=300.0, output_max_nm=310.0)
+
+
+def nearly_saturated(seed: int) -> tuple[Expectation, Expectation]:
+    """Return a star that leaves one pixel near saturation and saturates the others, and a weak flare."""
+    rng = np.random.default_rng(seed)
+    quiet, _ = star("G2V", 5.0, amplitudes=(0.05,), exposure=5.0 * float(rng.integers(1, 3)), payload=PAYLOAD)
+    room = (quiet.ceiling_dn - quiet.bias_dn - quiet.dark_dn) / quiet.gain_dn_per_electron
+    light = 2.0 * room
+    at = int(rng.integers(room.size))
+    light[at] = room[at] - float(rng.uniform(0.1, 3.0)) * math.sqrt(room[at])
+    quiet = replace(quiet, source_electrons=light, sky_electrons=np.zeros(light.size), messages=())
+    flare = replace(quiet, source_electrons=light + 0.02 * math.sqrt(room[at]), name="flare")
+    return quiet, flare
+
+
+def atom(values: np.ndarray, fap: float) -> tuple[float, float]:
+    """Return the shares of values beyond, and at, the one where the share from the top passes `fap`."""
+    _, counts = np.unique(-values, return_counts=True)
+    total = np.cumsum(counts)
+    place = int(np.argmax(total > math.floor(fap * values.size * (1 + 1e-12))))
+    return (total[place] - counts[place]) / values.size, counts[place] / values.size
+
+
+def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine) -> None:
+    """Compare 20 stars near saturation, of which one pixel counts, with raw values, where whole DN are apart."""
+    kinds = set()
+    for seed in range(20):
+        quiet, flare = nearly_saturated(seed)
+        found = engine.detect(quiet, [flare], realisations=FEW, seed=seed, statistics=("matched", "uv_excess"))
+        assert not found.blinding
+        raw = engine.realise(quiet, count=FEW, seed=seed)[:, found.scene.used][:, 0].astype(np.int64)
+        kinds.add(atom(raw, 0.02)[1] > 0.02)
+        for fap in (0.006, 0.02, 0.1, 0.3):
+            beyond, at = atom(raw, fap)
+            if 0.7 < at / fap < 1.5:
+                continue
+            for statistic in found.statistics:
+                if at > fap:
+                    with pytest.raises(InputError) as error:
+                        found.threshold(fap, statistic)
+                    assert error.value.key == "fap"
+                    (seen,) = found.detection_probability(fap, statistic)
+                    assert np.isnan([seen.value, seen.low, seen.high]).all()
+                    # Those that exist hold what they promise.
+                    held = found.threshold(beyond + at, statistic).value
+                    assert found.false_alarm_probability(held, statistic).value == pytest.approx(beyond + at, rel=1e-9)
+                else:
+                    value = found.false_alarm_probability(found.threshold(fap, statistic).value, statistic).value
+                    assert fap - max(at, 1.5 / FEW) - 0.01 * fap <= value <= fap
+        sentences = found.without_threshold(0.006)
+        assert len(sentences) == (2 if atom(raw, 0.006)[1] > 0.006 else 0)
+        if sentences:
+            table = found.table(0.006)
+            assert np.isnan(table["threshold"]).all()
+            assert np.isnan(table["probability"]).all()
+    assert kinds == {True, False}
+
+
+def test_sampled_threshold_raises_as_well(engine: Engine) -> None:
+    """Sample a single frame, drawn as a stack, whose most probable value is the same."""
+    quiet, flare = nearly_saturated(3)
+    quiet, flare = (replace(x, n_frames=1) for x in (quiet, flare))
+    light = quiet.source_electrons.copy()
+    pixel = int(np.argmin(quiet.saturated))
+    light[pixel] = (quiet.ceiling_dn - quiet.bias_dn[pixel] - quiet.dark_dn[pixel]) / quiet.gain_dn_per_electron[pixel]
+    light[pixel] -= 0.5 * math.sqrt(light[pixel])
+    quiet, flare = replace(quiet, source_electrons=light), replace(flare, source_electrons=light + 1.0)
+    found = engine.detect(quiet, [flare], realisations=FEW, seed=1, statistics=("matched",), tails="sampled")
+    with pytest.raises(InputError, match="no threshold"):
+        found.threshold(1e-4, "matched")
+    assert np.isnan(found.table(1e-4)["fap_error"]).all()
+
+
+def study(magnitude: float, **sections: object) -> Study:
+    observation = {"changes": {"output_min_nm": 300.0, "output_max_nm": 301.5}, "exposure_s": 5.0}
+    given = {"star": [{"library": "G2V", "magnitude": magnitude}], "run": {"realisations": FEW, "seed": 3}}
+    return study_of_g2v(**given, flare={"amplitudes": [1e-5]}, observation=observation, **sections).paper()
+
+
+def test_answers_report_missing_thresholds(engine: Engine) -> None:
+    def faintest(magnitude: float) -> float:
+        x = expectations(study(magnitude))[0]
+        return float((x.mean_raw_dn - x.ceiling_dn).min())
+
+    # The faintest pixel reaches saturation on average.
+    magnitude = float(optimize.brentq(faintest, -5.0, 10.0)) + 0.001
+    answer = detect(study(magnitude), engine)
+    assert np.isnan(answer.table["probability"]).all()
+    assert of_kind(answer.messages, "no threshold")
+    axes = {"x": {"quantity": "magnitude", "values": [magnitude, magnitude + 3.0]},
+            "y": {"quantity": "amplitude", "values": [1e-5, 2e-5]}}  # fmt: skip
+    found = detection_map(study(magnitude, map=axes), engine)
+    np.testing.assert_array_equal(np.isnan(found.probability[0]), [[True, False], [True, False]])
+    (message,) = of_kind(found.messages, "no threshold")
+    assert "2 of 4" in message
+
+
+NUMBER = r"([\d.e+-]*\d)"
+ENDS = rf"(?:.* overlap of its stacks {NUMBER} \[{NUMBER}, {NUMBER}\])?"
+#: Tests, probability of one, expected alarms, chance if independent and at most, and with overlap with its interval.
+MANY = rf"makes {NUMBER} tests: at {NUMBER} per test {NUMBER} .* is {NUMBER} if .* at most {NUMBER}{ENDS}"
+#: Wanted chance, tests, probability of one if independent and in any case, and with overlap with its interval.
+ONE = rf"chance of {NUMBER} .* its {NUMBER} tests may have {NUMBER} if .*?, {NUMBER} in any case{ENDS}"
+
+
+def said(
+    engine: Engine, frames: int, stack: int = 1, of_test: float = 0.02, **campaign: float
+) -> list[list[float | None]]:
+    """Return the numbers of a detection's sentences on a campaign and on its wanted chance, in the order above."""
+    study = study_of_g2v(
+        observation={"exposure_s": 5.0 * stack, "changes": {"output_min_nm": 300.0, "output_max_nm": 303.0}},
+        run={"realisations": 10_000, "fap": of_test, "tails": "sampled", "seed": 1},
+        campaign={"frames": frames, "step": stack, **campaign},
+    )
+    assert Study.build(study.model_dump(), "again") == study
+    text = "\n".join(detect(study, engine).messages)
+    found = [re.search(pattern, text) for pattern in (MANY, ONE)]
+    return [[number and float(number) for number in one.groups()] for one in found if one is not None]
+
+
+def test_day_of_single_frames_has_its_false_alarms(engine: Engine) -> None:
+    (found,) = said(engine, 17_280, of_test=1e-5)
+    exact = [17_280, 1e-5, 0.1728, 1 - (1 - 1e-5) ** 17_280, 0.1728]
+    assert found == [*(pytest.approx(one, rel=0.005) for one in exact), None, None, None]
+
+
+@pytest.mark.parametrize(("stack", "step"), [(2, 1), (10, 1), (10, 5)])
+def test_overlap_lies_between_the_bounds(engine: Engine, stack: int, step: int) -> None:
+    """Check that overlapping stacks alarm less often than independent ones and more often than adjacent ones."""
+    (found,), (apart,) = (said(engine, 600, stack, 1e-3, step=one) for one in (step, stack))
+    tests, _, _, independent, at_most, _, low, high = found
+    assert tests == (600 - stack) // step + 1
+    assert low < independent < at_most
+    assert high > apart[3]
+
+
+def test_two_overlapping_stacks_equal_the_exact_probability(engine: Engine) -> None:
+    """Compare with a bivariate normal of correlation 1/2: four standard errors of 20 000 campaigns, and 3 digits."""
+    (found,) = said(engine, 3, 2, 0.05, step=1)
+    cut = stats.norm.isf(0.05)
+    both = stats.multivariate_normal([0, 0], [[1, 0.5], [0.5, 1]]).cdf([cut, cut])
+    assert found[0] == 2
+    assert found[5] == pytest.approx(1 - both, abs=4 * np.sqrt(both * (1 - both) / 20_000) + 5e-4)
+
+
+@pytest.mark.long
+def test_long_campaigns_are_joined_from_stretches(engine: Engine) -> None:
+    """Check that ten times the frames take P(no alarm) to the tenth power, to four standard errors and the digits."""
+    rate = []
+    for frames in (40_005, 400_050):
+        ((tests, *_, chance, _, _),) = said(engine, frames, 10, 1e-6, step=1)
+        rate.append(-np.log1p(-chance) / tests)
+    # Some 4096 x 20 000 x 1e-6 / clustering alarms are drawn, twice.
+    assert abs(rate[0] / rate[1] - 1) < 4 * np.sqrt(2 / (20_000 * 4096 * rate[0])) + 0.01
+
+
+@pytest.mark.parametrize("wanted", [0.01, 0.5])
+@pytest.mark.parametrize(("frames", "stack"), [(17_280, 1), (17_280, 10), (7, 7)])
+def test_false_alarm_probability_per_test_is_the_inverse(engine: Any, wanted: float, frames: int, stack: int) -> None:
+    _, (asked, tests, independent, at_least, *overlap) = said(engine, frames, stack, fap=wanted)
+    assert (asked, tests) == (wanted, frames // stack)
+    assert 1 - (1 - independent) ** tests == pytest.approx(wanted, rel=1e-3)
+    assert at_least == pytest.approx(wanted / tests, rel=1e-3)
+    assert overlap == [None] * 3
+
+
+def test_overlapping_stacks_allow_more_per_test(engine: Engine) -> None:
+    """Invert with other draws: 20 000 campaigns give 0.05 to 6 %, four standard errors of both, and the digits."""
+    _, (*_, independent, _, value, low, high) = said(engine, 600, 10, step=1, fap=0.05)
+    assert low <= value <= high
+    assert value > independent
+    (back,) = said(engine, 600, 10, value, step=1)
+    assert back[5] == pytest.approx(0.05, abs=4 * np.sqrt(2 * 0.05 * 0.95 / 20_000) + 5e-4)
+
+
+def test_wanted_number_of_alarms_is_divided_among_the_tests(engine: Engine) -> None:
+    study = paper(
+        "star=[{library='G2V', magnitude=7.4}]",
+        "run={realisations=20000, fap=0.01, statistics=['matched']}",
+        "campaign={frames=17280, step=1, fap=0.01, alarms=2}",
+    )
+    sentences = [text for text in detect(study, engine).messages if "campaign" in text]
+    assert "173 false alarms are expected" in sentences[0]
+    assert "`fap=5.79e-07`" in sentences[1]
+    assert "`fap=0.0001158`" in sentences[2]

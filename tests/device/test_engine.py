@@ -1,6 +1,5 @@
 """Comparison of the engine with the NumPy reference, with its own splits, and with closed-form moments."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -9,8 +8,8 @@ from unittest.mock import Mock, call
 import numpy as np
 import pytest
 from answers import same
+from commands import started
 from marks import long_but
-from processes import python
 from reference import statistics as numpy_kernels
 from scenes import instrument, star
 
@@ -67,7 +66,6 @@ COMPARED: list[tuple[str, dict[str, Any]]] = [
 
 
 def case(name: str) -> tuple[list, dict]:
-    """Return the expectations of a case and the options of their draw."""
     options = dict(CASES[name])
     how = {key: options.pop(key) for key in ("mode", "recipe", "processes") if key in options}
     exposure, magnitude = options.pop("exposure", 50.0), options.pop("magnitude", 7.4)
@@ -137,11 +135,8 @@ def test_statistics_equal_reference(any_width: Engine, name: str, more: dict[str
 
 
 def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
-    """Give the kernel values on each side of each end of the fine bins, which draws of chi2 seldom meet.
-
-    Each value stands once in a block of the kernel's loop and once after it. A step that belongs to the last bin is
-    neither in the sums of fine steps nor lost: the host counts it.
-    """
+    """Give the kernel values on each side of each end of the fine bins, which draws of chi2 seldom meet."""
+    # Each stands once in a block of the kernel's loop and once after it; the host counts steps of the last bin.
     half, fine = layout.BINS // 2, 2**layout.FINE_BITS
     inner, end = (half - 1) * fine, half * fine
     # Halves are rounded to even steps.
@@ -187,29 +182,17 @@ def test_tile_size_does_not_affect_results(engine: Engine, tile: int) -> None:
     same(Engine(tile=tile).detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
 
 
-THREADS = """
-import hashlib, sys
-sys.path.insert(0, {tests!r})
-from scenes import instrument, star
-from mauvecl import Engine
-quiet, *flares = star(amplitudes=(0.081, 0.24), payload=instrument(part=True))
-found = Engine().detect(quiet, flares, realisations=20_000, seed=3)
-table = found.table(fap=1e-2)
-print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
-"""
-
-
 @pytest.mark.long
-def test_number_of_threads_does_not_affect_results() -> None:
-    code = THREADS.format(tests=str(Path(__file__).parents[1]))
-    one, two = (python(code, POCL_MAX_PTHREAD_COUNT=threads).stdout for threads in ("1", "2"))
+def test_number_of_threads_does_not_affect_results(tmp_path: Path) -> None:
+    for threads in ("1", "2"):
+        words = f"detect -s G2V -m 7.4 -a 0.081,0.24 -n 20000 --fap 0.01 --no-pictures --output {threads}".split()
+        started(*words, folder=tmp_path, POCL_MAX_PTHREAD_COUNT=threads)
+    one, two = ((tmp_path / threads / "detection.ecsv").read_bytes() for threads in ("1", "2"))
     assert one == two
 
 
 def test_flares_in_batches_equal_single_flares(engine: Engine) -> None:
-    amplitudes = tuple(np.linspace(0.01, 0.3, 18))
-    payload = instrument(part=True)
-    quiet, *flares = star(amplitudes=amplitudes, payload=payload)
+    quiet, *flares = star(amplitudes=tuple(np.linspace(0.01, 0.3, 18)), payload=instrument(part=True))
     together = engine.detect(quiet, flares, realisations=2000, seed=8)
     for k in (0, 14, 15, 17):
         alone = engine.detect(quiet, [flares[k]], realisations=2000, seed=8)
@@ -218,28 +201,6 @@ def test_flares_in_batches_equal_single_flares(engine: Engine) -> None:
                 wanted = alone.distribution(statistic, flare)
                 ours = together.distribution(statistic, None if flare is None else k, template=k)
                 np.testing.assert_array_equal(ours.counts, wanted.counts)
-
-
-@pytest.mark.parametrize("signal", ["net", "paper"])
-def test_snr_includes_photon_noise_of_sky(engine: Engine, signal: Any) -> None:
-    """Compare with S/N computed from raw spectra, for a sky as bright as the star."""
-    (x,) = star(magnitude=9.0, exposure=100.0, payload=instrument(part=True))
-    x = replace(x, signal=signal, sky_electrons=x.source_electrons)
-    n = 4000
-    found = engine.snr(x, realisations=n, seed=6)
-    light = engine.realise(x, count=n, seed=6) - x.n_frames * (x.bias_dn + x.dark_dn)
-    net = light - (x.sky_dn if signal == "net" else 0.0)
-    noise2 = x.gain_dn_per_electron * np.maximum(light, 0) + x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
-    summed = [np.array([x.per_element(row) for row in part]) for part in (net, noise2)]
-    for table, (s, v) in ((found.pixel, (net, noise2)), (found.element, summed)):
-        direct = s / np.sqrt(v)
-        # A bin is 1/64 of a standard deviation at most, and its middle counts.
-        np.testing.assert_allclose(table["mean"], direct.mean(axis=0), atol=0.01)
-        np.testing.assert_allclose(table["std"], direct.std(axis=0), atol=0.01)
-        np.testing.assert_allclose(table["q50"], np.median(direct, axis=0), atol=0.04)
-    # Five standard errors, of some 250 means.
-    assert np.abs(found.element["mean"] - found.element["expected"]).max() < 5 / np.sqrt(n)
-    assert found.element.meta["signal"] == signal
 
 
 def test_progress_is_reported_and_may_stop(engine: Engine) -> None:

@@ -1,6 +1,7 @@
 """First builds with failing compilers: the user's process continues or ends with a one-sentence error."""
 
 import os
+import re
 import stat
 import time
 from pathlib import Path
@@ -9,7 +10,6 @@ import pytest
 from processes import forked, printed, python
 
 pytestmark = pytest.mark.long
-
 #: Script that draws on the default device and prints the level and the counts' digest, or the error.
 RUN = """
 import hashlib, sys
@@ -46,20 +46,17 @@ ACTS = {
 
 
 def run(cache: Path | str, before: str = "", **environment: str) -> dict[str, str]:
-    """Run a separate process and return what it prints."""
     return printed(forked(RUN.format(before=before), cache=cache, **environment))
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
-    """Return the cache after a first start, and what this start printed."""
     cache = tmp_path_factory.mktemp("plain")
     return cache, run(cache)
 
 
 @pytest.fixture
 def chooses(plain: tuple[Path, dict[str, str]]) -> None:
-    """Skip the test if mauvecl does not choose the processor name."""
     if plain[1]["level"] == "None":
         pytest.skip("the default device chooses what it compiles for by itself")
 
@@ -82,10 +79,8 @@ def test_failure_at_every_level_is_one_sentence(act: str, tmp_path: Path, plain:
     """The next run tries again."""
     found = run(tmp_path, misbehaving(act, "(None,)"), MAUVECL_BUILD_LIMIT_S="2")
     assert found.keys() == {"sentence"}
-    lines, sentence = found["sentence"].split(" ", 1)
-    assert lines == "0"
-    for word in ("driver", ACTS[act], "conda-forge", "MAUVECL_BUILD_LIMIT_S"):
-        assert word in sentence
+    assert found["sentence"].startswith("0 ")
+    assert all(word in found["sentence"] for word in ("driver", ACTS[act], "conda-forge", "MAUVECL_BUILD_LIMIT_S"))
     if act == "ctypes.string_at(0)":
         assert run(tmp_path) == plain[1]
 
@@ -100,20 +95,14 @@ def test_failing_linker_is_reported(tmp_path: Path, plain) -> None:
     assert run(tmp_path / "cache") == plain[1]
 
 
-def test_level_is_reused(plain: tuple[Path, dict[str, str]]) -> None:
-    cache, first = plain
-    count = "drivers._try = lambda *a: print('tried', a[0]); "
-    assert run(cache, count) == first
-
-
-def test_read_only_store_suffices(plain: tuple[Path, dict[str, str]]) -> None:
+def test_level_is_reused_and_a_read_only_store_suffices(plain: tuple[Path, dict[str, str]]) -> None:
     cache, first = plain
     folders = [cache, *(path for path in cache.rglob("*") if path.is_dir())]
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in folders}
     try:
         for path in folders:
             path.chmod(0o555)
-        assert run(cache)["digest"] == first["digest"]
+        assert run(cache, "drivers._try = lambda *a: print('tried', a[0]); ") == first
     finally:
         for path, mode in modes.items():
             path.chmod(mode)
@@ -141,6 +130,5 @@ def test_first_build_stops_compiler_of_zen_4(tmp_path: Path, plain: tuple[Path, 
 @pytest.mark.parametrize("wrong", ["-1", "nan", "x"])
 def test_invalid_build_limit_is_refused(wrong: str, plain: tuple[Path, dict[str, str]]) -> None:
     found = run(plain[0], MAUVECL_BUILD_LIMIT_S=wrong)
-    assert found.keys() == {"sentence"}
-    assert found["sentence"].startswith("0 MAUVECL_BUILD_LIMIT_S must be between 1 and 86400 seconds")
-    assert found["sentence"].endswith(f"not '{wrong}'")
+    said = f"0 MAUVECL_BUILD_LIMIT_S must be between 1 and 86400 seconds.* not '{wrong}'"
+    assert re.fullmatch(said, found["sentence"])

@@ -92,17 +92,10 @@ def test_line_snr_equals_its_closed_form(name: str, wanted: float) -> None:
 
 
 @pytest.mark.parametrize("unknown", [False, True], ids=["known", "free"])
-@pytest.mark.parametrize(
-    ("library", "v", "kelvin", "jump", "line"),
-    [
-        ("K3V", 6.0, 7500.0, 1.8, 3e-12),
-        ("G2V", 8.0, 14_000.0, 3.0, 0.0),
-        ("M3V", 7.0, 25_000.0, 1.2, 8e-12),
-        ("F5V", 7.0, 11_000.0, 2.2, 1e-12),
-        ("M5V", 11.0, 6000.0, 3.8, 2e-12),
-        ("K5V", 9.0, 33_000.0, 1.5, 5e-12),
-    ],
-)
+@pytest.mark.parametrize(("library", "v", "kelvin", "jump", "line"), [
+    ("K3V", 6.0, 7500.0, 1.8, 3e-12), ("G2V", 8.0, 14_000.0, 3.0, 0.0), ("M3V", 7.0, 25_000.0, 1.2, 8e-12),
+    ("F5V", 7.0, 11_000.0, 2.2, 1e-12), ("M5V", 11.0, 6000.0, 3.8, 2e-12), ("K5V", 9.0, 33_000.0, 1.5, 5e-12),
+])  # fmt: skip
 def test_forecasts_agree_with_brute_force(
     library: str, v: float, kelvin: float, jump: float, line: float, unknown: bool
 ) -> None:

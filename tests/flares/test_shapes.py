@@ -20,7 +20,6 @@ every_shape = pytest.mark.parametrize("shape", [*SHAPES.values(), TABLE], ids=la
 
 
 def between(function, first: float, last: float, kinks: list[float]) -> float:
-    """Integrate a shape numerically, piece by piece."""
     ends = [first, *(k for k in kinks if first < k < last), last]
     return sum(quad(function, a, b, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(ends))
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import sgp4
 from astropy.table import Table
-from numpy.typing import NDArray
 from refusals import refused
 from scipy.interpolate import RegularGridInterpolator
 
@@ -18,7 +17,6 @@ import mauvecl
 from mauvecl import Study, visible
 from mauvecl.host.orbit import visibility
 
-Floats = NDArray[np.float64]
 VECTORS = Path(sgp4.__file__).parent
 PROTONS = Path(mauvecl.__file__).parent / "host" / "orbit" / "protons.ecsv"
 EARTH_KM = 6378.137
@@ -45,7 +43,7 @@ def month() -> Any:
     return seen(**MONTH)
 
 
-def degrees_between(one: Floats, other: Floats) -> Floats:
+def degrees_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the angles between vectors of shapes (n, 3) and (k, 3), or (n, 3) each."""
     one, other = (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) for vectors in (one, other))
     cosine = np.einsum("ni,ni->n", one, other) if one.shape == other.shape else one @ other.T

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from commands import ended, run
+from commands import run
 from refusals import refused
 
 from mauvecl import Expectation, Source, Study, simulate
@@ -47,17 +47,13 @@ def archive_file(**header: Any) -> bytes:
     return out.getvalue()
 
 
-def library(folder: Path, *words: str | Path) -> str:
-    """Run a command of the library and return what it says."""
-    done = run("library", *words, folder=folder)
+def library(folder: Path, *words: str | Path, code: int = 0) -> str:
+    done = run("library", *words, folder=folder, code=code)
     return done.stdout + done.stderr
 
 
 def not_done(folder: Path, *words: str | Path) -> str:
-    """Run a command of the library that is refused, and return its sentence."""
-    code, out, reported = ended("library", *words, folder=folder)
-    assert code == 2, out + reported
-    return reported
+    return library(folder, *words, code=2)
 
 
 def kept(folder: Path) -> list[str]:
@@ -152,7 +148,6 @@ class Archive(http.server.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def archive() -> Iterator[str]:
-    """Serve the archives' files locally and return the address."""
     calspec = WHOLE.read_bytes()
     ngsl = archive_file(TARGNAME="HD037202", DATAQUAL="good", OFFSETPX=0.1)
     names = ("18sco_stis_004.fits", "18sco_stis_006.fits", "18sco_stis_005.fits", "18sco_mod_009.fits",
@@ -177,12 +172,8 @@ def archive() -> Iterator[str]:
         server.shutdown()
 
 
-def fetch(folder: Path, name: str, base: str = "", *more: str) -> str:
-    return library(folder, "fetch", name, *(("--from", base) if base else ()), *more)
-
-
 def test_calspec_star_is_its_newest_file(archive: str, tmp_path: Path) -> None:
-    fetch(tmp_path, "calspec:18 Sco", f"{archive}/calspec/")
+    library(tmp_path, "fetch", "calspec:18 Sco", "--from", f"{archive}/calspec/")
     star, data = Source.from_library("18 sco"), fits.getdata(WHOLE)
     assert star.name == "18 Sco"
     assert all(words in star.origin for words in ("18sco_stis_006.fits", "doi 10.1086/677655"))
@@ -191,10 +182,10 @@ def test_calspec_star_is_its_newest_file(archive: str, tmp_path: Path) -> None:
 
 
 def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path) -> None:
-    base = f"{archive}/calspec/"
-    reported = not_done(tmp_path, "fetch", "calspec:VB 8", "--from", base)
+    words = ("fetch", "calspec:VB 8", "--from", f"{archive}/calspec/")
+    reported = not_done(tmp_path, *words)
     assert all(fact in reported for fact in ("VB8", "290.033-2497.72", "200-700", "--extend"))
-    fetch(tmp_path, "calspec:VB 8", base, "--extend", "M3V")
+    library(tmp_path, *words, "--extend", "M3V")
     direct = Source.read(WHOLE.parent / "vb8_stiswfcnic_004.fits", extend="M3V")
     np.testing.assert_array_equal(Source.from_library("VB 8").flux_flam, direct.flux_flam)
     # Its messages are reported wherever it is used.
@@ -207,7 +198,7 @@ def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path)
 
 
 def test_dereddened_star_is_marked_and_can_be_reddened(archive: str, tmp_path: Path) -> None:
-    reported = fetch(tmp_path, "lowlib:HD146233", f"{archive}/lowlib")
+    reported = library(tmp_path, "fetch", "lowlib:HD146233", "--from", f"{archive}/lowlib")
     assert "--star HD146233" in reported
     assert "--ebv reddens it again" in reported
     assert "HST stellar library of 513 stars" in library(tmp_path)
@@ -216,7 +207,7 @@ def test_dereddened_star_is_marked_and_can_be_reddened(archive: str, tmp_path: P
     assert not any("dereddened by its archive" in text for text in dusty.messages)
     ratio = (dusty.source_electrons / plain.source_electrons)[[100, -100]]
     assert ratio[0] < 0.8 < ratio[1]
-    fetch(tmp_path, "ngsl:HD 37202", f"{archive}/ngsl")
+    library(tmp_path, "fetch", "ngsl:HD 37202", "--from", f"{archive}/ngsl")
     star = Source.from_library("HD 37202")
     assert "DATAQUAL = good" in star.notes
     assert not any("dereddened" in text for text in star.notes)
@@ -225,7 +216,7 @@ def test_dereddened_star_is_marked_and_can_be_reddened(archive: str, tmp_path: P
 def test_any_collection_is_searched(archive: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = tuple(replace(c, base=f"{archive}/{c.name}/") for c in additions.COLLECTIONS)
     monkeypatch.setattr(additions, "COLLECTIONS", here)
-    fetch(tmp_path, "HD 37202")
+    library(tmp_path, "fetch", "HD 37202")
     assert "Spectral Library" in Source.from_library("HD 37202").origin
     reported = not_done(tmp_path, "fetch", "HD 99999")
     assert all(words in reported for words in ("'HD 99999'", "CALSPEC"))

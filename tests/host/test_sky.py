@@ -5,6 +5,7 @@ import socket
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import astropy.units as u
 import numpy as np
@@ -24,10 +25,8 @@ CELLS = {
 
 
 def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, float]:
-    """Return helio-ecliptic longitude, latitude and the Sun's separation, degrees, to 0.03 deg for 1950-2050.
-
-    The Astronomical Almanac's low-precision Sun (page C5), a rotation by the obliquity of J2000, general precession.
-    """
+    """Return helio-ecliptic longitude, latitude and the Sun's separation by a low-precision Sun, to 0.03 deg."""
+    # Page C5 of the Astronomical Almanac, for 1950-2050, the obliquity of J2000 and general precession.
     n = (datetime.fromisoformat(utc) - datetime(2000, 1, 1, 12)).total_seconds() / 86400
     anomaly = np.radians(357.528 + 0.9856003 * n)
     sun = 280.460 + 0.9856474 * n + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly)
@@ -114,10 +113,7 @@ def test_equivalent_targets_and_times() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_no_network_access_and_no_global_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("the network was asked")
-
-    monkeypatch.setattr(socket, "socket", refuse)
+    monkeypatch.setattr(socket, "socket", Mock(side_effect=AssertionError("the network was asked")))
     before = (iers.conf.auto_download, solar_system_ephemeris.get())
     # Decades past the bundled tables of Earth rotation.
     assert Sky.at("290 -11", "2085-07-01").surface_brightness == pytest.approx(22.4, abs=0.1)

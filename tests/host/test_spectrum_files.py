@@ -1,8 +1,4 @@
-"""Spectra of arrays, of tables at random, of archives, and of files that are packed, cut, damaged, or no files at all.
-
-Named cases are in tests/data/corpus. A file is read right or refused in one sentence; unmodified files of the archives
-are read as by hand.
-"""
+"""Spectra of tables at random, of archives, and of files that are packed, cut, damaged or none: right or refused."""
 
 import bz2
 import csv
@@ -31,11 +27,8 @@ CASES = dict(cases(CORPUS / "spectrum_files.toml"))
 
 
 def is_right(star: Source) -> bool:
-    return (
-        star.wavelength_nm.size == NM.size
-        and np.allclose(star.wavelength_nm, NM, rtol=1e-8, atol=0)
-        and np.allclose(star.flux_flam, FLUX, rtol=1e-6, atol=0)
-    )
+    pairs = ((star.wavelength_nm, NM, 1e-8), (star.flux_flam, FLUX, 1e-6))
+    return star.wavelength_nm.size == NM.size and all(np.allclose(*both, rtol, 0) for *both, rtol in pairs)
 
 
 def is_right_or_raises(folder: Path, head: str, mark: str, columns: dict[str, Any], may_raise: bool) -> None:
@@ -50,17 +43,12 @@ def is_right_or_raises(folder: Path, head: str, mark: str, columns: dict[str, An
         assert is_right(star), star.messages
 
 
-def test_units_may_be_those_of_astropy(tmp_path: Path) -> None:
-    path = written(
-        CASES["spectrum_files assumed units txt"] | {"columns": {"w": "10 * nm", "f": "flux / 100"}}, tmp_path
-    )
-    assert is_right(Source.read(path, wavelength_unit=u.AA, flux_unit=u.W / u.m**2 / u.nm))
-
-
-@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
-def test_frequencies_of_arrays_may_rise_or_fall(order: slice) -> None:
+def test_units_may_be_those_of_astropy_and_frequencies_may_rise_or_fall(tmp_path: Path) -> None:
+    case = CASES["spectrum_files assumed units txt"] | {"columns": {"w": "10 * nm", "f": "flux / 100"}}
+    assert is_right(Source.read(written(case, tmp_path), wavelength_unit=u.AA, flux_unit=u.W / u.m**2 / u.nm))
     frequency, flux = (NM * u.nm).to(u.Hz, u.spectral()), value('per("Jy")') * u.Jy
-    assert is_right(Source.from_arrays(frequency[order], flux[order]))
+    for order in (slice(None), slice(None, None, -1)):
+        assert is_right(Source.from_arrays(frequency[order], flux[order]))
 
 
 RANDOM = tomllib.loads((CORPUS / "spectrum_files.toml").read_text(encoding="utf-8"))["random"]
@@ -104,9 +92,7 @@ def test_any_table_is_read_correctly_or_raises(
     columns=st.sampled_from([{"0": NM, "1": FLUX}, {"0": NM, "1": FLUX, "2": 0.03 * FLUX}]),
 )
 @AT_RANDOM
-def test_prose_in_a_header_changes_nothing(
-    tmp_path: Path, lines: list[str], remark: str, mark: str, columns: dict[str, Any]
-) -> None:
+def test_prose_in_a_header_changes_nothing(tmp_path: Path, lines: Any, remark: str, mark: str, columns: Any) -> None:
     """Add prose with words for wavelength, flux, errors and units; the first two columns are read, or it raises."""
     is_right_or_raises(tmp_path, "\n".join(remark + line for line in lines), mark, columns, True)
 
@@ -132,9 +118,7 @@ def test_packed_files_are_whole_or_refused(pack: Callable[[bytes], bytes], tmp_p
 
 @pytest.mark.long
 @PACKERS
-def test_decompression_bomb_raises_early(
-    pack: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_decompression_bomb_raises_early(pack: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "bomb").write_bytes(pack(bytes(64 << 20)))
     monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "16")
     # Python reserves the memory of the largest file.
@@ -198,7 +182,6 @@ def test_damaged_files_raise_or_are_read(name: str, tmp_path: Path) -> None:
 HERE = Path(__file__).parents[1] / "data" / "spectra"
 ENTRIES = tomllib.loads((CORPUS / "archive_files.toml").read_text(encoding="utf-8"))
 RIGHT, SHORT = ([pytest.param(one, id=one["file"]) for one in ENTRIES[key]] for key in ("right", "short"))
-ANGSTROM = {"wavelength_unit": "Angstrom"}
 
 
 def by_hand(name: str, flux: str = "FLUX", skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -268,7 +251,7 @@ def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
     mauve = Instrument.load("mauvesim")
     lamost = written(dict(cases(CORPUS / "surveys.toml"))["surveys LAMOST table of DR8 fits"], tmp_path)
     model, ngsl = HERE / "ckp00_5750.fits[g45]", HERE / "h_stis_ngsl_hd095735_v2.txtA"
-    for star in (Source.read(model), Source.read(ngsl, **ANGSTROM), Source.read(lamost, extend="K5V")):
+    for star in (Source.read(model), Source.read(ngsl, wavelength_unit="Angstrom"), Source.read(lamost, extend="K5V")):
         with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0

@@ -15,5 +15,4 @@ def probes(request: pytest.FixtureRequest, engine: Engine) -> Probes:
 
 @pytest.fixture(scope="session")
 def probes_fast(engine: Engine) -> Probes:
-    """Return probes in the device's own form."""
     return Probes(device=engine.open_device)

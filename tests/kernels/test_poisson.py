@@ -1,11 +1,11 @@
 """Poisson draws by alias table: exact probabilities, Pearson tests, extreme words."""
 
 from dataclasses import replace
+from itertools import product
 
 import exact
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from probes import Probes
 from scipy import stats
 
@@ -18,20 +18,14 @@ SMALLEST_EXPANDED = 1000.0
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
 
-def words_per_column(table: layout.AliasTable) -> NDArray[np.int64]:
-    """Return the number of the 2**32 words that give each column: its exact probability."""
-    shift = 32 - table.bits
-    threshold = table.entries.astype(np.int64) & ((1 << shift) - 1)
-    words = threshold.copy()
-    np.add.at(words, table.entries.astype(np.int64) >> shift, (1 << shift) - threshold)
-    return words
-
-
 @pytest.mark.parametrize("mean", [*MEANS, 1e-9, 0.01, 1.0, 999.5, 1e6, 1e7])
 def test_alias_table_has_the_probabilities_of_scipy(mean: float) -> None:
     """Count the words of each outcome exactly and compare with scipy to one word in 2**32."""
     table = layout.alias_table(mean)
-    words = words_per_column(table)
+    shift, entries = 32 - table.bits, table.entries.astype(np.int64)
+    threshold = entries & ((1 << shift) - 1)
+    words = threshold.copy()
+    np.add.at(words, entries >> shift, (1 << shift) - threshold)
     assert words.sum() == 2**32
     counts = table.low + np.arange(words.size)
     np.testing.assert_allclose(words / 2**32, stats.poisson.pmf(counts, mean), rtol=0, atol=2.0**-32 * 1.01)
@@ -54,11 +48,6 @@ def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
     column, alias = words >> np.uint32(32 - table.bits), table.entries >> np.uint32(32 - table.bits)
     below = (words & np.uint32(share - 1)) < threshold[column]
     np.testing.assert_array_equal(ours, np.where(below, column, alias[column]))
-
-
-def pearson(counts: np.ndarray, low: int, mean: float) -> float:
-    """Return the two-sided p-value of Pearson's statistic with scipy's probabilities of low, low + 1, ..."""
-    return selftest.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
 
 
 #: Draws of each mean by expansion, and by table.
@@ -86,28 +75,14 @@ def drawn(probes_fast: Probes) -> dict[tuple[str, float], np.ndarray]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mean", MEANS)
-def test_pearson_of_the_table(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
-    """Pearson's test at 1e7 draws; fails by chance once in 1e6 runs of a new seed.
-
-    Words between the edges that are tested above must give the same counts as the edges. A rounded normal of mean 2225
-    gives p < 1e-70 here.
-    """
-    counts = drawn["table", mean]
-    assert counts.sum() == OF_TABLE
-    if mean == 0.0:
-        assert counts[0] == counts.sum()
-    else:
-        assert pearson(counts, layout.alias_table(mean).low, mean) > 1e-6
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("mean", EXPANDED)
-def test_pearson_of_the_expansion(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
-    """The same at 1e8 draws from the expansion. A rounded normal of mean 2225 gives p < 1e-100 here."""
-    counts = drawn["expansion", mean]
-    assert counts.sum() == DRAWS
-    assert pearson(counts, round(mean) - int(10 * np.sqrt(mean)), mean) > 1e-6
+@pytest.mark.parametrize(("way", "mean"), [*product(["table"], MEANS), *product(["expansion"], EXPANDED)])
+def test_pearson_of_draws(drawn: dict[tuple[str, float], np.ndarray], way: str, mean: float) -> None:
+    """Pearson's test at 1e7 or 1e8 draws; a rounded normal of mean 2225 gives p < 1e-70, a new seed 1e-6."""
+    counts = drawn[way, mean]
+    assert counts.sum() == {"table": OF_TABLE, "expansion": DRAWS}[way]
+    low = layout.alias_table(mean).low if way == "table" else round(mean) - int(10 * np.sqrt(mean))
+    exact = stats.poisson.pmf(low + np.arange(counts.size), mean)
+    assert counts[0] == OF_TABLE if mean == 0.0 else selftest.pearson(counts, exact) > 1e-6
 
 
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])

@@ -138,7 +138,6 @@ def invert(name: str, factor: float) -> float:
 
 
 def outside(prior: Prior, value: float, upper: bool) -> float:
-    """Return the probability between a value and the end of the prior."""
     law: Any = stats.uniform(prior.low, prior.high - prior.low)
     if isinstance(prior, Normal):
         cuts = ((end - prior.mean) / prior.sd for end in (prior.low, prior.high))

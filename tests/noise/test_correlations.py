@@ -1,13 +1,16 @@
-"""Independence of draws, for every method and every mixture of methods in a group."""
+"""Independence of draws, for every method and every mixture of methods in a group, and extreme words and counters."""
 
 from typing import Any
 
 import exact
 import numpy as np
 import pytest
+from refusals import refused
+from scenes import instrument, star
 
 from mauvecl import CosmicRays, Engine, Expectation, Normal, Processes
-from mauvecl.noise import layout
+from mauvecl.device.launches import scene_launches
+from mauvecl.noise import layout, reference
 from mauvecl.noise.scene import prepare
 
 #: Sixteen groups of four; pixel i of group g has a mean for the expansion where bit i of g is set, else for a table.
@@ -38,11 +41,7 @@ ROWS = 50_000
 @pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_draws_are_uncorrelated(engine: Engine, name: str) -> None:
-    """Correlate values, squares and neighbours' products of 64 pixels in two frames.
-
-    The limit |z| < 6.5 for 73 000 correlations fails once in 1e5 seeds per scene, and 1.5 times as often with the long
-    tails of squares.
-    """
+    """Correlate values, squares and neighbours' products of 64 pixels in two frames; each fails once in 6e4 seeds."""
     x, how = SCENES[name]
     values = []
     for frame in (0, 1):
@@ -75,3 +74,84 @@ def test_pairs_of_pixels_use_one_method() -> None:
     # The last of an odd number has no neighbour.
     odd = exact.flat(65, 1, dark=np.append(MIXED, 1500.0), read=0.7)
     assert prepare([odd]).dark_counts["bits"][64] == 0
+
+
+INVERSE = [pow(m, -1, 2**32) for m in (0xD2511F53, 0xCD9E8D57)]
+
+
+def unwind(words: tuple[int, int, int, int], seed: int) -> tuple[int, int, int, int]:
+    """Return the counter that gives these Philox words, which exists because each round is a bijection."""
+    k0, k1 = seed & 0xFFFFFFFF, seed >> 32
+    c = words
+    for r in reversed(range(10)):
+        a, b = (k0 + r * 0x9E3779B9) & 0xFFFFFFFF, (k1 + r * 0xBB67AE85) & 0xFFFFFFFF
+        # out = (high1 ^ c1 ^ a, low1, high0 ^ c3 ^ b, low0)
+        c2, c0 = c[1] * INVERSE[1] & 0xFFFFFFFF, c[3] * INVERSE[0] & 0xFFFFFFFF
+        high0, high1 = c0 * 0xD2511F53 >> 32, c2 * 0xCD9E8D57 >> 32
+        c = (c0, c[0] ^ high1 ^ a, c2, c[2] ^ high0 ^ b)
+    return c
+
+
+def place_of(words: tuple[int, int, int, int], stream: str) -> tuple[int, int, int, int]:
+    """Return a seed, realisation, frame and group that give these words in a stream."""
+    for seed in range(100_000):
+        c = unwind(words, seed)
+        if c[3] >> 24 == layout.STREAMS[stream] and c[1] < 2**31:
+            return seed, c[1] << 32 | c[0], c[2], c[3] & 0xFFFFFF
+    raise AssertionError("no such place")
+
+
+ENDS = [
+    (0, 0, 0, 0),
+    (2**32 - 1,) * 4,
+    (0, 2**32 - 1, 0, 2**32 - 1),
+    (2**32 - 1, 0, 1, 2**31),
+    (1, 2**31 - 1, 2**32 - 2, 2**30),
+]
+
+
+@pytest.mark.parametrize("words", ENDS)
+@pytest.mark.parametrize(("stream", "options", "how"), [
+    ("noise", {}, {}), ("noise", {"temperature_c": -30.0}, {}), ("dark", {}, {"recipe": "apart"}),
+    ("dark", {"temperature_c": -30.0}, {"recipe": "apart"}), ("photon", {"name": "mauve"}, {"recipe": "apart"}),
+    ("cosmic_rays", {}, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=500.0))}),
+])  # fmt: skip
+def test_extreme_words_in_production_kernel_equal_reference(
+    engine: Engine, words: tuple[int, int, int, int], stream: str, options: dict, how: dict
+) -> None:
+    seed, index, frame, group = place_of(words, stream)
+    np.testing.assert_array_equal([int(w[0]) for w in reference.words_at([index], frame, stream, group, seed)], words)
+    (x,) = star(payload=instrument(**{"part": True, "output_max_nm": 310.0} | options), exposure=5.0)
+    scene = prepare([x], first_frame=frame, first_group=group, **how)
+    raw = np.empty((1, scene.n_pixel), np.int32)
+    with scene_launches(engine.open_device, scene, seed) as launches:
+        launches.realise(engine._tiles.at(index, 1, 4096), raw)
+    np.testing.assert_array_equal(raw, reference.realise(scene, np.array([index], np.uint64), seed))
+    # No word gives more than 6.77 sigma of its own noise, or half the tables' 2**-33.
+    z = (raw[0, :4] - x.mean_raw_dn[:4]) / np.sqrt(x.variance_dn2[:4])
+    if stream != "cosmic_rays":
+        assert np.abs(z).max() < 15
+    if stream == "noise" and words == (0, 0, 0, 0):
+        assert z[0] > 6.5
+
+
+@pytest.mark.parametrize("index", [2**32 - 1, 2**32, 2**40 - 1, 2**40, 2**62])
+def test_draws_at_counter_boundaries_equal_reference(engine: Engine, index: int) -> None:
+    (x,) = star(payload=instrument(part=True, output_max_nm=320.0))
+    raw = engine.realise(x, start=index - 20, count=41, seed=2**64 - 1)
+    numbers = np.arange(index - 20, index + 21, dtype=np.uint64)
+    np.testing.assert_array_equal(raw, reference.realise(prepare([x]), numbers, 2**64 - 1))
+    assert len(np.unique(raw, axis=0)) == 41
+
+
+def test_largest_number_of_pixels_is_drawn(engine: Engine) -> None:
+    """Draw 65 536 pixels: all equal the reference, all groups differ, and statistics are defined."""
+    x = exact.flat(65_536, 1, dark=2225.0, photons=40.0)
+    raw = engine.realise(x, start=2**40, count=2, seed=3)
+    np.testing.assert_array_equal(raw, reference.realise(prepare([x]), np.array([2**40, 2**40 + 1], np.uint64), 3))
+    z = (raw - x.mean_raw_dn) / np.sqrt(x.variance_dn2)
+    assert len(np.unique(z[0].reshape(-1, 4), axis=0)) == 16_384
+    found = engine.detect(x, [], realisations=4000, seed=3, statistics=("chi2",)).distribution("chi2")
+    assert abs(found.mean - 65_536) < 5 * np.sqrt(2 * 65_536 / 4000)
+    with refused("pixels", "65540", "65536"):
+        prepare([exact.flat(65_540, 1)])

@@ -1,16 +1,22 @@
-"""Optional processes: each has its distribution and its own stream, and changes nothing else."""
+"""Optional processes and pointing drifts: each has its distribution and its own stream, and changes nothing else."""
 
+import json
+import os
+import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from marks import long_but
+from processes import python
 from scenes import instrument, star
-from scipy import stats
+from scipy import integrate, stats
 
-from mauvecl import CosmicRays, Engine, Normal, Processes, Study, Uniform, simulate
+from mauvecl import CosmicRays, Engine, Normal, Processes, Stare, Study, Uniform, simulate
 from mauvecl.device import selftest
-from mauvecl.noise import layout, reference
-from mauvecl.noise.scene import prepare
+from mauvecl.noise import layout, reference, unknowns
+from mauvecl.noise.scene import changes_of, prepare
 
 N = 20_000
 NONE = Processes()
@@ -116,7 +122,6 @@ def test_charge_has_moments_of_compound_poisson_sum() -> None:
 
 
 def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
-    """Check that a process changes no bit of pixels on which it has no effect."""
     (x,) = star(exposure=5.0)
     clean = engine.realise(x, count=200, seed=4)
     # Hits only: pixels without one are as they were.
@@ -237,3 +242,199 @@ def test_sky_follows_its_level(engine: Engine, level: Uniform) -> None:
         # A uniform value's variance scatters by less than a normal's; the noise's grows with the light at most.
         wanted = sd**2 + noise[1]
         assert abs(of_sky.var() / wanted - 1) < 5 * error + abs(mean - 1) * noise[1] / wanted
+
+
+def test_every_default_prior_has_a_source_or_documentation() -> None:
+    assert all(row.source for row in unknowns.PROCESSES.values() if row.prior is not None)
+    for row in unknowns.DOCUMENTED_NUISANCES:
+        assert row.marginalised
+        assert row.scatter > 0
+
+
+@pytest.mark.parametrize(
+    ("course", "name"), [(key, name) for key, row in unknowns.STARE_CHANGES.items() for name in row]
+)
+def test_stares_take_every_change_of_the_registry(course: str, name: str) -> None:
+    stare = Stare.of(6000.0, **{course: {name: 0.01}})
+    assert any(stare.jitters.values()) or stare.unknowns
+
+
+@pytest.mark.parametrize("magnitude", [-2.0, -1.2, -1.0, 2.0])
+def test_changes_are_slopes_of_recorded_moments(magnitude: float) -> None:
+    """Compare with a star whose light, or dark, is larger by 1e-5, where no, some and most pixels saturate."""
+    quiet, *_ = star("K3V", magnitude, payload=instrument(part=True))
+    means, variances = changes_of(quiet)
+    step = 1e-5
+    light = ("source_electrons", "sky_electrons", "neighbour_electrons")
+    for row, names in ((0, light), (1, light[1:2]), (2, ("dark_dn",))):
+        moved = replace(quiet, **{name: getattr(quiet, name) * (1 + step) for name in names})
+        slope = (moved.recorded_dn - quiet.recorded_dn) / step
+        unclipped = (moved.mean_raw_dn - quiet.mean_raw_dn) / step
+        # The width of the distribution changes too, by much less than its mean.
+        assert slope / quiet.n_frames == pytest.approx(means[row] / quiet.n_frames, abs=5e-3 * unclipped.max())
+    # Dark and light together are all of what factors change: without them the variance is not negative.
+    assert (quiet.variance_dn2 - variances[0] - variances[2] >= 0).all()
+    assert (means >= 0).all()
+    assert (quiet.cut_share.max() > 0.1) == (magnitude < 0)
+
+
+#: A toy process that is registered before anything else is imported, as a new row of the registry is.
+TOY = """
+import json, sys
+from typing import ClassVar
+import numpy as np
+import mauvecl.noise.disturbances as additive
+
+class Bursts(additive.AdditiveProcess):
+    "Bursts of the dark current: a Poisson number of bursts with exponentially distributed electrons."
+    stream: ClassVar[int] = 40
+    label: ClassVar[str] = "bursts"
+    per_s: float = 0.02
+    mean_electrons: float = 300.0
+    def charge(self, seconds):
+        size = 1 << 15
+        one = np.exp(-np.arange(size) / self.mean_electrons)
+        one[0] = 0.0
+        spectrum = np.exp(self.per_s * seconds * (np.fft.rfft(one / one.sum()) - 1.0))
+        return np.maximum(np.fft.irfft(spectrum, size), 0.0)[: self.most_electrons(seconds) + 1]
+    def most_electrons(self, seconds):
+        return 12_000
+
+additive.ADDITIVE["bursts"] = Bursts
+from mauvecl import Engine, Processes, Stare, Stares, Study, simulate
+from mauvecl.device.selftest import toy
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare_scene import Flares, StareScene
+from reference import stares as twin
+from mauvecl.noise import reference
+from mauvecl.noise.scene import prepare
+
+N = 4000
+sections = {"bursts": {"per_s": 0.02}, "cosmic_rays": {"rate_per_cm2_s": 300.0}}
+study = Study.build({"star": [{"library": "G2V", "magnitude": 7.4}], "processes": sections}, "t")
+both = study.processes
+quiet, engine, index = toy(64, 3), Engine(), np.arange(N, dtype=np.uint64)
+bursts = Processes(bursts=both.bursts)
+clean, hit, all_ = (engine.realise(quiet, count=N, seed=2, processes=p) for p in (Processes(), bursts, both))
+few = index[:8]
+charge = both.bursts.charge(15.0)
+electrons = np.arange(charge.size)
+mean = float(charge @ electrons)
+gain = quiet.gain_dn_per_electron
+one = toy(64, 1)
+c, stare = Components.of(one, [], np.ones((1, 64))), Stare.of(50.0)
+frames = Stares(engine.open_device).frames(c, stare, count=8, seed=2, processes=both)
+scene = StareScene.of(c, stare, both)
+slow = twin.pixels(scene, Flares.of(c, stare, None, None, 8), few, range(stare.n_frames), 2)[0]
+
+def same(drawn, processes):
+    return bool((drawn[:8] == reference.realise(prepare([quiet], processes=processes), few, 2)).all())
+
+print(json.dumps({
+    "keys": list(Processes.model_fields)[:2],
+    "kept": Study.build(__import__("tomllib").loads(study.toml()), "t") == study,
+    "same": same(hit, bursts) and same(all_, both),
+    "stares": bool((frames == slow).all()),
+    "added": float(np.mean((hit - clean) / gain)), "mean": mean,
+    "sd": float(np.sqrt((charge @ electrons**2 - mean**2) / (N * 64))),
+    "particles": [p.label for p in bursts.with_particles(5.0).particle_processes],
+    "column": "bursts" in simulate(study).observations[0][2].colnames,
+}))
+"""
+
+
+@pytest.mark.long
+def test_another_process_needs_its_class_and_row_only() -> None:
+    """Section, kernels, reference, stares and decomposition follow a row; the added charge is that of the class."""
+    done = python(TOY, PYTHONPATH=os.pathsep.join(sys.path))
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["keys"][-1:] == ["bursts"]
+    assert found["kept"]
+    assert found["same"]
+    assert found["stares"]
+    assert found["column"]
+    assert found["particles"] == ["cosmic rays"]
+    # Rounding adds 0.03 electrons at most; five standard errors fail once in 2e6.
+    assert abs(found["added"] - found["mean"]) < 5 * found["sd"] + 0.03
+    assert "bursts" not in layout.STREAMS
+
+
+#: Three statistical tests of 4.5 sigma and KS tests at 1e-5: about one run in 10 000 fails by chance. Seeds were fixed
+#: before the first run.
+SIGMA, LEAST_P, SEED = 4.5, 1e-5, 11
+DRIFTS = Study().with_settings(["stare.pointing={rate_per_h=6.0, duration_s=200.0, depth=0.8}"]).stare.pointing
+drifts, losses = (partial(function, DRIFTS) for function in (reference.pointing_drifts, reference.pointing_losses))
+WAIT_S = 600.0
+NUMBERS = np.arange(20_000, dtype=np.uint64)
+
+
+def test_waits_durations_and_depths_have_their_distributions() -> None:
+    start, lasts, depth = drifts(NUMBERS[:4000], 5000.0, SEED)
+    assert (start[:, -1] >= 5000.0).all()
+    ends = np.column_stack([np.zeros(4000), (start + lasts)[:, :-1]])
+    waits = start - ends
+    assert (waits > 0).all()
+    # Drawn up to a fixed number of drifts, and so without the bias of a fixed time.
+    for values, law in (
+        (waits[:, :8], stats.expon(scale=WAIT_S)),
+        (lasts[:, :8], stats.expon(scale=200.0)),
+        (depth[:, :8], stats.uniform(0.0, 0.8)),
+    ):
+        assert stats.kstest(values.ravel(), law.cdf).pvalue > LEAST_P
+    # Nothing is related to anything else.
+    table = np.column_stack([waits[:, 0], waits[:, 1], lasts[:, 0], lasts[:, 1], depth[:, 0], depth[:, 1]])
+    rank = stats.spearmanr(table).statistic[np.triu_indices(6, 1)]
+    assert np.abs(rank).max() * np.sqrt(4000) < SIGMA
+
+
+@pytest.mark.parametrize(
+    ("time_s", "later_s"), long_but([(50.0, 100.0), (500.0, 30.0), (3000.0, 300.0)], (3000.0, 300.0))
+)
+def test_occupation_and_its_correlation_in_time(time_s: float, later_s: float) -> None:
+    """P(drift at t) and P(drift at t and t + h) follow in closed form."""
+    at = np.array([time_s, time_s + later_s])
+    lost = losses(NUMBERS, at, 1e-6, SEED) > 0
+    # A Markov chain of two states, first without a drift.
+    n, share, rates = len(NUMBERS), 200.0 / (200.0 + WAIT_S), 1 / WAIT_S + 1 / 200.0
+    p = -share * np.expm1(-rates * time_s)
+    assert abs(lost[:, 0].mean() - p) < SIGMA * np.sqrt(p * (1 - p) / n)
+    both = p * (share + (1 - share) * np.exp(-rates * later_s))
+    assert abs((lost[:, 0] & lost[:, 1]).mean() - both) < SIGMA * np.sqrt(both * (1 - both) / n)
+
+
+@pytest.mark.long
+def test_moments_of_the_loss() -> None:
+    """Long after the start, the loss in a drift is a share of its depth that is uniform between 0 and 1."""
+    lost = losses(NUMBERS, np.array([20_000.0]), 1e-6, SEED)[:, 0]
+    share = 200.0 / (200.0 + WAIT_S)
+    mean, square, fourth = share * 0.8 / 4, share * 0.8**2 / 9, share * 0.8**4 / 25
+    n = len(NUMBERS)
+    assert abs(lost.mean() - mean) < SIGMA * np.sqrt((square - mean**2) / n)
+    assert abs((lost**2).mean() - square) < SIGMA * np.sqrt((fourth - square**2) / n)
+    assert lost.max() <= 0.8
+
+
+def test_frames_hold_the_mean_of_the_drift() -> None:
+    """The loss of a frame is the integral of the saw-tooth over it, whatever begins or ends in the frame."""
+    start, lasts, depth = (one[0] for one in drifts(NUMBERS[:1], 3000.0, SEED))
+
+    def lost(time_s: float) -> float:
+        inside = (time_s >= start) & (time_s < start + lasts)
+        return float(np.sum(inside * depth * (time_s - start) / lasts))
+
+    edges = np.arange(0.0, 3000.0, 5.0)
+    found = losses(NUMBERS[:1], edges, 5.0, SEED)[0]
+    breaks = np.concatenate([start, start + lasts])
+    for k in [*np.flatnonzero(found)[::7], *((breaks[breaks < 3000.0] // 5.0).astype(int))]:
+        inner = [b for b in breaks if edges[k] < b < edges[k] + 5.0]
+        value = integrate.quad(lost, edges[k], edges[k] + 5.0, points=inner or None, limit=200)[0] / 5.0
+        assert found[k] == pytest.approx(value, abs=1e-9)
+
+
+def test_a_stare_depends_on_its_number_and_the_seed_alone() -> None:
+    some = losses(NUMBERS[7:9], np.arange(0.0, 6000.0, 5.0), 5.0, SEED)
+    every = losses(NUMBERS[:20], np.arange(0.0, 6000.0, 5.0), 5.0, SEED)
+    np.testing.assert_array_equal(some, every[7:9])
+    longer = losses(NUMBERS[7:9], np.arange(0.0, 60_000.0, 5.0), 5.0, SEED)
+    np.testing.assert_allclose(some, longer[:, :1200], atol=1e-12)
+    assert not np.array_equal(some, losses(NUMBERS[7:9], np.arange(0.0, 6000.0, 5.0), 5.0, SEED + 1))

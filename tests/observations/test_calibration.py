@@ -1,7 +1,7 @@
 """Calibration of an instrument from standard stars that NumPy draws, of which the fit does not know the truth."""
 
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,28 +10,13 @@ import pytest
 import scipy
 from astropy.table import QTable, Table
 from commands import run
-from numpy.typing import NDArray
 from refusals import refused
 from scenes import paper
 from scenes import source as star
 
 import mauvecl
-from mauvecl import (
-    Expectation,
-    FlareModel,
-    Frames,
-    Instrument,
-    Sky,
-    Source,
-    Study,
-    calibrate,
-    expect,
-    fit,
-    measure,
-    plan,
-)
+from mauvecl import Expectation, FlareModel, Frames, Instrument, Sky, Source, Study, calibrate, expect, measure, plan
 
-Float = NDArray[np.float64]
 NOMINAL = Instrument.load("mauvesim")
 SKY = Sky.of_brightness(22.1)
 STARS = (("B3V", 4.5), ("A0V", 5.0), ("F0V", 4.0), ("G2V", 4.0), ("B0V", 5.0))
@@ -40,7 +25,6 @@ FAR = 4.0
 
 
 def curve(nm: Any, values: Any) -> Any:
-    """Return a quantity of the instrument against wavelength."""
     return replace(NOMINAL.quantum_efficiency_a_per_w, wavelength_nm=tuple(nm), value=tuple(values))
 
 
@@ -102,33 +86,32 @@ def answer() -> Any:
     return answer_of(STARS, truth(), 1)
 
 
-def test_fit_recovers_values(answer: Any) -> None:
+def test_fit_recovers_values_and_throughput(answer: Any) -> None:
     """Nine values: a false failure once in 1800 seeds."""
     true = truth()
     expected = {
         "dark slope": 0.072, "bias": 612.0, "gain": true.gain_dn_per_electron, "read noise": 13.0,
         "wavelength shift": 0.0, "wavelength stretch": 0.0, "line width": 10.5, "line width, change to the red": 0.0,
     }  # fmt: skip
-    values = {one.name: one for one in answer.values}
+    expected["dark current"] = true.with_(temperature_c=answer.dark.reference_c).dark_dn_per_s
     for name, value in expected.items():
-        assert abs(values[name].value - value) < FAR * values[name].error, name
-        assert values[name].determined
-    at = answer.dark.reference_c
-    found = values["dark current"]
-    assert abs(found.value - true.with_(temperature_c=at).dark_dn_per_s) < FAR * found.error
+        found = value_of(answer, name)
+        assert abs(found.value - value) < FAR * found.error, name
+        assert found.determined
     assert answer.transfer.dark_unit == "DN"
     assert all(row["p_value"] > 1e-4 for row in answer.fits)
+    assert far(answer.throughput) < FAR
+    assert 0.005 < np.median(answer.throughput.error) < 0.02
+
+
+def value_of(answer: Any, name: str) -> Any:
+    return next(one for one in answer.values if one.name == name)
 
 
 def far(fitted: Any) -> float:
     """Return the largest error of a fitted throughput, in its standard errors."""
     true = np.log(truth().throughput(fitted.wavelength_nm) / NOMINAL.throughput(fitted.wavelength_nm))
     return float(np.abs((fitted.log_factor - true) / fitted.error).max())
-
-
-def test_fit_recovers_throughput(answer: Any) -> None:
-    assert far(answer.throughput) < FAR
-    assert 0.005 < np.median(answer.throughput.error) < 0.02
 
 
 @pytest.mark.long
@@ -208,10 +191,7 @@ def test_other_stars_than_stated_are_refused_or_reported() -> None:
 
 
 def test_plans_and_measurements_state_the_error_of_the_throughput(tmp_path: Path) -> None:
-    """A throughput known to 5 % moves fluxes by as much, no temperature, and E50 by less, but more than by its root.
-
-    A limit moves by 5 % of the light each way.
-    """
+    """A throughput known to 5 % moves fluxes and limits by as much, no temperature, and E50 by less than that."""
     errors = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: wavelength, unit: nm, datatype: float64}\n"
     errors += "# - {name: mode_1, datatype: float64}\nwavelength mode_1\n200 0.05\n700 0.05\n"
     (tmp_path / "errors.ecsv").write_text(errors)
@@ -244,7 +224,7 @@ def test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels() -> Non
     table = found.dark_table
     off = (table["bias"].value - bias[NOMINAL.read_pixels]) / table["bias_error"].value
     assert abs(np.mean(off**2) - 1) < 4 * np.sqrt(2 / off.size)
-    (slope,) = (one for one in found.values if one.name == "dark slope")
+    slope = value_of(found, "dark slope")
     assert abs(slope.value - 0.072) < FAR * slope.error
     assert all(row["p_value"] > 1e-4 for row in found.fits)
 
@@ -258,7 +238,7 @@ def test_gain_ignores_jitter_of_light() -> None:
     jitter = 1 + 0.05 * rng.standard_normal((60, 1))
     jittered = replace(frames, flux=np.rint(level + (frames.flux - level) * jitter))
     found = calibrate(study_of((("A0V", 4.0),)), frames=(jittered, dark))
-    (gain,) = (one for one in found.values if one.name == "gain")
+    gain = value_of(found, "gain")
     assert abs(gain.value - truth().gain_dn_per_electron) < FAR * gain.error
     assert gain.error < 0.05 * gain.value
 
@@ -330,12 +310,9 @@ CHANGED = ("throughput_factor", "dark_scale_dn_per_s", "dark_slope_per_c", "conv
            "read_noise_dn", "bias_dn")  # fmt: skip
 FLARE = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]"]
 PLAN = ["plan.targets=[{name='eps Eri'}, {name='YZ CMi'}]", "orbit.days=2", "plan.completeness='closed form'"]
-#: Measured quantities that are compared.
-MEASURED = ("temperature", "flux 200-320 nm", "flux 200-700 nm")
 
 
 def with_(settings: list[str], instrument: Path | Instrument) -> Study:
-    """Return a study with a fitted instrument's file, or with the values of a true one."""
     study = paper(*settings)
     if isinstance(instrument, Path):
         return study.with_settings([f"observation.instrument={instrument}"])
@@ -347,21 +324,13 @@ def light(instrument: Instrument, amplitude: float) -> Expectation:
     return expect(quiet.flaring(amplitude) if amplitude else quiet, instrument, exposure=50.0, sky=SKY)
 
 
-@cache
-def true_answers(true: Instrument) -> tuple[Float, QTable]:
-    """Return the counts of a flare and a plan through an instrument."""
-    added = light(true, 0.5).recorded_dn - light(true, 0.0).recorded_dn
-    return added, plan(with_(PLAN, true)).table
-
-
-def deviations(true: Instrument, file: Path) -> dict[str, float]:
-    """Return answers through a true instrument, less those of a fitted one, in standard errors of the throughput."""
-    added, right = true_answers(true)
+def deviations(added: np.ndarray, right: QTable, file: Path) -> dict[str, float]:
+    """Return a flare's fit and a plan through a true instrument, less a fitted one's, in errors of the throughput."""
     fitted = Instrument.load(file)
     quiet = light(fitted, 0.0)
-    measured = fit(quiet.recorded_dn + added, quiet, FlareModel.of(star("M3V", 9.0), fitted, quiet))
+    measured = mauvecl.fit(quiet.recorded_dn + added, quiet, FlareModel.of(star("M3V", 9.0), fitted, quiet))
     table, found = measure(with_([*FLARE, "run.realisations=10"], file)).table, {}
-    for name in MEASURED:
+    for name in ("temperature", "flux 200-320 nm", "flux 200-700 nm"):
         (row,) = table[table["quantity"] == name]
         off = measured.estimates[0, measured.column(name)] - float(row["perfect"])
         found[name] = off / float(row["error_throughput"])
@@ -376,21 +345,16 @@ def deviations(true: Instrument, file: Path) -> dict[str, float]:
 @pytest.mark.filterwarnings("ignore:Pydantic serializer warnings")
 @pytest.mark.long
 def test_answers_with_fitted_instruments_have_their_errors(tmp_path: Path) -> None:
-    """Throughput, measurements and a plan through the true instrument, less those of ten fitted ones.
-
-    The sum of ten squares in stated standard errors follows chi-squared. It lies beyond the bounds by chance once in
-    3000 for each of seven quantities. Errors that are overstated by a factor of 2.6 fail as those understated by 1.8.
-    The throughput is within 95 % of its band as often as that, by 4 standard errors of ten fits and 2 %.
-    """
-    true = truth()
-    far: dict[str, list[float]] = {}
-    shares = []
+    """Compare a true instrument with ten fitted ones: each of seven quantities fails by chance once in 3000 seeds."""
+    # Errors that are overstated by a factor of 2.6, or understated by 1.8, fail.
+    true, far, shares = truth(), dict[str, list[float]](), []
+    added, right = light(true, 0.5).recorded_dn - light(true, 0.0).recorded_dn, plan(with_(PLAN, true)).table
     for seed in range(10):
         folder, found = tmp_path / str(seed), answer_of(STARS, true, 70 + seed)
         found.write(folder)
         off, error = relative(found, true)
         shares.append(np.mean(np.abs(off) < 1.96 * error))
-        for name, value in deviations(true, folder / "instrument.toml").items():
+        for name, value in deviations(added, right, folder / "instrument.toml").items():
             far.setdefault(name, []).append(value)
     low, high = scipy.stats.chi2.ppf([1 / 6000, 1 - 1 / 6000], 10)
     for name, values in far.items():

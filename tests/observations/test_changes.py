@@ -3,34 +3,33 @@
 from pathlib import Path
 from typing import Any
 
+import astropy.units as u
 import numpy as np
 import pytest
 import scipy
-from scenes import MG_II, paper
+from scenes import MG_II, analysed, noisy, paper, source
 
-from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, change, expect
+from mauvecl import Engine, Expectation, Frames, Instrument, Nuisances, Sky, Source, Study, analyse, change, expect
 from mauvecl.observations import visits
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
 MAUVE = Instrument.load("mauvesim")
-STAR = Source.from_library("M3V").at_magnitude(9.0)
 
 
 def asked(*settings: str, star: str = "library='M3V', magnitude=9") -> Any:
     return change(paper(f"star=[{{{star}}}]", *settings))
 
 
-def written(source: Source, path: Path) -> str:
+def written(star: Source, path: Path) -> str:
     """Return the words of a study for a star's spectrum in a file."""
-    both = zip(source.wavelength_nm.tolist(), source.flux_flam.tolist(), strict=True)
-    rows = [f"{nm!r},{flux!r}" for nm, flux in both]
-    path.write_text("\n".join(["wavelength (nm),flux (erg/(s cm2 Angstrom))", *rows]) + "\n")
+    columns = np.column_stack([star.wavelength_nm, star.flux_flam])
+    np.savetxt(path, columns, "%.17g", ",", header="wavelength (nm),flux (erg/(s cm2 Angstrom))", comments="")
     return f"file='{path}'"
 
 
 @pytest.fixture(scope="module")
 def quiet() -> Expectation:
-    return expect(STAR, MAUVE, exposure=50.0, sky=Sky.of_brightness(22.1))
+    return expect(source(), MAUVE, exposure=50.0, sky=Sky.of_brightness(22.1))
 
 
 @pytest.mark.parametrize(("fap", "power"), [(1e-3, 0.9), (1e-6, 0.5), (0.05, 0.95)])
@@ -106,30 +105,25 @@ def spread(nm: np.ndarray, flux: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("file", ["lp02123.txt", "lp09052.txt", "lp09126.txt"])
 def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str, tmp_path: Path) -> None:
-    table = np.loadtxt(AU_MIC / file, skiprows=19, usecols=(0, 1))
+    angstrom, flux = np.loadtxt(AU_MIC / file, skiprows=19, usecols=(0, 1)).T
     # A library star of its type continues it; only 258-302 nm and the reach of the line function matter.
-    nm, flux, other = table[:, 0] / 10, table[:, 1], Source.from_library("M1V")
-    beyond = other.wavelength_nm > nm[-1]
-    red = (
-        other.flux_flam[beyond]
-        * flux[nm > 325].mean()
-        / np.interp(nm[nm > 325], other.wavelength_nm, other.flux_flam).mean()
-    )
-    source = Source.from_arrays(
-        np.concatenate([[170.0], nm, other.wavelength_nm[beyond]]), np.concatenate([flux[:1], flux, red]), name="AU Mic"
-    )
-    answer = asked("sky={none=true}", "change.of=['200-320']", star=written(source, tmp_path / "aumic.csv"))
+    nm, other = angstrom / 10, Source.from_library("M1V")
+    near, beyond = nm > 325, other.wavelength_nm > nm[-1]
+    red = other.flux_flam[beyond] * flux[near].mean() / np.interp(nm[near], other.wavelength_nm, other.flux_flam).mean()
+    nm, flux = np.r_[170.0, nm, other.wavelength_nm[beyond]], np.r_[flux[0], flux, red]
+    star = Source.from_arrays(nm, flux, name="AU Mic")
+    answer = asked("sky={none=true}", "change.of=['200-320']", star=written(star, tmp_path / "aumic.csv"))
     (row,) = answer.index_table[answer.index_table["index"] == "Mg II"]
     nm = MAUVE.wavelength_nm
     # Per nm in place of per Angstrom; the pixel is far narrower than the line function.
-    flux = 10 * spread(source.wavelength_nm, source.flux_flam, nm)
+    flux = 10 * spread(star.wavelength_nm, star.flux_flam, nm)
     windows = ((nm >= 258.0) & (nm <= 270.0)) | ((nm >= 290.0) & (nm <= 302.0))
     line = np.polyfit(nm[windows], flux[windows], 1)
     fine = np.linspace(row["band_low"].value, row["band_high"].value, 4001)
     direct = np.trapezoid(np.interp(fine, nm, flux) - np.polyval(line, fine), fine)
     assert row["flux"].value == pytest.approx(direct, rel=0.01, abs=0)
     # The index at the resolution of IUE, times the share that is captured, leaves the continuum's curvature.
-    sharp = visits.line_index(source.wavelength_nm, 10 * source.flux_flam, **MG_II)
+    sharp = visits.line_index(star.wavelength_nm, 10 * star.flux_flam, **MG_II)
     assert 0.2 < row["flux"].value / (row["captured"] * float(sharp.flux)) < 5
 
 
@@ -186,8 +180,8 @@ def test_recovered_periods_are_those_of_another_periodogram() -> None:
 
 @pytest.fixture(scope="module")
 def flat(tmp_path_factory: pytest.TempPathFactory) -> str:
-    source = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")
-    return written(source, tmp_path_factory.mktemp("flat") / "flat.csv")
+    star = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")
+    return written(star, tmp_path_factory.mktemp("flat") / "flat.csv")
 
 
 @pytest.mark.parametrize("limits", [(300.0, 301.0), (310.03, 317.58), (400.0, 500.0)])
@@ -242,3 +236,81 @@ def test_a_colour_of_magnitudes_is_not_linear() -> None:
         colour, band = (row.smallest.one for row in answer.changes)
         assert colour == pytest.approx(2.5 * np.log10(1.0 + band), rel=1e-6)
     assert faint.changes[0].smallest.one < 10.0
+
+
+NM = np.linspace(270.0, 290.0, 201)
+LINE = np.exp(-((NM - 280.0) ** 2) / 2 / 0.3**2) / 0.3 / np.sqrt(2 * np.pi)
+
+
+def mg_ii(nm: np.ndarray, flux: np.ndarray, error: np.ndarray | None = None) -> tuple[float, float]:
+    found = visits.line_index(nm, flux, error, **MG_II)
+    return float(found.flux), float(found.error)
+
+
+def test_straight_continuum_is_removed_exactly_and_a_batch_equals_single_spectra() -> None:
+    for slope in (0.0, 0.3):
+        found = visits.line_index(NM, 5.0 + slope * (NM - 280) + 2 * LINE, **MG_II)
+        assert found.flux == pytest.approx(2.0, abs=2e-6)
+        assert found.equivalent_width_nm == pytest.approx(0.4, abs=1e-5)
+        assert np.isnan(found.error)
+    rng = np.random.default_rng(1)
+    flux, error = 5.0 + rng.normal(0, 0.1, (4, NM.size)), rng.uniform(0.05, 0.2, (4, NM.size))
+    error[2, 60] = np.nan
+    found = visits.line_index(NM * u.nm, flux, error, **MG_II)
+    for k in range(4):
+        assert (found.flux[k], found.error[k]) == pytest.approx(mg_ii(NM, flux[k], error[k]), rel=1e-12)
+
+
+def test_mg_ii_of_au_mic_lies_in_the_published_range() -> None:
+    """20 IUE spectra: 0.6-3.5e-12 erg/s/cm2, median 3.0e-12; formal errors from 1e-13, of long exposures, to 5e-13."""
+    found = []
+    for path in sorted(AU_MIC.glob("lp*.txt")):
+        angstrom, flux, error = np.loadtxt(path, skiprows=19, usecols=(0, 1, 2)).T
+        # Per nm, so that the index is a flux.
+        found.append(mg_ii(angstrom / 10, 10 * flux, 10 * error))
+    flux, error = np.array(found).T
+    assert flux.size == 20
+    assert [round(float(1e12 * x), 1) for x in (flux.min(), np.median(flux), flux.max())] == [0.6, 3.0, 3.5]
+    assert 7e-14 < error.min() < 1e-13
+    assert error.max() < 5e-13
+
+
+def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
+    rng = np.random.default_rng(299)
+    star, blue, shape, loss = np.linspace(100.0, 900.0, 40), np.linspace(300.0, 50.0, 40), np.zeros(300), np.ones(300)
+    shape[80:100] = np.exp(-np.arange(20) / 6.0)
+    loss[200:215] = 1.15
+    mean = (star + shape[:, None] * blue) * loss[:, None]
+    error, nm = np.full(mean.shape, 15.0), np.linspace(200.0, 700.0, 40)
+    events = analysed(Frames.of(np.arange(300) * 60.0, rng.normal(mean, error), error, wavelength_nm=nm)).events
+    flare, change = (next(row for row in events if row["istart"] <= at <= row["istop"]) for at in (82, 205))
+    assert flare["blue_over_red"] > 2
+    assert flare["p_no_colour"] < 1e-6
+    assert abs(change["blue_over_red"] - 1) < 4 * change["blue_over_red_error"]
+    assert change["p_no_colour"] > 1e-4
+
+
+def electrons(star: Source) -> float:
+    return float(expect(star, MAUVE, exposure=50.0).source_electrons.sum())
+
+
+def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(tmp_path: Path) -> None:
+    """The light of a flare of unit amplitude on each star, made by hand, says how large it must be."""
+    (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
+    star = {"library": "M3V", "magnitude": 9.0, "neighbours": tmp_path / "near.csv", "neighbour_share": 0.8}
+    study = Study.model_validate({"star": [star], "search": {"per": "day"}})
+    light = np.full(400, 1000.0)
+    light[200:206] += [400, 300, 200, 120, 60, 30]
+    answer = analyse(study, frames=noisy(3, np.arange(400) * 60.0, light, 5.0))
+    n, table = len(answer.events), answer.tables["neighbour-flares"]
+    assert n >= 1
+    assert table["star"].tolist() == ["M3V V = 9", "B", "C"] * n
+    stars = [source(*one) for one in (("M3V", 9.0), ("M4V", 10.0), ("G2V", 12.0))]
+    light = np.array([electrons(one) for one in stars])
+    shares = np.array([1.0, 0.8, 0.8])
+    rise = shares * (np.array([electrons(one.flaring(1.0)) for one in stars]) - light) / (shares @ light)
+    np.testing.assert_allclose(table["amplitude"], table["ampl_rec"] / np.tile(rise, n), rtol=1e-9)
+    duration = [one.equivalent_duration_s for one in answer.analysis.events for _ in stars]
+    np.testing.assert_allclose(table["equivalent_duration"].to_value("s"), duration / np.tile(rise, n), rtol=1e-9)
+    assert "neighbours.ecsv" in answer.files
+    assert any("assumption: 80 % of it enters" in text for text in answer.messages)

@@ -1,20 +1,21 @@
 """Simulated light curves with a known truth: false alarms as promised, intervals that cover, limits that hold."""
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import scenes
-from numpy.typing import NDArray
-from scenes import analysed
+from scenes import PER_MONTH, analysed, detected, noisy
 from scipy import stats
+from scripts import loaded
 
-from mauvecl import SHAPES, Frames
-from mauvecl.observations import events
+import mauvecl
+from mauvecl import SHAPES, Frames, Instrument, Source, Stares, Study, TableShape, analyse, expect, read_frames, stare
+from mauvecl.observations import detection, events
 from mauvecl.observations import level as levels
 from mauvecl.observations import search as searches
-from mauvecl.observations.detection import detect_events
 from mauvecl.observations.light_curve import survey_light_curve
 
 SHAPE = SHAPES["davenport2014"]
@@ -27,8 +28,8 @@ def survey_of(frames: Frames) -> Any:
     return survey_light_curve(frames, SHAPE, 1)[0]
 
 
-def light_curve(rng: np.random.Generator, mean: NDArray[np.float64] | float = LEVEL) -> Frames:
-    return Frames.of(TIME, rng.normal(mean, SD, FRAMES), np.full(FRAMES, SD))
+def light_curve(rng: np.random.Generator, mean: np.ndarray | float = LEVEL) -> Frames:
+    return noisy(rng, TIME, mean + np.zeros(FRAMES), SD)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def test_false_alarms_in_white_noise_are_as_many_as_promised(threshold: float) -
     count, days = 0, 0.0
     for _ in range(250):
         survey = survey_of(light_curve(rng))
-        count += len(detect_events(survey, threshold)[0])
+        count += len(detection.detect_events(survey, threshold)[0])
         days += survey.stare.observed_s / 86_400
     # The threshold has a standard error of some 3 %, and an estimated noise makes alarms more frequent: by
     # exp(u^2 s^2 / 2) u^2 of 4 % in the noise.
@@ -55,10 +56,7 @@ def test_false_alarms_in_white_noise_are_as_many_as_promised(threshold: float) -
 
 @pytest.mark.long
 def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> None:
-    """Intervals of 68 and 95 % of flares of S/N 30-200, and pulls; each range fails by chance once in a thousand times.
-
-    The sum of squares of 16 pulls notices intervals of half the width in 86 of 100 sets.
-    """
+    """Intervals of 68 and 95 % of flares of S/N 30-200, and pulls: each range fails by chance once in 1000 times."""
     rng = np.random.default_rng(291)
     inside, pulls, number = np.zeros(2), list[float](), 16
     for _ in range(number // 2):
@@ -66,7 +64,7 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
         peak = rng.uniform((4000, 20_000), (10_000, 28_000))
         light = sum(size * flare(*each) for size, *each in zip(amplitude, peak, width, strict=True))
         survey = survey_of(light_curve(rng, LEVEL * (1 + light)))
-        found, taken = detect_events(survey, threshold)
+        found, taken = detection.detect_events(survey, threshold)
         level = survey.flux_level(~taken)
         for truth, at in zip(amplitude * width * SHAPE.equivalent_duration, peak, strict=True):
             near = (one for one in found if abs(one.peak_s - at) < 2000)
@@ -92,7 +90,7 @@ def test_flares_at_the_limit_are_detected_nine_times_in_ten() -> None:
         peaks = rng.uniform((4000, 20_000), (16_000, 32_000))
         light = amplitude * sum(flare(peak, width) for peak in peaks)
         survey = survey_of(light_curve(rng, LEVEL * (1 + light)))
-        found, _ = detect_events(survey, answer.analysis.threshold)
+        found, _ = detection.detect_events(survey, answer.analysis.threshold)
         seen += sum(any(abs(one.peak_s - peak) < 4 * width + 300 for one in found) for peak in peaks)
     # The limit itself comes from forty injections per size: its completeness is known to some 5 %.
     low, high = stats.binom.ppf([0.0005, 0.9995], number, [0.78, 0.97])
@@ -123,32 +121,24 @@ def test_correlations_do_not_bridge_gaps() -> None:
     assert all(levels.likeness(numbers, rng.normal(0, 1, (numbers.size, 1))).alike for _ in range(100))
 
 
-def test_a_flare_is_found_at_its_time_and_a_step_is_a_step() -> None:
+def test_steps_single_frames_and_dips_are_no_flares_and_three_frames_are_one() -> None:
     rng = np.random.default_rng(292)
-    (event,) = analysed(light_curve(rng, LEVEL * (1 + 0.1 * flare(15_000, 400)))).events
-    assert event["kind"] == "flare"
-    assert abs(event["tpeak"].to_value("s") - 15_000) < 300
     stepped = analysed(light_curve(rng, LEVEL + np.where(TIME > 24_000, 40.0, 0.0))).events
     assert "flare" not in set(stepped["kind"][stepped["verdict"] == "detected"])
     assert "step" in set(stepped["kind"])
-
-
-def test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not() -> None:
-    rng = np.random.default_rng(293)
     mean = np.full(FRAMES, LEVEL)
-    mean[100] += 100
-    mean[200] -= 100
-    mean[300:303] += (100, 60, 40)
-    reasons = analysed(light_curve(rng, mean)).frames["reason"]
-    assert {k: str(one) for k, one in enumerate(reasons) if one} == {100: "spike", 200: "below"}
+    mean[[100, 200, 300, 301, 302]] += (100, -100, 100, 60, 40)
+    answer = analysed(light_curve(rng, mean))
+    assert {k: str(one) for k, one in enumerate(answer.frames["reason"]) if one} == {100: "spike", 200: "below"}
+    assert [str(one) for one in answer.events["kind"]] == ["flare"]
 
 
 @pytest.mark.long
 def test_the_level_follows_rotation_and_the_noise_does_not() -> None:
-    rng = np.random.default_rng(294)
     time = np.arange(6000) * 120.0
     rotation = LEVEL * (1 + 0.02 * np.sin(2 * np.pi * time / 2.6e5))
-    table = analysed(Frames.of(time, rng.normal(rotation, SD), np.full(time.size, SD / 2))).frames
+    drawn = np.random.default_rng(294).normal(rotation, SD)
+    table = analysed(Frames.of(time, drawn, np.full(time.size, SD / 2))).frames
     # Six standard errors of the level, which are those of its departures from the truth.
     off = np.asarray((table["level"] - rotation) / table["level_error"])
     assert np.abs(off).max() < 6
@@ -160,10 +150,201 @@ def test_the_level_follows_rotation_and_the_noise_does_not() -> None:
 def test_error_of_a_summed_duration_includes_that_of_its_level() -> None:
     """A star whose level is known to 1.3 %: the level is that of all frames outside of the event."""
     sd = 30.0
-    flux = 100.0 * (1 + 40.0 * flare(15_000, 300.0)) + np.random.default_rng(299).normal(0.0, sd, FRAMES)
-    (event,) = analysed(Frames.of(TIME, flux, np.full(FRAMES, sd))).analysis.events
+    (event,) = analysed(noisy(299, TIME, 100.0 * (1 + 40.0 * flare(15_000, 300.0)), sd)).analysis.events
     energy, inside = event.energy, event.last - event.first + 1
-    frames = energy.summed_s / CADENCE_S
-    quiet = FRAMES - inside
-    expected = sd / 100.0 * CADENCE_S * np.sqrt(inside + (inside + frames) ** 2 / quiet)
+    error = np.sqrt(inside + (inside + energy.summed_s / CADENCE_S) ** 2 / (FRAMES - inside))
+    expected = sd / 100.0 * CADENCE_S * error
     assert energy.summed_error_s == pytest.approx(expected, rel=0.15)
+
+
+SECTIONS: dict[str, Any] = {
+    "star": [{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}],
+    "flare": {"amplitudes": [0.3]},
+    "stare": {"duration_s": 5400.0, "half_width_s": 60.0, "jitters": {"light": 0.02}, "drifts": {"star": 0.01}},
+    "search": {"nulls": 0, "per": "day"},
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("pointing", [{}, {"pointing": {"rate_per_h": 3.0}}], ids=["steady", "pointing losses"])
+def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: Stares, tmp_path: Path) -> None:
+    """Size of half of the flares detected, over the threshold: the ratio of 11 stares was 1.00, its scatter 0.06."""
+    ratios = []
+    for seed in (1, 2, 3):
+        sections = SECTIONS | {"stare": SECTIONS["stare"] | pointing, "run": {"seed": seed}}
+        quiet = Study(**sections | {"flare": {"amplitudes": [1e-6]}})
+        drawn = stare(quiet, stares)
+        drawn.write(tmp_path / str(seed))
+        answer = analyse(quiet, frames=read_frames(tmp_path / str(seed) / "light-curve-1.fits"))
+        completeness, spectra = answer.analysis.completeness, answer.analysis.spectra
+        assert spectra is not None
+        series = spectra.series
+        # Sizes of inject are relative to the star in the flare's band, those of analyse to all light of the frames.
+        relative = float(series.model.flares((10_000.0,))[0].sum() / series.light.sum())
+        ratios.append(completeness.limit(1, 0.5) / answer.analysis.threshold / relative)
+    width = float(completeness.half_widths_s[1])
+    injections = {"of": "duration", "half_width_low_s": width, "half_width_high_s": width, "widths": 1, "sizes": 12,
+                  "count": 200, "positions": 200, "fitted": 0}  # fmt: skip
+    # Analyses leave out the level of each frame, and a dark current that drifts; inject assumes neither by itself. They
+    # find a constant level over the whole stare, where inject expects slopes and cycles, which cost 6 % of the S/N.
+    free = {name: "free" for name, sd in series.jitters.items() if np.isinf(sd)}
+    level = {"slope": False, "cycle": False, "window_s": 40_000.0}
+    alike = SECTIONS["search"] | {"frame": free} | level
+    expected = mauvecl.inject(Study(**sections | {"search": alike}, injections=injections), stares)
+    there = float(expected.tables["limits"]["e50"][0].value) / float(expected.tables["search"]["threshold"][0])
+    assert np.mean(ratios) / there == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.long
+def test_blind_analysis_of_stares_with_pointing_losses_finds_the_flares_and_no_others(stares: Stares) -> None:
+    """Four stares of each of two stars; bounds fail once in 1000 (alarms) and 2700 (intervals) times by chance."""
+    stars = ((("M3V", 9.0, 0.3), 2940), (("M5V", 11.0, 1.0), 3108))
+    outcome = loaded(Path(__file__).parents[2] / "bench" / "observed.py").outcome
+    found = [outcome(stares, *star, seed) for star, first in stars for seed in range(first, first + 4)]
+    assert all(one.found for one in found)
+    assert sum(one.false for one in found) <= stats.poisson.ppf(0.999, 10.0 * sum(one.days for one in found))
+    for name in ("temperature", "energy bolometric"):
+        # P(less than 5 of 8) = 3.7e-4 for 95 %.
+        assert sum(one.inside[name] for one in found) >= 5
+
+
+DATA = Path(__file__).parents[1] / "data"
+#: The great flare of AD Leo (1985) as published, less the quiescent spectrum, with the peak of its light: net flux in
+#: 200-330 nm, erg/s/cm2; its colour temperature is 9500 K in the optical, 13 800-14 500 K between 270 and 417 nm.
+FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLeo_1497s.dat"}
+QUIET = DATA / "flares" / "adleo_quiescent2.dat"
+NET = {912: 4.0e-9, 1497: 9.2e-10}
+N, FRAME_S, PEAKS_S, HALF_WIDTH_S = 2880, 5.0, {912: 4800.0, 1497: 9600.0}, 120.0
+DISTANCE_PC = 4.97
+MIDDLES_S = (np.arange(N) + 0.5) * FRAME_S
+COURSE = {one: scenes.flare(MIDDLES_S, FRAME_S, peak_s, HALF_WIDTH_S) for one, peak_s in PEAKS_S.items()}
+
+
+@pytest.mark.long
+def test_temperatures_and_luminosities_are_those_of_the_spectra() -> None:
+    """Statistical errors are 4 % at 912 s and 13 % at 1497 s; a blackbody adds some 7 % to the ultraviolet at 912 s."""
+    star, mauve = Source.read(QUIET, wavelength_unit="Angstrom", extend="M3V"), Instrument.load("mauvesim")
+    quiet = expect(star, mauve, exposure=FRAME_S)
+    light = np.tile(quiet.light_dn, (N, 1))
+    for seconds, path in FILES.items():
+        flare = mauvecl.ObservedFlare.read(path, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0)
+        grid = flare.grid(star.wavelength_nm)
+        both = Source(grid, np.interp(grid, star.wavelength_nm, star.flux_flam) + flare.flux(grid), "AD Leo", "test")
+        light += np.outer(COURSE[seconds], expect(both, mauve, exposure=FRAME_S).light_dn - quiet.light_dn)
+    fixed = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
+    rng = np.random.default_rng(912)
+    drawn = rng.normal(light, np.sqrt(fixed + quiet.gain_dn_per_electron * light))
+    bins = (quiet.element == np.arange(quiet.element_wavelength_nm.size)[:, None]).astype(float)
+    error = np.sqrt(bins @ quiet.unsaturated_variance_dn2) / FRAME_S
+    frames = Frames.of(
+        MIDDLES_S, drawn @ bins.T / FRAME_S, np.tile(error, (N, 1)), exposure_s=FRAME_S, name="AD Leo", unit="adu / s",
+        wavelength_nm=quiet.element_wavelength_nm,
+    )  # fmt: skip
+    sections = {
+        "star": [{"file": QUIET, "wavelength_unit": "Angstrom", "extend": "M3V", "distance_pc": DISTANCE_PC}],
+        "search": {"per": "day"},
+        "measure": {"bands_nm": [[200, 330], [200, 700]]},
+    }
+    answer = analyse(Study(**sections), frames=frames)  # type: ignore[arg-type]
+    survey, significant = answer.analysis.survey, [row for row in answer.rows if row.significant]
+    rows = [max(significant, key=lambda row: -abs(survey.time_s[row.event.brightest] - PEAKS_S[one])) for one in FILES]
+    assert [row.event.kind for row in rows] == ["flare", "flare"]
+    # A sixth of a false alarm is promised; more than two happen once in 1500 draws.
+    assert len(significant) <= 2 + 2
+    for row, seconds in zip(rows, FILES, strict=True):
+        found = row.measured
+        assert not isinstance(found, str), found
+        assert abs(survey.time_s[row.event.brightest] - PEAKS_S[seconds]) < 30
+        inside = np.isin(MIDDLES_S, survey.time_s[row.event.first : row.event.last + 1])
+        luminosity = NET[seconds] * COURSE[seconds][inside].mean() * 4 * np.pi * (DISTANCE_PC * 3.0857e18) ** 2
+        k = found.column("luminosity 200-330 nm")
+        assert found.low[1, 0, k] < luminosity < found.high[1, 0, k] or seconds == 912
+        assert found.estimates[0, k] == pytest.approx(luminosity, rel={912: 0.2, 1497: 0.4}[seconds])
+        temperature, low, high = row.quantity("temperature")
+        assert low < temperature < high
+        assert 9500 < temperature < 14_500
+    # A blackbody does not fit the epoch of the peak, and the answer says so.
+    assert rows[0].measured.p_value[0] < 1e-3  # type: ignore[union-attr]
+    assert "no flare of one temperature fits" in rows[0].note
+
+
+#: Shape, times of the frames, peak and half-width of a flare.
+Drawn = tuple[Any, np.ndarray, float, float]
+TAU = np.linspace(-4, 60, 6401)
+RISE = np.where(TAU < 0, SHAPE.at(TAU), 0.0)
+#: Two symmetrical shapes, and published rises with a slow and a fast tail.
+OTHERS = [
+    TableShape(TAU, np.exp(-4 * np.log(2) * TAU**2)),
+    TableShape(TAU, np.interp(TAU, [-3, 0, 1], [0, 1, 0])),
+    TableShape(TAU, np.where(TAU < 0, RISE, 0.7 * np.exp(-1.6 * TAU) + 0.3 * np.exp(-0.14 * TAU))),
+    TableShape(TAU, np.where(TAU < 0, RISE, 0.7 * np.exp(-1.6 * TAU) + 0.3 * np.exp(-0.6 * TAU))),
+]
+
+
+def middles(length_s: float, more: int = 0) -> np.ndarray:
+    return (np.arange(int(length_s / 5) + more) + 0.5) * 5.0
+
+
+def published(rng: np.random.Generator, k: int) -> Drawn:
+    """Draw one of two shapes in a window of 2 to 15 half-widths."""
+    width = rng.uniform(30, 120)
+    time = middles((rng.uniform(2, 15) + 5) * width, 40)
+    return list(SHAPES.values())[k % 2], time, 200 + rng.uniform(0, 3) * width, width
+
+
+def other(rng: np.random.Generator, k: int) -> Drawn:
+    width = rng.uniform(30, 90)
+    time = middles((rng.uniform(3, 15) + 7) * width, 40)
+    return OTHERS[k % 4], time, 200 + rng.uniform(3, 6) * width, width
+
+
+def without_peak(rng: np.random.Generator, k: int) -> Drawn:
+    """Draw a window of 1.5 to 2 half-widths that begins 0.7 to 1.4 after the peak."""
+    width = rng.uniform(200, 500)
+    return SHAPE, middles(rng.uniform(1.5, 2) * width), -rng.uniform(0.7, 1.4) * width, width
+
+
+def triangle(rng: np.random.Generator, k: int) -> Drawn:
+    """Draw a triangle that rises in 2 to 4 half-widths and falls in 0.5 to 1.5, which no shape fits."""
+    rise, fall = rng.uniform(2, 4), rng.uniform(0.5, 1.5)
+    tau = np.linspace(-rise, fall, 2001)
+    width = rng.uniform(100, 160)
+    return TableShape(tau, np.interp(tau, [-rise, 0, fall], [0, 1, 0])), middles(1800), 200 + rise * width, width
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("draw", "seed", "number", "snr", "missed", "most"), [
+    (published, 407, 18, (25, 3000), 0.1, (0.6827, 0.95)), (other, 408, 4, (50, 3000), 0, (1, 1)),
+    (without_peak, 409, 6, (1000, 5000), 1 / 3, (1, 1)), (triangle, 410, 3, (1000, 5000), 0, (1, 1)),
+])  # fmt: skip
+def test_recommended_energies_are_in_their_intervals(
+    draw: Any, seed: int, number: int, snr: tuple[float, float], missed: float, most: tuple[float, float]
+) -> None:
+    """Intervals of 68 and 95 %, and pulls in their units: each end of a range fails by chance once in 800 times."""
+    rng = np.random.default_rng(seed)
+    inside, pulls = np.zeros(2), list[float]()
+    for k in range(number):
+        shape, time, peak, width = draw(rng, k)
+        light = scenes.flare(time, 5.0, peak, width, shape)
+        size = np.exp(rng.uniform(*np.log(snr))) / np.sqrt(float(light @ light))
+        # Rarer false alarms take long to simulate for windows this short.
+        analysis = analysed(noisy(rng, time, 1e4 + size * light, 1.0), false_alarms=10.0).analysis
+        if not analysis.events:
+            continue
+        event = max(analysis.events, key=lambda one: one.value)
+        energy, truth = event.energy, size / 1e4 * width * shape.equivalent_duration
+        end = (energy.high_s if truth > energy.fitted_s else energy.low_s)[1]
+        pulls.append(stats.norm.isf(0.025) * (truth - energy.fitted_s) / (end - energy.fitted_s))
+        inside += [low <= truth <= high for low, high in zip(energy.low_s, energy.high_s, strict=True)]
+        # That is 18 times the largest error when the test was written.
+        assert draw not in (triangle, other) or energy.fitted_s == pytest.approx(truth, rel=0.2)
+        # A flare of another shape is one flare, and no process.
+        assert draw is not other or detected(analysis, PER_MONTH) == [event]
+        assert draw is not other or event.value > 0.6 * size * np.linalg.norm(light)
+    seen = len(pulls)
+    assert number - seen <= missed * number
+    assert (inside >= stats.binom.ppf(0.00125, seen, [0.6827, 0.95])).all(), inside
+    assert (inside <= stats.binom.ppf(0.99875, seen, most)).all(), inside
+    low, high = stats.chi2.ppf([0.00125, 0.99875], seen)
+    assert np.sum(np.square(pulls)) <= high, pulls
+    assert draw is not published or np.sum(np.square(pulls)) >= low, pulls

@@ -1,32 +1,36 @@
-"""Frames from arrays, from containers of other packages and from the layouts of the documentation."""
+"""Frames from arrays, other packages and documented layouts, and their times against an independent route."""
 
 import re
 from pathlib import Path
 
 import astropy.units as u
+import erfa
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.nddata import InverseVariance, StdDevUncertainty
 from astropy.table import Table
 from astropy.time import Time
 from astropy.timeseries import BinnedTimeSeries, TimeSeries
 from layouts import documented_files
+from scenes import paper
 
-from mauvecl import Frames, read_frames
+from mauvecl import Frames, Study, analyse, read_frames, visible
 from mauvecl.observations import frame_files
+from mauvecl.observations import frames as observed
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
 FLUX = 1000 + RNG.normal(0, 5, 100)
-ERROR = np.full(100, 5.0)
 
 
 def test_frames_are_sorted_and_numbered_over_gaps_and_slow_changes_of_the_times() -> None:
     order = RNG.permutation(100)
-    frames = Frames.of(TIME[order], FLUX[order], ERROR[order])
+    frames = Frames.of(TIME[order], FLUX[order], np.full(100, 5.0))
     np.testing.assert_array_equal(frames.flux, FLUX)
     assert len(frames.remarks) == 1
     assert Frames.of(TIME, FLUX).remarks == ()
+    assert Frames.of(TIME, FLUX, quality=4 * (TIME == 140.0)).flags[7:9] == ["4", ""]
     kept = np.r_[0:30, 50:100]
     assert Frames.of(TIME[kept], FLUX[kept]).numbers.tolist() == kept.tolist()
     # Barycentric times: 100 s of drift over a year, as of the Earth's motion along the line of sight.
@@ -36,33 +40,15 @@ def test_frames_are_sorted_and_numbered_over_gaps_and_slow_changes_of_the_times(
     np.testing.assert_array_equal(Frames.of(time, RNG.normal(0, 1, n)).numbers, numbers)
 
 
-@pytest.mark.parametrize("before", ["", "\n\n", " \n", "\ufeff\n"])
-def test_empty_lines_before_a_header_keep_its_units(before: str, tmp_path: Path) -> None:
-    table = Table({"time": TIME / 60, "flux": FLUX}, units={"time": "min"})
-    table.write(tmp_path / "plain.ecsv", format="ascii.ecsv")
-    (tmp_path / "frames.ecsv").write_text(before + (tmp_path / "plain.ecsv").read_text())
-    np.testing.assert_allclose(read_frames(tmp_path / "frames.ecsv").time_s, TIME)
-
-
-def test_faults_of_the_file_are_reasons() -> None:
-    flux, error, quality = FLUX.copy(), ERROR.copy(), np.zeros(100)
-    flux[3], error[5], quality[7] = np.nan, -1.0, 4
-    frames = Frames.of(TIME, flux, error, quality=quality)
-    assert np.flatnonzero(frames.faults).tolist() == [3, 5, 7]
-    assert frames.faults[3] == frames.faults[5] != frames.faults[7]
-    assert frames.flags[7] == "4"
-
-
 def test_the_errors_are_those_of_the_chosen_flux() -> None:
     """A light curve that lightkurve exports has its own flux next to those of the mission."""
     ones = np.ones(30)
     columns = {"time": np.arange(30.0), "pdcsap_flux": 2 * ones, "pdcsap_flux_err": 3 * ones, "flux": ones}
-    frames = frame_files.frames_of(Table(columns, units={"time": "s"}))
-    assert frames.flux.tolist() == ones.tolist()
-    assert frames.error is None
-    frames = frame_files.frames_of(
-        Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"})
-    )
+    table = Table(columns, units={"time": "s"})
+    frames = frame_files.frames_of(table)
+    assert (frames.flux.tolist(), frames.error) == (ones.tolist(), None)
+    table.remove_column("flux")
+    frames = frame_files.frames_of(table)
     assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
 
 
@@ -92,19 +78,13 @@ def test_spectra_of_specutils_are_frames(kind: type | None) -> None:
     specutils = pytest.importorskip("specutils")
     error = np.full(LIGHT.shape, 0.5)
     uncertainty = None if kind is None else StdDevUncertainty(error).represent_as(kind)
-    mask = np.zeros(LIGHT.shape, bool)
-    mask[3, 1] = True
-    spectra = specutils.Spectrum(
-        flux=LIGHT * u.adu, spectral_axis=NM * 10 * u.AA, uncertainty=uncertainty, mask=mask, meta={"OBJECT": "AU Mic"}
-    )
-    frames = frame_files.frames_of(spectra, time=WHEN)
+    mask = np.arange(LIGHT.size).reshape(LIGHT.shape) == 13
+    how = {"spectral_axis": NM * 10 * u.AA, "uncertainty": uncertainty, "mask": mask, "meta": {"OBJECT": "AU Mic"}}
+    frames = frame_files.frames_of(specutils.Spectrum(flux=LIGHT * u.adu, **how), time=WHEN)
     np.testing.assert_allclose(frames.flux, np.where(mask, np.nan, LIGHT))
     np.testing.assert_allclose(frames.wavelength_nm, NM)
     assert (frames.unit, frames.name, frames.scale) == ("adu", "AU Mic", "tdb")
-    if kind is None:
-        assert frames.error is None
-    else:
-        np.testing.assert_allclose(frames.error, 0.5)
+    assert frames.error is None if kind is None else np.allclose(frames.error, 0.5, atol=0)
 
 
 def test_every_example_of_the_page_gives_the_same_frames(tmp_path: Path) -> None:
@@ -125,3 +105,89 @@ def test_every_example_of_the_page_gives_the_same_frames(tmp_path: Path) -> None
         assert frames.date(float(frames.time_s[0]))[:21] == ("2026-03-01T00:00:02.5")
         np.testing.assert_allclose(np.diff(frames.time_s), 5.0, atol=1e-3)
         np.testing.assert_allclose(frames.exposure_s, 5.0)
+
+
+SECONDS = np.arange(200) * 30.0 + 15.0
+LIGHT_AT = RNG.normal(1000, 5, SECONDS.size)
+ORBIT = Study().paper().orbit.orbit()
+(AU_MIC,) = visible(paper("orbit.targets=['311.2897 -31.3409']", "orbit.days=0.1")).targets
+#: Days near the epoch of the embedded elements, and far from them.
+NEAR, LATE = "2026-09-16T03:00:00", "2027-03-01T00:00:00"
+
+
+def _frames(start: str, position: str, scale: str = "utc") -> Frames:
+    mjd = float(Time(start, scale=scale).mjd)
+    return Frames.of(SECONDS, LIGHT_AT, reference_mjd=mjd, scale=scale, position=position, name="AU Mic")
+
+
+def _geocentric_s(start: str) -> np.ndarray:
+    """Return barycentric TDB less UTC for an observer at the geocentre, s, by ERFA alone."""
+    mjd = Time(start, scale="utc").mjd
+    days = SECONDS / 86_400
+    # 37 leap seconds since 2017, and TT - TAI of 32.184 s.
+    tt = mjd + days + 69.184 / 86_400
+    tdb_tt = erfa.dtdb(2_400_000.5, tt, 0.0, 0.0, 0.0, 0.0)
+    _, barycentric_au = erfa.epv00(2_400_000.5, tt + tdb_tt / 86_400)
+    ra, dec = np.radians([AU_MIC.ra_deg, AU_MIC.dec_deg])
+    star = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    # Light time for 1 au (IAU 2012, 149 597 870.7 km; c = 299 792.458 km/s).
+    return 69.184 + tdb_tt + barycentric_au["p"] @ star * 149_597_870.7 / 299_792.458
+
+
+def _late_s(frames: Frames, start: str) -> np.ndarray:
+    return (frames.reference_mjd - float(Time(start, scale="utc").mjd)) * 86_400 + frames.time_s - SECONDS
+
+
+@pytest.mark.parametrize("start", [NEAR, LATE])
+def test_barycentric_times_of_the_geocentre_are_those_of_erfa(start: str) -> None:
+    found = observed.barycentric(_frames(start, "GEOCENTER"), AU_MIC)
+    # A modified Julian date in double precision resolves a microsecond.
+    np.testing.assert_allclose(_late_s(found, start), _geocentric_s(start), atol=3e-6)
+    assert (found.scale, found.position) == ("tdb", "BARYCENTER")
+    assert found.direction_deg == (AU_MIC.ra_deg, AU_MIC.dec_deg)
+
+
+@pytest.mark.parametrize(("start", "kind"), [(NEAR, "tle"), (LATE, "mean")])
+def test_the_satellites_place_counts_with_its_light_travel_time(start: str, kind: str) -> None:
+    found = observed.barycentric(_frames(start, "TOPOCENTER"), AU_MIC, ORBIT)
+    orbit = {"start": start, "days": SECONDS.size * 30 / 86_400, "step_s": 30.0}
+    grid = Study.build({"orbit": orbit}, "test").orbit.times()
+    assert ORBIT.resolved(grid) == kind
+    expected = ORBIT.track(grid).position_km @ AU_MIC.direction / 299_792.458
+    assert np.ptp(expected) > 5e-3
+    np.testing.assert_allclose(_late_s(found, start) - _geocentric_s(start), expected, atol=5e-6)
+    words = "good to 23 ms" if kind == "mean" else "along the track"
+    assert words in found.remarks[0]
+
+
+def test_other_scales_give_the_same_instants_and_barycentric_times_stay() -> None:
+    utc = observed.barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
+    found = observed.barycentric(_frames(Time(NEAR, scale="utc").tt.isot, "GEOCENTER", "tt"), AU_MIC)
+    assert (found.reference_mjd - utc.reference_mjd) * 86_400 == pytest.approx(0.0, abs=2e-6)
+    np.testing.assert_allclose(found.time_s, utc.time_s, atol=1e-6)
+    again = observed.barycentric(utc, AU_MIC)
+    np.testing.assert_array_equal(again.time_s, utc.time_s)
+    assert "barycentric already" in again.remarks[-1]
+
+
+def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    for place in ("astropy.utils.data.download_file", "astropy.utils.iers.iers.download_file"):
+        monkeypatch.delattr(place)
+    later = Frames.of(SECONDS, LIGHT_AT, reference_mjd=70_000.0, scale="utc", position="TOPOCENTER")
+    assert observed.barycentric(later, AU_MIC, ORBIT).position == "BARYCENTER"
+
+
+@pytest.mark.long
+def test_tables_of_an_analysis_state_epoch_scale_and_place(tmp_path: Path) -> None:
+    hdu = fits.table_to_hdu(Table({"TIME": SECONDS, "FLUX": LIGHT_AT}))
+    hdu.header.update({"TIMEUNIT": "s", "MJDREF": 61_299.0, "TREFPOS": "TOPOCENTER", "INSTRUME": "mauvesim"})
+    hdu.writeto(tmp_path / "a.fits")
+    answer = analyse(Study.build({"data": {"file": str(tmp_path / "a.fits"), "barycentric": "AU Mic"}}, "test"))
+    where = {"TIMESYS": "TDB", "TREFPOS": "BARYCENTER", "TREFDIR": "RA_OBJ,DEC_OBJ"}
+    assert where.items() <= answer.events.meta.items()
+    answer.frames.write(tmp_path / "frames.ecsv")
+    again, given = read_frames(tmp_path / "frames.ecsv"), answer.analysis.frames
+    assert (again.scale, again.position, again.direction_deg) == ("tdb", "BARYCENTER", given.direction_deg)
+    assert again.reference_mjd == pytest.approx(given.reference_mjd, abs=1e-10)
+    np.testing.assert_allclose(again.time_s, given.time_s - given.time_s[0], atol=2e-5)
+    np.testing.assert_allclose(again.flux, given.flux)

@@ -1,12 +1,11 @@
-"""Light curves of stars that rotate, of red noise, few counts and short windows: false alarms and energies."""
+"""Light curves of stars that rotate, of GJ 65, of red noise, few counts, short windows: false alarms and energies."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scenes import PER_CENTURY, PER_MONTH, analysed, detected, flare
+from scenes import PER_CENTURY, PER_MONTH, analysed, detected, flare, noisy
 from scipy import stats
 from scipy.linalg import null_space
 
@@ -15,19 +14,18 @@ from mauvecl.observations import process as processes
 from mauvecl.observations import process_search
 from mauvecl.observations import search as searches
 
-Float = NDArray[np.float64]
 DAVENPORT = SHAPES["davenport2014"]
 CASES = Path(__file__).parent.parent / "data" / "cases"
-#: Rotation and correlated noise, in standard deviations of a frame.
-ROTATOR = processes.Process(
-    (
-        processes.ProcessTerm("rotation", tuple(np.log([20.0, 40_000.0, 10.0, 1.0, 0.3]))),
-        processes.ProcessTerm("correlated", tuple(np.log([0.5, 1000.0]))),
-    ),
-    1.0,
-)
-#: A sinusoid that keeps its phase for longer than the light curve.
-LASTING = processes.Process((processes.ProcessTerm("rotation", tuple(np.log([4.0, 40_000.0, 1e4, 2.0, 0.1]))),), 1.0)
+
+
+def process(**terms: list[float]) -> processes.Process:
+    made = (processes.ProcessTerm(kind, tuple(np.log(values))) for kind, values in terms.items())
+    return processes.Process(tuple(made), 1.0)
+
+
+#: Rotation and correlated noise, in standard deviations of a frame, and a sinusoid that keeps its phase for long.
+ROTATOR = process(rotation=[20.0, 40_000.0, 10.0, 1.0, 0.3], correlated=[0.5, 1000.0])
+LASTING = process(rotation=[4.0, 40_000.0, 1e4, 2.0, 0.1])
 
 
 @pytest.mark.parametrize("n", [100, 2**14 + 1])
@@ -63,15 +61,10 @@ def test_covariance_is_that_of_dense_matrices() -> None:
 
 
 @pytest.mark.parametrize("taken", [False, True], ids=["at-once", "after-an-event"])
-@pytest.mark.parametrize(
-    ("process", "n", "spread", "tolerance", "apart"),
-    [
-        (ROTATOR, 300, 0.05, 0.02, 0),
-        (ROTATOR, 2500, 0.05, 0.02, 0),
-        (LASTING, 2500, 0.0, 0.01, 0),
-        (ROTATOR, 1000, 0.05, 0.02, 5 * 10**7),
-    ],
-)
+@pytest.mark.parametrize(("process", "n", "spread", "tolerance", "apart"), [
+    (ROTATOR, 300, 0.05, 0.02, 0), (ROTATOR, 2500, 0.05, 0.02, 0), (LASTING, 2500, 0.0, 0.01, 0),
+    (ROTATOR, 1000, 0.05, 0.02, 5 * 10**7),
+])  # fmt: skip
 def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
     process: processes.Process, n: int, spread: float, tolerance: float, apart: int, taken: bool
 ) -> None:
@@ -135,9 +128,9 @@ def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold
 
 def test_table_of_events_has_the_flare_in_its_units() -> None:
     """264 frames of 5 s, of which 93 show the quiescent star: intervals, level, times and sizes, at one seed."""
-    rng, time = np.random.default_rng(402), (np.arange(264) + 0.5) * 5.0
+    time = (np.arange(264) + 0.5) * 5.0
     light = 10 * flare(time, 5.0, 528.0, 60.0)
-    answer = analysed(Frames.of(time, 1e6 * (1 + light) + 2500 * rng.standard_normal(264), np.full(264, 2500.0)))
+    answer = analysed(noisy(402, time, 1e6 * (1 + light), 2500.0))
     assert np.median(answer.analysis.level.level) == pytest.approx(1e6, rel=2e-3)
     (row,) = answer.events
     assert row["tpeak"].to_value("s") == pytest.approx(528.0, abs=5.0)
@@ -156,9 +149,7 @@ def test_table_of_events_has_the_flare_in_its_units() -> None:
 
 def test_probability_of_an_event_is_that_of_the_larger_rate() -> None:
     """Search white noise for 30 events a day, whose rates by the process and by measured residuals differ."""
-    rng = np.random.default_rng(407)
-    frames = Frames.of(np.arange(3000) * 60.0, 1 + 1e-3 * rng.standard_normal(3000), np.full(3000, 1e-3))
-    answer = analysed(frames, false_alarms=30.0, per="day")
+    answer = analysed(noisy(407, np.arange(3000) * 60.0, np.ones(3000), 1e-3), false_alarms=30.0, per="day")
     analysis, events = answer.analysis, answer.events
     rates = np.array([events["rate_normal"].to_value("1 / d"), events["rate_measured"].to_value("1 / d")])
     assert (rates[0] != rates[1]).any()
@@ -182,10 +173,9 @@ def test_beginning_of_a_bright_flare_is_no_flare_of_its_own(peak_s: float, half_
 @pytest.mark.long
 def test_faint_star_with_a_great_flare_has_its_energy() -> None:
     """340 frames of mean 30.4 and noise 5.5, amplitude 120: the error is that of the level, to which it is relative."""
-    rng = np.random.default_rng(403)
     time = (np.arange(340) + 0.5) * 5.0
-    flux = 30.4 * (1 + 120 * flare(time, 5.0, 900.0, 90.0)) + 5.5 * rng.standard_normal(340)
-    (event,) = analysed(Frames.of(time, flux, np.full(340, 5.5))).analysis.events
+    light = 30.4 * (1 + 120 * flare(time, 5.0, 900.0, 90.0))
+    (event,) = analysed(noisy(403, time, light, 5.5)).analysis.events
     error = (event.energy.high_s[0] - event.energy.low_s[0]) / 2
     assert abs(event.energy.fitted_s - 19_730) < 3 * error
     assert 0.005 < error / event.energy.fitted_s < 0.03
@@ -199,14 +189,14 @@ def test_process_of_a_varying_star_is_the_best_and_stated_with_the_scatter_of_it
     seed: int, n: int, period_s: float, sizes: tuple[float, float], noise: float
 ) -> None:
     """A star that shows three rotations may have another standard deviation than its process."""
-    rng, time = np.random.default_rng(seed), np.arange(n) * 1800.0
+    time = np.arange(n) * 1800.0
     phase = 2 * np.pi * time / period_s
-    flux = 1 + sizes[0] * np.sin(phase) + sizes[1] * np.sin(2 * phase + 1.1) + noise * rng.standard_normal(n)
-    analysis = analysed(Frames.of(time, flux, np.full(n, noise))).analysis
+    frames = noisy(seed, time, 1 + sizes[0] * np.sin(phase) + sizes[1] * np.sin(2 * phase + 1.1), noise)
+    analysis = analysed(frames).analysis
     texts = "\n".join(analysis.messages)
     stated = re.search(r"standard deviation of (\S+) %, by (?:sharp )?rotation", texts)
     assert stated
-    assert float(stated[1]) == pytest.approx(100 * flux.std() / flux.mean(), rel=0.05)
+    assert float(stated[1]) == pytest.approx(100 * frames.flux.std() / frames.flux.mean(), rel=0.05)
     process = analysis.level.process
     assert min(process.bic, key=lambda one: one[1]) == (process.name, 0.0)
     assert not detected(analysis, PER_CENTURY)
@@ -221,7 +211,7 @@ def test_files_of_rotating_stars_have_no_flare(name: str) -> None:
     assert analysis.level.used.mean() > 0.95
 
 
-def two_exponentials(time_s: Float, frame_s: float, peak_s: float, half_width_s: float) -> Float:
+def two_exponentials(time_s: np.ndarray, frame_s: float, peak_s: float, half_width_s: float) -> np.ndarray:
     """Return a flare of a linear rise and two exponentials, which no template has, as the mean of 60 points a frame."""
     tau = (time_s[:, None] + (np.arange(60) - 29.5) / 60 * frame_s - peak_s) / half_width_s
     decay = np.maximum(tau, 0.0)
@@ -232,7 +222,6 @@ def two_exponentials(time_s: Float, frame_s: float, peak_s: float, half_width_s:
 @pytest.mark.long
 def test_edges_of_a_transit_are_no_flares_and_flares_of_its_star_are() -> None:
     """A growing spot, a transit of 1.2 %, gaps, a spike and three flares, of which the smallest is a candidate only."""
-    rng = np.random.default_rng(20261125)
     frame_s, noise = 120.0, 8 / np.sqrt(2)
     time = np.arange(2160) * frame_s
     phase = 2 * np.pi * time / 38_880.0
@@ -241,18 +230,14 @@ def test_edges_of_a_transit_are_no_flares_and_flares_of_its_star_are() -> None:
     flux = star * np.where(np.abs(time - 110_000) < 3600, 0.988, 1.0)
     for size, peak, width in flares:
         flux += 5400 * size * two_exponentials(time, frame_s, peak, width)
-    flux += noise * rng.standard_normal(time.size)
     flux[350] += 300
     flux[1250:1260] = np.nan
-    kept = np.ones(time.size, np.bool_)
-    kept[1500:1545] = False
-    frames = Frames.of(time[kept], flux[kept], np.full(int(kept.sum()), noise))
-    analysis = analysed(frames).analysis
+    kept = np.delete(np.arange(time.size), slice(1500, 1545))
+    analysis = analysed(noisy(20261125, time[kept], flux[kept], noise)).analysis
     assert [analysis.survey.time_s[event.brightest] for event in detected(analysis, PER_MONTH)] == [61_200.0, 211_080.0]
     assert 6.0 < analysis.dip == analysis.threshold
     for size, peak, width in flares:
-        near = [event for event in analysis.events if abs(analysis.survey.time_s[event.brightest] - peak) < 400]
-        (one,) = near
+        (one,) = (one for one in analysis.events if abs(analysis.survey.time_s[one.brightest] - peak) < 400)
         assert one.kind == "flare"
         light = float(two_exponentials(time, frame_s, peak, width).sum()) * frame_s
         truth = size * light * 5400 / float(np.interp(peak, time, star))
@@ -277,14 +262,10 @@ def test_files_that_once_failed_have_an_answer() -> None:
 @pytest.mark.parametrize("decay", [10, 20])
 def test_light_that_settles_after_a_gap_is_no_detected_flare(decay: int) -> None:
     """As Kepler's light after its safe mode of July 2009; a flare of the same light whose peak is seen is detected."""
-    rng = np.random.default_rng(7)
     number = np.arange(700)
-    kept = (number < 300) | (number >= 350)
     settles = np.where(number >= 350, np.exp(-(number - 350.0) / decay), 0.0)
-    flux = 1000.0 * (1 + 0.05 * settles) + rng.standard_normal(700)
-    for searched, verdict in ((kept, "candidate"), (np.ones(700, np.bool_), "detected")):
-        frames = Frames.of(1800.0 * number[searched], flux[searched], np.ones(searched.sum()))
-        events = analysed(frames).events
+    for searched, verdict in ((np.delete(number, slice(300, 350)), "candidate"), (number, "detected")):
+        events = analysed(noisy(7, 1800.0 * searched, 1000.0 * (1 + 0.05 * settles[searched]), 1.0)).events
         (event,) = events[events["value"] > 20]
         assert event["verdict"] == verdict
 
@@ -292,8 +273,7 @@ def test_light_that_settles_after_a_gap_is_no_detected_flare(decay: int) -> None
 @pytest.mark.long
 def test_red_noise_has_as_many_false_alarms_as_promised() -> None:
     """White noise and 1/f of 0.5 sigma, 12 stares at 2 events a star-day; fails by chance once in a thousand times."""
-    rng = np.random.default_rng(405)
-    count, days = 0, 0.0
+    rng, count, days = np.random.default_rng(405), 0, 0.0
     for _ in range(12):
         time, frequency = np.arange(500) * 30.0, np.fft.rfftfreq(2000)
         # A part of a series four times as long.
@@ -307,9 +287,9 @@ def test_red_noise_has_as_many_false_alarms_as_promised() -> None:
 
 def test_events_do_not_depend_on_the_unit_of_the_light() -> None:
     """Fluxes such as 1e-14 erg s-1 cm-2 were taken for counts, since they are nearly zero."""
-    rng, time = np.random.default_rng(407), np.arange(300) * 20.0
-    flux = 1000 + 10 * rng.standard_normal(300) + 500 * flare(time, 20.0, 3000.0, 60.0)
-    whole, small = (analysed(Frames.of(time, size * flux, np.full(300, 10 * size))).analysis for size in (1.0, 1e-17))
+    time = np.arange(300) * 20.0
+    light = 1000 + 500 * flare(time, 20.0, 3000.0, 60.0)
+    whole, small = (analysed(noisy(407, time, size * light, 10 * size)).analysis for size in (1.0, 1e-17))
     assert small.threshold == pytest.approx(whole.threshold, rel=1e-6)
     assert [one.value for one in small.events] == pytest.approx([one.value for one in whole.events], rel=1e-6)
 
@@ -342,3 +322,23 @@ def test_few_counts_have_their_mean_and_pulls() -> None:
     assert np.mean(levels) == pytest.approx(3.64, abs=3.3 * np.sqrt(3.64 / 9000))
     low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], len(pulls) - 1) / (len(pulls) - 1))
     assert low < np.std(pulls, ddof=1) < high
+
+
+@pytest.mark.long
+def test_bins_of_gj_65_are_flagged_and_level_and_great_flare_are_those_of_the_counts() -> None:
+    """Analyse GALEX's bins, one bad and one a spike; a flare of 20:01 is as small as other changes of the star."""
+    folder = CASES.parent / "flares"
+    answer = analysed(read_frames(folder / "gj65_galex_nuv_5s.csv", folder / "gj65.toml"))
+    flagged = {k: str(reason) for k, reason in enumerate(answer.frames["reason"]) if reason}
+    assert (set(flagged), flagged[59], "below" in flagged[265]) == ({59, 265}, "spike", True)
+    analysis, frames, great = answer.analysis, answer.analysis.frames, answer.analysis.events[-1]
+    assert frames.date(frames.time_s[59]).startswith("2005-11-18T20:04:43.5")
+    level, error = (float(np.median(one)) for one in (analysis.level.level, analysis.level.error))
+    assert 5.3 < level < 5.8
+    # Counts of 5.5 per second in 4.5 effective seconds.
+    assert 0.8 < error / np.sqrt(level / 4.54) < 1.1
+    assert frames.date(analysis.survey.time_s[great.brightest])[11:19] in ("20:22:33", "20:22:38")
+    assert (great.kind, great.cut, great.missing) == ("flare", True, 1)
+    assert max(one.value for one in analysis.events) == great.value
+    # The peak of the published light curve: 838.6 counts per second over 5.5.
+    assert great.amplitude * great.energy.level * analysis.survey.level == pytest.approx(838.6 - 5.5, rel=0.005)

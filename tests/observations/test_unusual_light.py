@@ -1,18 +1,15 @@
-"""Light that resembles neither a quiet star nor a whole flare: tails without a peak, eclipses, too many events."""
-
-from __future__ import annotations
+"""Light that resembles neither a quiet star nor a whole flare: tails, eclipses, steps of the level, too many events."""
 
 import tracemalloc
 
 import numpy as np
 import pytest
 from marks import long_but
-from numpy.typing import NDArray
-from scenes import PER_MONTH, analysed, detected, flare
+from scenes import PER_MONTH, analysed, detected, flare, noisy
 
 from mauvecl import SHAPES, Frames, Study, analyse
+from mauvecl.observations import detection
 
-Float = NDArray[np.float64]
 DURATION = SHAPES["davenport2014"].equivalent_duration
 
 
@@ -25,32 +22,24 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     half_width_s: float, after: float, amplitude: float, window: float, seed: int
 ) -> None:
     """Observe 11 to 15 half-widths after the peak; five standard errors, exceeded once in 1.7 million cases."""
-    rng, frame_s, noise = np.random.default_rng([501, seed]), 5.0, 5e-3
-    time = (np.arange(round(window * half_width_s / frame_s)) + 0.5) * frame_s
-    flux = 1 + amplitude * flare(time, frame_s, -after * half_width_s, half_width_s)
-    flux += noise * rng.standard_normal(time.size)
+    time = (np.arange(round(window * half_width_s / 5.0)) + 0.5) * 5.0
+    light = 1 + amplitude * flare(time, 5.0, -after * half_width_s, half_width_s)
     # Rarer false alarms take long to simulate for windows this short.
-    analysis = analysed(Frames.of(time, flux, np.full(time.size, noise)), false_alarms=3.0).analysis
+    analysis = analysed(noisy([501, seed], time, light, 5e-3), false_alarms=3.0).analysis
     event = max(analysis.events, key=lambda one: one.value)
-    assert event.first == 0
-    assert event.cut
-    assert event.kind == "flare"
+    assert (event.first, event.cut, event.kind) == (0, True, "flare")
     assert event.value > analysis.threshold
     truth = amplitude * half_width_s * DURATION
-    low, high = event.energy.low_s[0], event.energy.high_s[0]
-    assert abs(event.energy.fitted_s - truth) < 2.5 * (high - low)
+    assert abs(event.energy.fitted_s - truth) < 2.5 * (event.energy.high_s[0] - event.energy.low_s[0])
 
 
 @pytest.mark.parametrize("seed", long_but([1, 2], 1))
 def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
     """A third, longer than the window, must not stand for either; five standard errors of the energy."""
-    rng, frame_s, noise = np.random.default_rng([508, seed]), 5.0, 1.2e-3
-    time = (np.arange(197) + 0.5) * frame_s
+    time = (np.arange(197) + 0.5) * 5.0
     peaks, widths, sizes = (284.0, 406.0), (88.0, 102.0), (0.218, 0.191)
-    light = sum(size * flare(time, frame_s, *one) for *one, size in zip(peaks, widths, sizes, strict=True))
-    flux = 1 + light + noise * rng.standard_normal(time.size)
-    analysis = analysed(Frames.of(time, flux, np.full(time.size, noise))).analysis
-    event = max(analysis.events, key=lambda one: one.value)
+    light = sum(size * flare(time, 5.0, *one) for *one, size in zip(peaks, widths, sizes, strict=True))
+    event = max(analysed(noisy([508, seed], time, 1 + light, 1.2e-3)).analysis.events, key=lambda one: one.value)
     assert sorted(one.peak_s for one in event.energy.flares) == pytest.approx(peaks, abs=8.0)
     truth = DURATION * sum(size * width for size, width in zip(sizes, widths, strict=True))
     assert abs(event.energy.fitted_s - truth) < 2.5 * (event.energy.high_s[0] - event.energy.low_s[0])
@@ -58,27 +47,20 @@ def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
 
 @pytest.mark.long
 def test_end_of_a_search_at_its_largest_number_of_events_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(503)
     time = np.arange(1000) * 20.0
-    flux = 1 + 1e-3 * rng.standard_normal(time.size)
-    for peak in np.linspace(2e3, 18e3, 4):
-        flux += 0.1 * flare(time, 20.0, peak, 60.0)
-    frames = Frames.of(time, flux, np.full(time.size, 1e-3))
+    light = 1 + 0.1 * sum(flare(time, 20.0, peak, 60.0) for peak in np.linspace(2e3, 18e3, 4))
+    frames = noisy(503, time, light, 1e-3)
     assert not any("ended at" in line for line in analysed(frames).analysis.messages)
-    monkeypatch.setattr("mauvecl.observations.detection.MOST_EVENTS", 3)
+    monkeypatch.setattr(detection, "MOST_EVENTS", 3)
     ended = analysed(frames).analysis
     assert any(f"ended at {len(ended.events)} events" in line for line in ended.messages)
 
 
 def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
     """Three losses of 3 %, of 30 standard deviations, and a flare between them; ends are known to a few frames."""
-    rng = np.random.default_rng(504)
-    time, noise = np.arange(900) * 20.0, 1e-3
-    lost = np.zeros(time.size, np.bool_)
-    for first in (150, 400, 700):
-        lost[first : first + 40] = True
-    flux = 1 - 0.03 * lost + 0.02 * flare(time, 20.0, 11_000.0, 60.0) + noise * rng.standard_normal(time.size)
-    answer = analysed(Frames.of(time, flux, np.full(time.size, noise)))
+    time = np.arange(900) * 20.0
+    lost = np.isin(np.arange(900), np.add.outer([150, 400, 700], np.arange(40)))
+    answer = analysed(noisy(504, time, 1 - 0.03 * lost + 0.02 * flare(time, 20.0, 11_000.0, 60.0), 1e-3))
     found = np.array(["loss" in str(one) for one in answer.frames["reason"]])
     assert found[lost].mean() > 0.9
     assert found[~lost].mean() < 0.05
@@ -89,24 +71,18 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "losses",
-    [
-        ((900, 770, 0.042, 20, 110), (2400, 700, 0.047, 130, 420)),
-        ((-400, 1200, 0.03, 20, 60), (1500, 900, 0.045, 90, 60), (3800, 500, 0.02, 30, 200), (5600, 900, 0.04, 60, 90)),
-    ],
-    ids=["between", "at both ends"],
-)
+@pytest.mark.parametrize("losses", [
+    ((900, 770, 0.042, 20, 110), (2400, 700, 0.047, 130, 420)),
+    ((-400, 1200, 0.03, 20, 60), (1500, 900, 0.045, 90, 60), (3800, 500, 0.02, 30, 200), (5600, 900, 0.04, 60, 90)),
+], ids=["between", "at both ends"])  # fmt: skip
 def test_losses_in_most_frames_are_no_flares_between_them(losses: tuple[tuple[float, ...], ...]) -> None:
     """Observe a star that is out of the fibre for half of the time or more, and returns to its light."""
-    rng, frame_s, noise = np.random.default_rng([504, 1]), 10.0, 1e-4
-    time = np.arange(630) * frame_s
+    time, noise = np.arange(630) * 10.0, 1e-4
     loss = np.zeros(time.size)
     for start, length, size, out, back in losses:
         gone = 1 - np.exp(-np.clip(time - start, 0, length) / out)
         loss = np.maximum(loss, size * gone * np.exp(-np.clip(time - start - length, 0, None) / back))
-    flux = 1 - loss + noise * rng.standard_normal(time.size)
-    answer = analysed(Frames.of(time, flux, np.full(time.size, noise)))
+    answer = analysed(noisy([504, 1], time, 1 - loss, noise))
     assert not detected(answer.analysis, PER_MONTH)
     lost = np.array(["loss" in str(reason) for reason in answer.frames["reason"]])
     assert lost[loss > 10 * noise].mean() > 0.95
@@ -115,15 +91,12 @@ def test_losses_in_most_frames_are_no_flares_between_them(losses: tuple[tuple[fl
 @pytest.mark.parametrize("missing", [True, False])
 def test_missing_frames_that_may_have_held_a_peak_are_stated(missing: bool) -> None:
     """Observe a flare shorter than a frame, with and without its brightest frame."""
-    rng, frame_s, noise = np.random.default_rng(506), 600.0, 1e-3
+    frame_s, decay_s = 600.0, 400.0
     time = np.arange(300) * frame_s
-    flux = 1 + noise * rng.standard_normal(time.size)
-    decay_s, start_s = 400.0, 150 * frame_s + 30.0
-    ages = np.clip(time[:, None] + np.array([-0.5, 0.5]) * frame_s - start_s, 0, None)
-    flux -= 0.2 * decay_s / frame_s * np.diff(np.exp(-ages / decay_s))[:, 0]
-    kept = np.ones(time.size, np.bool_)
-    kept[150] = not missing
-    answer = analysed(Frames.of(time[kept], flux[kept], np.full(int(kept.sum()), noise)), per="month")
+    ages = np.clip(time[:, None] + np.array([-0.5, 0.5]) * frame_s - 150 * frame_s - 30.0, 0, None)
+    light = 1 - 0.2 * decay_s / frame_s * np.diff(np.exp(-ages / decay_s))[:, 0]
+    kept = (np.arange(300) != 150) | (not missing)
+    answer = analysed(noisy(506, time[kept], light[kept], 1e-3), per="month")
     (row,) = (row for row in answer.rows if row.verdict == "detected")
     assert ("are missing: they may have held its peak" in row.note) is missing
 
@@ -131,11 +104,9 @@ def test_missing_frames_that_may_have_held_a_peak_are_stated(missing: bool) -> N
 @pytest.mark.long
 def test_bumps_of_every_orbit_are_no_flares() -> None:
     """Observe eight orbits in each of which the light rises and falls smoothly, by changing sizes."""
-    rng, frame_s, noise = np.random.default_rng([505, 1]), 30.0, 2e-4
-    phase = np.arange(1520) * frame_s / 5700.0 + 0.3
+    phase = np.arange(1520) * 30.0 / 5700.0 + 0.3
     bump = np.exp(4 * (np.cos(2 * np.pi * phase) - 1)) * (1 + 0.2 * np.sin(2 * np.pi * (0.12 * phase + 0.4)))
-    flux = 1 + 0.012 * bump + noise * rng.standard_normal(phase.size)
-    answer = analysed(Frames.of(phase * 5700.0, flux, np.full(phase.size, noise)))
+    answer = analysed(noisy([505, 1], phase * 5700.0, 1 + 0.012 * bump, 2e-4))
     assert "detected" not in set(answer.events["verdict"])
 
 
@@ -190,9 +161,7 @@ def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
     peaks = [float(one) for one in rng.uniform(0.03, 0.97, 5) * time[-1]]
     for size, peak in zip(np.geomspace(0.008, 0.15, 5), peaks, strict=True):
         light += size * flare(time, frame_s, peak, rng.uniform(200, 1000))
-    flux = light + noise * rng.standard_normal(time.size)
-    frames = Frames.of(time, flux, np.full(time.size, noise), exposure_s=frame_s)
-    answer = analyse(Study().paper(), frames=frames)
+    answer = analyse(Study().paper(), frames=noisy(rng, time, light, noise, exposure_s=frame_s))
     searched = np.array(answer.frames["reason"]) == ""
     assert searched[depth < 1e-9].mean() > 0.9
     events = answer.events[answer.events["verdict"] == "detected"]
@@ -215,8 +184,7 @@ def test_dips_at_random_are_no_flares() -> None:
     flux = np.ones(time.size)
     for middle in rng.uniform(0, time[-1], 38):
         flux *= 1 - rng.uniform(0.02, 0.3) * np.exp(-(((time - middle) / (rng.uniform(0.05, 0.3) * 86_400)) ** 4))
-    flux += 1e-3 * rng.standard_normal(time.size)
-    answer = analyse(Study().paper(), frames=Frames.of(time, flux, np.full(time.size, 1e-3), exposure_s=frame_s))
+    answer = analyse(Study().paper(), frames=noisy(rng, time, flux, 1e-3, exposure_s=frame_s))
     assert "detected" not in set(answer.events["verdict"])
     messages = [one for one in answer.messages if "no verdicts" in one and "mapping" in one]
     assert len(messages) == int(answer.analysis.in_events > 0.5)
@@ -227,13 +195,12 @@ def test_dips_at_random_are_no_flares() -> None:
 @pytest.mark.long
 def test_light_that_the_process_does_not_describe_has_no_verdicts() -> None:
     """Observe a sawtooth of six hours, as the pointing of K2 makes, in half-hour frames with two flares."""
-    rng, time = np.random.default_rng([504, 1]), np.arange(1500) * 1800.0
+    time = np.arange(1500) * 1800.0
     flux = 1 + 0.01 * np.sin(2 * np.pi * time / (7.3 * 86_400)) + 0.002 * (time / 21_600 % 1)
     since = np.arange(12)
     flux[500:512] += 0.1 * np.exp(-since / 2)
     flux[900:912] += 0.006 * np.minimum((1 + since) / 2, 1) * np.exp(-since / 4)
-    flux += 3e-4 * rng.standard_normal(time.size)
-    answer = analyse(Study().paper(), frames=Frames.of(time, flux, np.full(time.size, 3e-4), exposure_s=1800.0))
+    answer = analyse(Study().paper(), frames=noisy([504, 1], time, flux, 3e-4, exposure_s=1800.0))
     analysis = answer.analysis
     assert not analysis.likeness.alike
     assert set(answer.events["verdict"][answer.events["kind"] == "flare"]) == {"undecided"}
@@ -260,9 +227,7 @@ def test_sudden_flares_of_a_few_frames_that_decay_exponentially_have_their_energ
         left = [np.exp(-np.maximum(time + shift - peak, 0) / decay_s) for shift in (0, frame_s)]
         flux += amplitude * decay_s * (left[0] - left[1]) / frame_s
         flares.append((peak, amplitude * decay_s / (1.08 if peak_d > 26 else 1)))
-    flux += noise * rng.standard_normal(time.size)
-    frames = Frames.of(time, flux, np.full(time.size, noise), exposure_s=frame_s)
-    events = analyse(Study().paper(), frames=frames).events
+    events = analyse(Study().paper(), frames=noisy(rng, time, flux, noise, exposure_s=frame_s)).events
     for peak, duration in flares:
         near = np.abs(events["tpeak"].to_value("s") - peak) < 2 * frame_s
         assert near.any()
@@ -280,10 +245,9 @@ def test_visits_over_years_take_little_memory() -> None:
     light = np.ones(time.size)
     for start in starts:
         light += flare(time, frame_s, start + 400.0, 60.0)
-    light += 0.05 * rng.standard_normal(time.size)
     tracemalloc.start()
     try:
-        answer = analysed(Frames.of(time, light, np.full(time.size, 0.05), exposure_s=frame_s))
+        answer = analysed(noisy(rng, time, light, 0.05, exposure_s=frame_s))
         assert tracemalloc.get_traced_memory()[1] < 2**30
     finally:
         tracemalloc.stop()
@@ -291,3 +255,48 @@ def test_visits_over_years_take_little_memory() -> None:
     assert len(events) == 6
     for start, peak in zip(starts, events["tpeak"].to_value("s"), strict=True):
         assert abs(peak - start - 400.0) < 30
+
+
+DAY_S = 86_400.0
+#: Frames of half an hour for 41 days, the frames before which the level changes, and by how much.
+FRAME_S, N_FRAMES, NOISE = 1765.0, 2000, 4e-4
+STEPS = {600: -0.03, 1150: 0.012, 1600: 0.03}
+#: Peaks (d), half-widths (s) and amplitudes of flares with an S/N of 20 or more.
+BESIDE = ((3.7, 1500.0, 0.012), (14.4, 900.0, 0.02), (25.5, 1800.0, 0.03), (34.2, 2900.0, 0.02))
+
+
+@pytest.mark.parametrize("turns", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
+    """A constant star and one that turns: 1.4 false alarms are promised, seven or more occur once in 1600 cases."""
+    time, truth = np.arange(N_FRAMES) * FRAME_S, np.ones(N_FRAMES)
+    if turns:
+        angle, slow = 2 * np.pi * time / (1.158 * DAY_S), 2 * np.pi * time / (70 * DAY_S)
+        truth += 0.015 * np.sin(angle) + 0.006 * np.sin(2 * angle + 1) + 0.03 * np.sin(slow)
+    for first, size in STEPS.items():
+        truth[first:] += size
+    light = truth + sum(size * flare(time, FRAME_S, peak * DAY_S, half_width) for peak, half_width, size in BESIDE)
+    answer = analysed(noisy([507, int(turns)], time, light, NOISE), per="month")
+    assert any("The level changes 3 times suddenly" in message for message in answer.messages)
+    found = answer.events[answer.events["verdict"] == "detected"]
+    start, stop = (found[name].to_value("d") for name in ("tstart", "tstop"))
+    assert all(((start <= peak) & (peak <= stop)).any() for peak, *_ in BESIDE)
+    assert len(found) <= len(BESIDE) + 6
+    level = np.asarray(answer.frames["level"], float)
+    near = np.concatenate([[first - 1, first] for first in STEPS])
+    assert np.abs(level - truth)[near].max() < 6 * NOISE
+
+
+@pytest.mark.parametrize("what", ["long flare", "dip of half a day", "fast trend"])
+def test_changes_that_do_not_last_are_no_steps(what: str) -> None:
+    """Observe twenty days with a flare that takes a day to decay, a dip of half a day, or a change within two days."""
+    time = np.arange(1000) * FRAME_S
+    light = {
+        "long flare": 0.05 * flare(time, FRAME_S, 9 * DAY_S, 4 * 3600.0),
+        "dip of half a day": -0.02 * ((time > 8 * DAY_S) & (time < 8.5 * DAY_S)),
+        "fast trend": 0.03 / (1 + np.exp(-(time - 9 * DAY_S) / (0.5 * DAY_S))),
+    }[what]
+    answer = analysed(noisy(508, time, 1 + light, NOISE), per="month")
+    assert not any("for a day or more" in message for message in answer.messages)
+    assert (what == "long flare") == any(
+        str(row["verdict"]) == "detected" and row["value"] > 20 for row in answer.events
+    )

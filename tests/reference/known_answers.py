@@ -7,10 +7,8 @@ writes them into the package, where the self-test reads them.
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
@@ -26,7 +24,7 @@ from mauvecl.noise.scene import prepare
 FILE = Path(selftest.__file__).parent / "known_answers.npz"
 
 
-def results(name: str, count: int) -> dict[str, NDArray[Any]]:
+def results(name: str, count: int) -> dict[str, np.ndarray]:
     """Return what `selftest.results` gives on a device."""
     if name in selftest.STARE_CASES:
         return stare_results(name, count)
@@ -56,14 +54,14 @@ def results(name: str, count: int) -> dict[str, NDArray[Any]]:
     }
 
 
-def fast(values: NDArray[np.float32], plan: requests.ChannelPlan) -> NDArray[np.float32]:
+def fast(values: np.ndarray, plan: requests.ChannelPlan) -> np.ndarray:
     """Select the channels of the fast kernel, with zeros for statistics that it does not compute."""
     chosen = values[: plan.n_rows - len(plan.scales)].copy()
     chosen[[2, 5]] = 0.0
     return chosen
 
 
-def stare_results(name: str, count: int) -> dict[str, NDArray[np.float32]]:
+def stare_results(name: str, count: int) -> dict[str, np.ndarray]:
     """Return the results of a case of stares."""
     components, stare, given = selftest.stare_case(name, count)
     index, seed = np.arange(selftest.START, selftest.START + count, dtype=np.uint64), selftest.SEED
@@ -76,7 +74,7 @@ def stare_results(name: str, count: int) -> dict[str, NDArray[np.float32]]:
     return ours | {"noise of flares": stares.glow(stare_scene.StareScene.of(components, stare), index, frames, seed)}
 
 
-def every_result(count: int) -> dict[str, NDArray[Any]]:
+def every_result(count: int) -> dict[str, np.ndarray]:
     """Return all results by the names of case and part."""
     made = ((name, results(name, count)) for name in (*selftest.CASES, *selftest.STARE_CASES))
     return {f"{name}: {part}": array for name, parts in made for part, array in parts.items()}

@@ -2,21 +2,18 @@
 
 import itertools
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mauvecl.flares import stare_scene
 from mauvecl.noise import layout, reference
-
-Floats = NDArray[np.float32]
-Numbers = NDArray[np.uint64]
 
 Flares, StareScene, SumTable = stare_scene.Flares, stare_scene.StareScene, stare_scene.SumTable
 fma = reference.fma
 
 
-def exponential_less_one(x: Floats) -> Floats:
+def exponential_less_one(x: np.ndarray) -> np.ndarray:
     """Return exp(x) - 1 for |x| < 80."""
     whole = x * np.float32(layout.LOG2_E) + reference.MAGIC
     n = whole - reference.MAGIC
@@ -29,7 +26,7 @@ def exponential_less_one(x: Floats) -> Floats:
     return fma(scale, fma(r * r, q, r), scale - np.float32(1.0))
 
 
-def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: Floats) -> dict[str, Floats]:
+def strengths(scene: StareScene, numbers: np.ndarray, frame: int, seed: int, lost: np.ndarray) -> dict[str, np.ndarray]:
     """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
     if scene.stare_job["jittered"]:
@@ -53,7 +50,7 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: 
     }
 
 
-def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+def glow(scene: StareScene, numbers: np.ndarray, frames: Iterable[int], seed: int) -> np.ndarray:
     """Draw a normal per statistic, and the factor on light minus one, float32 (n_stare, n_frame, n_statistic + 1)."""
     out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
@@ -62,22 +59,22 @@ def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) 
     return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
 
 
-def _normals(scene: StareScene, numbers: Numbers, frame: int, stream: str, seed: int) -> list[Floats]:
+def _normals(scene: StareScene, numbers: np.ndarray, frame: int, stream: str, seed: int) -> list[np.ndarray]:
     """Draw a normal per statistic, rounded up to groups of four, shape (n_stare,) each."""
     groups = range(-(-len(scene.weights) // 4))
     words = [reference.words_at(numbers, int(scene.numbers[frame]), stream, group, seed) for group in groups]
     return [z for each in words for z in reference.four_normals(each)]
 
 
-def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
+def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: np.ndarray) -> list[np.ndarray]:
     """Return the coefficients of the flare spectra, shape (n_stare,) each."""
     given = flares.rows[:, :, frame] * (scene.known[-1, frame] * flares.amplitudes[scenario][:, None])
     return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
 
 
 def _conditions(
-    scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int
-) -> Iterator[tuple[int, dict[str, Floats], list[list[Floats]]]]:
+    scene: StareScene, flares: Flares, numbers: np.ndarray, frames: Iterable[int], seed: int
+) -> Iterator[tuple[int, dict[str, np.ndarray], list[list[np.ndarray]]]]:
     """Yield each frame with its coefficients of steady components, and of the flares of each scenario."""
     lost = scene.losses(numbers, seed)
     for frame in frames:
@@ -86,7 +83,7 @@ def _conditions(
         yield frame, steady, [_coefficients(scene, flares, frame, k, steady["light"]) for k in every]
 
 
-def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+def pixels(scene: StareScene, flares: Flares, numbers: np.ndarray, frames: Iterable[int], seed: int) -> np.ndarray:
     """Draw statistics by the method "pixels", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
     out = []
     for frame, steady, of_flares in _conditions(scene, flares, numbers, frames, seed):
@@ -104,7 +101,7 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
 
 
-def _counts(scene: StareScene, z: Floats, conditions: dict[str, Floats], flare: list[Floats]) -> Floats:
+def _counts(scene: StareScene, z: np.ndarray, conditions: dict[str, np.ndarray], flare: list[np.ndarray]) -> np.ndarray:
     """Return the counts of all pixels above their bases, before the ADC, shape (n_pixel, n_stare)."""
     m, one = scene.mixtures[:, None], np.float32(1.0)
     light, dark = fma(conditions["star"], m["star"], conditions["sky"] * m["sky"]), conditions["dark"]
@@ -129,7 +126,7 @@ def _counts(scene: StareScene, z: Floats, conditions: dict[str, Floats], flare: 
     return np.asarray(fma(even * each, each, v) + fma(dark, m["dark"], light))
 
 
-def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+def sums(scene: StareScene, flares: Flares, numbers: np.ndarray, frames: Iterable[int], seed: int) -> np.ndarray:
     """Draw statistics by the method "cumulants", float32 (n_scenario, n_stare, n_frame, n_statistic)."""
     table, out = SumTable.of(scene.components), []
     for frame, steady, of_flares in _conditions(scene, flares, numbers, frames, seed):
@@ -138,7 +135,7 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
 
 
-def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
+def _chain(terms: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     (a, b), *rest = terms
     total = np.asarray(a * b)
     for a, b in rest:
@@ -146,9 +143,7 @@ def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
     return total
 
 
-def _sums(
-    scene: StareScene, table: SumTable, z: list[Floats], conditions: dict[str, Floats], flare: list[Floats]
-) -> list[Floats]:
+def _sums(scene: StareScene, table: SumTable, z: Any, conditions: Any, flare: list[np.ndarray]) -> list[np.ndarray]:
     n = len(scene.weights)
     pairs = stare_scene.unique(n, 2)
     place = {key: i for i, key in enumerate(key for order in (1, 2, 3, 4) for key in stare_scene.unique(n, order))}
@@ -159,18 +154,18 @@ def _sums(
         *((f, 5 + j) for j, f in enumerate(flare)),
     ]
 
-    def cumulant(key: tuple[int, ...], light: bool = True) -> Floats:
+    def cumulant(key: tuple[int, ...], light: bool = True) -> np.ndarray:
         total = np.full_like(z[0], table.rows[0, place[key]])
         for strength, row in [(conditions["dark"], 3), *(lit if light else [])]:
             total = fma(strength, table.rows[row, place[key]], total)
         return total
 
-    def of(tensor: dict[tuple[int, ...], Floats], *key: int) -> Floats:
+    def of(tensor: dict[tuple[int, ...], np.ndarray], *key: int) -> np.ndarray:
         return tensor[tuple(sorted(key, reverse=True))]
 
     c = {key: cumulant(key) for key in pairs}
-    low: dict[tuple[int, int], Floats] = {}
-    m: dict[tuple[int, int], Floats] = {}
+    low: dict[tuple[int, int], np.ndarray] = {}
+    m: dict[tuple[int, int], np.ndarray] = {}
     for b in range(n):
         for a in range(b, n):
             left = c[a, b]
@@ -191,7 +186,7 @@ def _sums(
         for a, b in pairs
         for c in range(n)
     }
-    skew: dict[tuple[int, ...], Floats] = {
+    skew: dict[tuple[int, ...], np.ndarray] = {
         (a, b, c): _chain((m[c, i], second[a, b, i]) for i in range(c + 1)) for a, b, c in stare_scene.unique(n, 3)
     }
     x = []

@@ -1,30 +1,17 @@
 """NumPy reference of the kernels for statistics, S/N histograms and tallies, in the device's order of summation."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mauvecl.detection import chi2, snr
+from mauvecl.detection import chi2, requests, snr
 from mauvecl.noise import layout, reference
-
-if TYPE_CHECKING:
-    from mauvecl.detection import requests
-
-Floats = NDArray[np.float32]
 
 fma = reference.fma
 
 
-def statistics(
-    hypotheses: requests.Hypotheses, plan: requests.ChannelPlan, realisation: NDArray[np.uint64], seed: int
-) -> NDArray[np.float32]:
-    """Compute all channels of the kernels `statistics` and `comparison`, in their order.
-
-    The shape is (3 n_scenario + n_linear + n_smoothed, n_realisation). Rows of `chi2_pair` are zero if it is not asked.
-    """
+def statistics(hypotheses: requests.Hypotheses, plan: Any, realisation: np.ndarray, seed: int) -> np.ndarray:
+    """Compute all channels of the kernels in their order; rows of `chi2_pair` are zero if it is not asked."""
     scene: Any = hypotheses.scene
     pair, smoothed = "chi2_pair" in hypotheses.statistics, len(plan.scales) > 0
     rows = chi2.Paper().smoothing(hypotheses.setting).rows.astype(np.float32) if smoothed else np.zeros((0, 0))
@@ -40,13 +27,10 @@ def statistics(
         _above_reference(scene, reference.observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
         for number in range(drawn)
     ]
-    finished = []
-    begin = 0
+    finished, begin = [], 0
     for k in range(n_scenario):
-        t = int(scene.references[k])
-        raw, level = x[k], scene.levels[k]
-        y: Floats = raw
-        variance: Floats = np.zeros_like(raw)
+        t, raw, level = int(scene.references[k]), x[k], scene.levels[k]
+        y, variance = raw, np.zeros_like(raw)
         if exposures:
             total = np.sum([other[t] for other in others], axis=0, dtype=np.float32)
             y = fma(total, -added, raw)
@@ -56,7 +40,6 @@ def statistics(
             if exposures:
                 variance = np.add(variance, added * _variance(total * added, estimate), dtype=np.float32)
             y = np.add(y, estimate["fraction"][:, None], dtype=np.float32)
-        if estimated:
             squares = _summed(y * y, scene.pixels["used"][:, None] / variance)
         else:
             squares = _summed(y, fma(y, level["inverse_variance"][:, None], level["twice"][:, None]))
@@ -85,18 +68,16 @@ def statistics(
     return np.concatenate([out, np.array(finished, np.float32).reshape(len(finished), len(realisation))])
 
 
-def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
+def _variance(x: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     """Return the variances that an observer estimates from counts, shape (n_padded, n)."""
     gain, known, offset = (estimate[name][:, None] for name in ("gain", "variance", "net_offset"))
     return fma(np.maximum(x + offset, np.float32(0.0)), gain, known)
 
 
-def _element_sums(
-    scene: Any, k: int, y: Floats, variance: Floats, weights: NDArray[np.float32]
-) -> tuple[Floats, Floats]:
+def _element_sums(scene: Any, k: int, y: Any, variance: Any, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return `chi2_element` of a scenario, shape (n,), and weighted sums of its elements, shape (m, n)."""
-    total: Floats = np.zeros_like(y[0])
-    weighted: Floats = np.zeros((len(weights), total.size), np.float32)
+    total: np.ndarray = np.zeros_like(y[0])
+    weighted: np.ndarray = np.zeros((len(weights), total.size), np.float32)
     inside, noise = total, total
     estimated = scene.comparison.estimated
     for p, (pixel, edge) in enumerate(zip(scene.pixels, scene.edges[k], strict=True)):
@@ -116,7 +97,7 @@ def _element_sums(
     return total, weighted
 
 
-def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -> NDArray[np.float32]:
+def marginalise(values: np.ndarray, subtractions: np.ndarray) -> np.ndarray:
     """Subtract the squares of channels as the kernel `marginalise` does."""
     out = values.copy()
     for base, first, end in subtractions.T:
@@ -125,7 +106,7 @@ def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -
     return out
 
 
-def _smoothed_sums(rows: Floats, scales: NDArray[np.float32], difference: Floats) -> list[Floats]:
+def _smoothed_sums(rows: np.ndarray, scales: np.ndarray, difference: np.ndarray) -> list[np.ndarray]:
     """Return the smoothed statistics of a scenario, each of shape (n,); `rows` holds the weights of each centre."""
     out = [np.zeros(difference.shape[1], np.float32) for _ in scales]
     for centre, row in enumerate(rows):
@@ -137,33 +118,28 @@ def _smoothed_sums(rows: Floats, scales: NDArray[np.float32], difference: Floats
     return out
 
 
-def _above_reference(scene: Any, counts: NDArray[np.int64]) -> NDArray[np.float32]:
+def _above_reference(scene: Any, counts: np.ndarray) -> np.ndarray:
     above = counts.astype(np.float32)
     if scene.frames:
         return np.asarray(above + scene.edges["whole"][:, :, None])
     return np.asarray((above + reference.MAGIC) - scene.levels["shift"][:, :, None])
 
 
-def _summed(values: Floats, weights: Floats) -> Floats:
-    """Return weighted sums over pixels, shape (n,), from four partial sums by pixel index modulo four.
-
-    Weights have the shape (n_pixel,) or (n_pixel, n).
-    """
+def _summed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return sums over pixels, (n,), with weights (n_pixel,) or (n_pixel, n), from four partial sums."""
     parts = [np.zeros(values.shape[1], np.float32) for _ in range(4)]
     for p, weight in enumerate(weights):
         parts[p % 4] = fma(values[p], weight, parts[p % 4])
-    total: Floats = (parts[0] + parts[1]) + (parts[2] + parts[3])
+    total: np.ndarray = (parts[0] + parts[1]) + (parts[2] + parts[3])
     return total
 
 
-def histograms(
-    scene: Any, observers: NDArray[np.void], elements: NDArray[np.void], realisation: NDArray[np.uint64], seed: int
-) -> snr.Counts:
+def histograms(scene: Any, observers: Any, elements: np.ndarray, realisation: np.ndarray, seed: int) -> snr.Counts:
     """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
     counts = snr.Counts(scene.n_pixel, len(elements))
     n = reference.observed(scene, realisation, seed, scenarios=[0])[0]
 
-    def count(kind: str, which: int, numbers: NDArray[np.int64]) -> None:
+    def count(kind: str, which: int, numbers: np.ndarray) -> None:
         counts.bins[kind].count(which * 2**32 + 2**31 + numbers)
 
     for e, element in enumerate(elements):
@@ -178,18 +154,12 @@ def histograms(
     return counts
 
 
-def tally(
-    values: NDArray[np.float32], grids: NDArray[np.void]
-) -> tuple[NDArray[np.uint32], NDArray[np.int64], NDArray[np.uint32]]:
-    """Count values, shape (n_channel, n), on grids as the kernel `tally` does.
-
-    Return histograms, shape (n_grid, BINS), whose first and last bins include all values outside; sums of fine steps
-    and of their squares without those, shape (n_grid, 2); and numbers of values outside, shape (n_grid,).
-    """
+def tally(values: np.ndarray, grids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Count values, (n_channel, n), as the kernel `tally`: histograms, sums of steps and squares, numbers outside."""
+    # The first and last bins include all values outside, the sums none.
     bins = layout.BINS
     histogram = np.zeros((len(grids), bins), np.uint32)
-    sums = np.zeros((len(grids), 2), np.int64)
-    outside = np.zeros(len(grids), np.uint32)
+    sums, outside = np.zeros((len(grids), 2), np.int64), np.zeros(len(grids), np.uint32)
     end = np.float32(bins // 2 << layout.FINE_BITS)
     for g, grid in enumerate(grids):
         with np.errstate(over="ignore", invalid="ignore"):

@@ -26,6 +26,7 @@ from refusals import failed
 from scenes import flaring_stares, instrument, paper, star
 
 from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, bulk, measure
+from mauvecl.runs import cluster
 from mauvecl.runs import pool as pools
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
@@ -39,9 +40,7 @@ def workers() -> Iterator[DaskWorkers]:
     found.close()
 
 
-def test_two_processes_give_the_answers_of_one(
-    workers: DaskWorkers, engine: Engine, scene: list[Expectation], tmp_path: Path
-) -> None:
+def test_two_processes_give_the_answers_of_one(workers: Any, engine: Engine, scene: Any, tmp_path: Path) -> None:
     pool = Pool(workers)
     assert workers.count == 2
     same(detected(pool, scene), detected(engine, scene))
@@ -134,7 +133,7 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
     silent = Mock(cluster=None, status="running", **{"run.return_value": {}, "cancel.side_effect": TimeoutError})
     silent.nthreads.return_value = {"one": 1, "two": 1}
     silent.submit.side_effect = lambda *given, **how: Mock()
-    monkeypatch.setattr("mauvecl.runs.cluster._client", lambda where, distributed: nullcontext(silent))
+    monkeypatch.setattr(cluster, "_client", lambda where, distributed: nullcontext(silent))
     workers = DaskWorkers("silent")
     monkeypatch.setattr(DaskWorkers, "count", 2)
     pool = Pool(workers)
@@ -165,10 +164,7 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Path) -> None:
-    """Check the promised five seconds.
-
-    Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
-    """
+    """Check the promised five seconds; workers are not of the group, or what they build is cut off aloud by Ctrl-C."""
     flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01 --ideal"
     words = ["detect", "--star", "G2V", "--star", "K3V", "-m", "7.4,3.7", *flags.split()]
     command = [*SMALL_SHARDS, *words, "--output", "out"]
@@ -214,7 +210,6 @@ def dask(folder: Path, *words: str | Path) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextmanager
 def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """Start a scheduler and a worker; return the scheduler and its file."""
     file = folder / "scheduler.json"
     with dask(folder, "scheduler", "--port", "0", "--host", "127.0.0.1") as scheduler:
         while not file.exists() or not file.read_text().strip():
@@ -225,7 +220,6 @@ def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
 
 @pytest.fixture(scope="module")
 def scheduler_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Start a scheduler and a worker for all tests that end neither."""
     with by_hand(tmp_path_factory.mktemp("started")) as (_, file):
         yield file
 
@@ -269,12 +263,10 @@ def test_shards_of_workers_with_other_code_are_drawn_again(
     same(found, detected(engine, scene, n))
 
 
-def test_cluster_of_workers_with_other_code_raises(
-    scheduler_file: str, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cluster_of_workers_with_other_code_raises(scheduler_file: str, scene: Any, monkeypatch: Any) -> None:
     """Replace the only worker by one with other code."""
     workers = DaskWorkers(scheduler_file)
-    monkeypatch.setattr("mauvecl.runs.cluster.code_identity", lambda: ("1.0.0", "another"))
+    monkeypatch.setattr(cluster, "code_identity", lambda: ("1.0.0", "another"))
     with pytest.raises(RuntimeError, match="workers with other code"):
         detected(Pool(workers), scene)
     workers.close()
@@ -284,7 +276,7 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
     tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Restrict shards to a worker that ends and is replaced under another address."""
-    monkeypatch.setattr("mauvecl.runs.cluster.RECOUNT_S", 0.5)
+    monkeypatch.setattr(cluster, "RECOUNT_S", 0.5)
     with by_hand(tmp_path) as (_, file):
         workers = DaskWorkers(file)
         workers._strangers.add("tcp://127.0.0.1:1")
@@ -316,9 +308,7 @@ class Leaves:
 
 
 @pytest.mark.parametrize("who", ["worker", "scheduler"])
-def test_end_during_a_transfer_is_noticed(
-    who: str, scheduler_file: str, engine: Engine, scene: list[Expectation]
-) -> None:
+def test_end_during_a_transfer_is_noticed(who: str, scheduler_file: str, engine: Engine, scene: Any) -> None:
     """Send a shard again whose worker leaves with its result, and report a scheduler that is lost."""
     workers, lost = DaskWorkers(scheduler_file), Leaves(who)
     submit, pool = workers._client.submit, Pool(workers)

@@ -13,6 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ import mauvecl
 from mauvecl import Comparison, DaskWorkers, Detection, Engine, Expectation, Linear, LocalWorkers, Pool, Stare, Stares
 from mauvecl.detection import requests
 from mauvecl.runs import checkpoint as shards
+from mauvecl.runs import cluster
 from mauvecl.runs import pool as pools
 
 pytestmark = pytest.mark.usefixtures("small_shards")
@@ -151,7 +153,6 @@ class Failing:
 
 
 def working(make: Callable[[], Any]) -> Pool:
-    """Return a pool of one engine, which is made anew after each failure."""
     return Pool(LocalWorkers([None], make=lambda device, progress: make()))
 
 
@@ -203,8 +204,6 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
 
 
 AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
-
-
 #: Tables: verb, attribute of its answer, sections of the study.
 TABLES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "detect": ("detect", "table", {}), "limit": ("limit", "table", {}), "map": ("map", "table", {"map": AXES}),
@@ -234,29 +233,21 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
 
     base, stares = asked(), flaring_stares()
     unlit, how = replace(stares, flare=None, amplitudes=None), {"jitters": {"light": 0.01}}
-    others = [
-        asked(seed=6),
-        asked(statistics=("chi2",)),
-        *(asked(statistics=("chi2", one)) for one in own),
-        asked(flares[::-1]),
-        asked([flares[0], brighter]),
-        asked(comparison=Comparison.of("exposure")),
-        asked(processes=mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.01))),
-        asked(mode="frames"),
-        *(asked(nuisances={"dark": sd}) for sd in (0.1, 0.2)),
-        stares,
-        replace(stares, seed=6),
-        replace(stares, method="pixels"),
-        replace(stares, stare=Stare.of(30.0, **how, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21, 22))),
-        replace(stares, stare=Stare.of(30.0, **how, offsets={"star": 0.1}, temperature_c=21.0)),
-        replace(stares, components=replace(stares.components, weights=2 * stares.components.weights)),
-        replace(stares, flare=np.nextafter(stares.flare, 9)),
-        replace(stares, amplitudes=stares.amplitudes[:1]),
-        *(replace(stares, reduction=one) for one in (Largest(), Above(1.0), Above(2.0))),
-        # Rows belong to stares: from another first one on they mean something else.
-        replace(stares, start=stares.start + 64),
-        unlit,
-    ]
+    asks: list[dict[str, Any]] = [
+        {"seed": 6}, {"mode": "frames"}, {"flares": flares[::-1]}, {"flares": [flares[0], brighter]},
+        {"statistics": ("chi2",)}, *({"statistics": ("chi2", one)} for one in own),
+        {"comparison": Comparison.of("exposure")}, *({"nuisances": {"dark": sd}} for sd in (0.1, 0.2)),
+        {"processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.01))},
+    ]  # fmt: skip
+    # Rows belong to stares: from another first one on they mean something else.
+    changes: list[dict[str, Any]] = [
+        {}, {"seed": 6}, {"method": "pixels"}, {"flare": np.nextafter(stares.flare, 9)}, {"start": stares.start + 64},
+        {"stare": Stare.of(30.0, **how, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21, 22))},
+        {"stare": Stare.of(30.0, **how, offsets={"star": 0.1}, temperature_c=21.0)},
+        {"components": replace(stares.components, weights=2 * stares.components.weights)},
+        {"amplitudes": stares.amplitudes[:1]}, *({"reduction": one} for one in (Largest(), Above(1.0), Above(2.0))),
+    ]  # fmt: skip
+    others = [*(asked(**one) for one in asks), *(replace(stares, **one) for one in changes), unlit]
     names = [shards.fingerprint(one) for one in (base, *others)]
     assert len(set(names)) == len(names)
     reported = replace(quiet, provenance={"from": "elsewhere"}, messages=())
@@ -269,9 +260,7 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
         assert shards.fingerprint(base) != names[0], "shards of an older form are not read"
 
 
-def test_shards_depend_on_the_number_of_realisations_in_the_last_and_largest_only(
-    scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shards_depend_on_the_number_of_realisations_in_the_last_and_largest_only(scene: Any, monkeypatch: Any) -> None:
     """A longer run finds the shards of a shorter one; huge ones have as many as one process can add up."""
 
     def cut(n: int) -> list[shards.Shard]:
@@ -287,14 +276,6 @@ def test_shards_depend_on_the_number_of_realisations_in_the_last_and_largest_onl
         assert len(cut(n)) <= 2 * shards.MAX_SHARDS + 1
 
 
-def interrupting(after: int) -> Callable[[int, int], None]:
-    def progress(done: int, total: int) -> None:
-        if done >= after:
-            raise KeyboardInterrupt
-
-    return progress
-
-
 def at_work(folder: Path, engine: Engine, progress: Any = None, study: mauvecl.Study | None = None, **how: Any) -> Any:
     """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
     with shards.Checkpoint(folder, "detect", study or small(), **{"patience_s": 0.0} | how) as checkpoint:
@@ -308,15 +289,19 @@ SCENE = star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
 
 @pytest.fixture(scope="module")
 def whole(engine: Engine) -> Detection:
-    """Return the answer of a run that nothing interrupts."""
     return detected(engine, SCENE)
 
 
 @pytest.fixture
 def begun(tmp_path: Path, engine: Engine) -> Path:
     """Return the folder of a run that was interrupted after 20 000 realisations."""
+
+    def progress(done: int, total: int) -> None:
+        if done >= 20_000:
+            raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(20_000))
+        at_work(tmp_path, engine, progress)
     return tmp_path
 
 
@@ -348,8 +333,7 @@ def test_interrupted_run_is_resumed_whatever_happens_to_its_files(
     text = manifest(begun).read_text()
     work, shard, in_manifest = DAMAGES[damage]
     work(begun)
-    reported: list[tuple[int, int]] = []
-    found, pool, checkpoint = at_work(begun, engine, lambda *standing: reported.append(standing), resume=True)
+    found, pool, checkpoint = at_work(begun, engine, progress := Mock(), resume=True)
     same(found, whole)
     assert checkpoint.damaged == int(shard)
     about = [said for said in checkpoint.messages if "manifest" in said]
@@ -357,8 +341,8 @@ def test_interrupted_run_is_resumed_whatever_happens_to_its_files(
     assert 16_000 - 4096 * shard < pool.standing.resumed < N
     assert manifest(begun).read_text() == text
     # Progress includes what was resumed.
-    assert (reported[0], reported[-1]) == ((0, N), (N, N))
-    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
+    reported = [one.args for one in progress.call_args_list]
+    assert (reported[0], reported[-1], reported) == ((0, N), (N, N), sorted(reported))
     assert (pool.standing.shards, pool.standing.of, pool.standing.retries) == (8, 8, 0)
     checkpoint.forget()
     assert list(begun.iterdir()) == []
@@ -418,8 +402,7 @@ def test_background_work_begins_once_after_the_devices() -> None:
     assert begun == []
     for _ in range(2):
         detected(pool, SCENE)
-    (of,) = begun
-    assert of > 0
+    assert [of > 0 for of in begun] == [True]
 
 
 def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> None:
@@ -435,6 +418,17 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
 
     assert list(pools.map_in_order(pool, slow, range(6))) == list(range(6))
 
+    begun: list[int] = []
+    answers = pools.map_in_order(pool, begun.append, range(100))
+    for _ in range(5):
+        next(answers)
+    time.sleep(0.05)
+    before = len(begun)
+    assert before < 20, "few are ahead of their use"
+    answers.close()
+    time.sleep(0.05)
+    assert len(begun) == before, "and none after it"
+
     def bad(number: int) -> int:
         if number == 2:
             raise mauvecl.InputError.of("number", 2, "another")
@@ -446,28 +440,11 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
         detected(pool, SCENE)
 
 
-def test_few_answers_are_ahead_of_their_use_and_none_after_it(engine: Engine) -> None:
-    begun: list[int] = []
-    answers = pools.map_in_order(Pool(Shuffled(engine, 1)), begun.append, range(100))
-    for _ in range(5):
-        next(answers)
-    time.sleep(0.05)
-    before = len(begun)
-    assert before < 20
-    answers.close()
-    time.sleep(0.05)
-    assert len(begun) == before
-
-
 def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None:
     """Check that work ahead of a verb's progress is stopped before its workers are closed."""
     pool = Pool(Shuffled(engine, 1))
-
-    def progress(done: int, total: int) -> None:
-        raise ArithmeticError
-
     with pytest.raises(ArithmeticError):
-        mauvecl.map(small(map=AXES), pool, progress)
+        mauvecl.map(small(map=AXES), pool, Mock(side_effect=ArithmeticError))
     with pytest.raises(pools.Stopped):
         detected(pool, SCENE)
 
@@ -481,7 +458,6 @@ def test_missing_package_raises(package: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_absent_scheduler_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mauvecl.runs.cluster.PATIENCE_S", 1.0)
-    with pytest.raises(RuntimeError) as error:
+    monkeypatch.setattr(cluster, "PATIENCE_S", 1.0)
+    with pytest.raises(RuntimeError, match=r"tcp://127\.0\.0\.1:1"):
         DaskWorkers("tcp://127.0.0.1:1")
-    assert "tcp://127.0.0.1:1" in str(error.value)

@@ -12,21 +12,19 @@ from refusals import refused
 from stores import CHUNK, PAINTER, flip, killed_at, locked, study, tree
 
 from mauvecl import bulk
-from mauvecl.runs.store import Store
+from mauvecl.runs import store as stored
 
 
 @pytest.fixture
 def made(tmp_path: Path) -> Path:
-    path = tmp_path / "frames.zarr"
-    bulk.realise(study(), path, PAINTER)
-    return path
+    bulk.realise(study(), tmp_path / "frames.zarr", PAINTER)
+    return tmp_path / "frames.zarr"
 
 
 @pytest.fixture
 def other(tmp_path: Path) -> Path:
-    path = tmp_path / "other.zarr"
-    bulk.realise(study(run={"seed": 31}), path, PAINTER)
-    return path
+    bulk.realise(study(run={"seed": 31}), tmp_path / "other.zarr", PAINTER)
+    return tmp_path / "other.zarr"
 
 
 def relabelled(place: Path, change: Callable[[str], str]) -> None:
@@ -118,28 +116,25 @@ def test_foreign_files_are_not_removed(made: Path, place: str, kind: str) -> Non
     assert (elsewhere / "keep").read_text() == "me"
 
 
-def test_restart_draws_the_new_study(made: Path, tmp_path: Path) -> None:
-    other = study(run={"seed": 3})
-    bulk.realise(other, made, PAINTER, restart=True)
-    bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
-    assert tree(made) == tree(tmp_path / "fresh.zarr")
+def test_restart_draws_the_new_study(made: Path, other: Path) -> None:
+    bulk.realise(study(run={"seed": 31}), made, PAINTER, restart=True)
+    assert tree(made) == tree(other)
     bulk.forget(made)
     assert not made.exists()
 
 
 @pytest.mark.long
-def test_kill_during_removal_is_recovered(made: Path, tmp_path: Path) -> None:
+def test_kill_during_removal_is_recovered(made: Path, other: Path, tmp_path: Path) -> None:
     """Kill at any file; the rest is a store, and a second restart completes."""
-    other = study(run={"seed": 3})
-    bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
     for step in (0, 3, 9, 14):
         path = tmp_path / f"{step}.zarr"
         shutil.copytree(made, path)
-        assert killed_at(step, partial(bulk.realise, other, path, PAINTER, restart=True), (Path, "unlink"))
+        again = partial(bulk.realise, study(run={"seed": 31}), path, PAINTER)
+        assert killed_at(step, partial(again, restart=True), (Path, "unlink"))
         with refused("store", "run.seed"):
-            bulk.realise(other, path, PAINTER)
-        bulk.realise(other, path, PAINTER, restart=True)
-        assert tree(path) == tree(tmp_path / "fresh.zarr")
+            again()
+        again(restart=True)
+        assert tree(path) == tree(other)
 
 
 def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,7 +143,7 @@ def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.M
     with refused("run.realisations"):
         bulk.realise(asked, path, PAINTER)
     # Written by hand, as an attacker would.
-    vast = Store(path, asked)
+    vast = stored.Store(path, asked)
     for name, content in vast.description().items():
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(content)

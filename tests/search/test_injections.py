@@ -76,15 +76,11 @@ def test_false_alarms_stay_as_promised_with_pointing_drifts(stares: Stares, star
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("frames", "search"),
-    [
-        ({"cycles": {"temperature": 9e-4}}, {"window_s": 12_000.0, "cycle": False}),
-        ({"drifts": {"temperature": 9e-4}}, {"window_s": 12_000.0, "slope": False}),
-        ({"drifts": {"star": 0.07}, "offsets": {"temperature": 4.0}, "jitters": {"light": 0.01}}, {"window_s": 1200.0}),
-    ],
-    ids=["cycle", "slope", "star"],
-)
+@pytest.mark.parametrize(("frames", "search"), [
+    ({"cycles": {"temperature": 9e-4}}, {"window_s": 12_000.0, "cycle": False}),
+    ({"drifts": {"temperature": 9e-4}}, {"window_s": 12_000.0, "slope": False}),
+    ({"drifts": {"star": 0.07}, "offsets": {"temperature": 4.0}, "jitters": {"light": 0.01}}, {"window_s": 1200.0}),
+], ids=["cycle", "slope", "star"])  # fmt: skip
 def test_thresholds_allow_for_what_the_search_does_not_remove(stares: Stares, frames: Any, search: Any) -> None:
     """Unmodelled cycles and drifts: alarms within a factor of 1.5 and 4 standard errors; fails once in 10^4 runs."""
     how: dict[str, Any] = {"seed": 27, "nulls": 100, "star": [{"library": "K2.5V", "magnitude": 5.0}]}
@@ -97,9 +93,7 @@ def test_thresholds_allow_for_what_the_search_does_not_remove(stares: Stares, fr
 
 @pytest.mark.parametrize(("star", "magnitude"), [("G2V", 7.4), ("M3V", 9.0)])
 @pytest.mark.parametrize("frame", [{}, {"light": 0.01, "dark": 0.02}, {"dark": "free", "light": "free"}])
-def test_few_sums_of_a_frame_lose_little_signal(
-    stares: Stares, star: str, magnitude: float, frame: dict[str, Any]
-) -> None:
+def test_few_sums_of_a_frame_lose_little_signal(stares: Stares, star: str, magnitude: float, frame: Any) -> None:
     """Three weighted sums keep 99.4 % of the S/N of flares of any temperature; one of them is far from it."""
     how: dict[str, Any] = {"star": [{"library": star, "magnitude": magnitude}], "stare": {"duration_s": 600.0}}
     three, one = (
