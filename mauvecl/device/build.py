@@ -159,32 +159,38 @@ def load_opencl() -> Any:
     return pyopencl
 
 
-def _devices() -> list[Any]:
+def _found() -> list[tuple[Any, DeviceRecord]]:
+    """Return all OpenCL devices and their records, the default one first."""
     cl = load_opencl()
-    try:
-        with show_intel_runtime():
-            platforms = cl.get_platforms()
-    except cl.Error:
-        platforms = []
-    handles = []
-    for platform in platforms:
-        try:
-            handles += platform.get_devices()
-        except cl.Error:
-            continue
+    handles, kind = list[Any](), cl.device_type
+    with contextlib.suppress(cl.Error), show_intel_runtime():
+        platforms = cl.get_platforms()
+        for platform in platforms:
+            with contextlib.suppress(cl.Error):
+                handles += platform.get_devices()
     if not handles:
         # If a variable names a folder, loaders search only that.
         folders = ", ".join(f"{name}={os.environ[name]}" for name in FOLDER_VARIABLES if os.environ.get(name))
         searched = f" ({folders})" if folders else ""
         raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}", "no device")
-    # PoCL on the CPU comes first, because the first device is the default.
-    return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
-
-
-def _kind(device: Any) -> str:
-    cl = load_opencl()
-    kinds = {"cpu": cl.device_type.CPU, "gpu": cl.device_type.GPU, "accelerator": cl.device_type.ACCELERATOR}
-    return next((name for name, bit in kinds.items() if device.type & bit), "other")
+    # PoCL on the CPU is the default.
+    handles.sort(key=lambda device: (device.platform.name != POCL, not device.type & kind.CPU))
+    kinds = {"cpu": kind.CPU, "gpu": kind.GPU, "accelerator": kind.ACCELERATOR}
+    found = []
+    for device in handles:
+        lacking = weaknesses(device)
+        record = DeviceRecord(
+            platform=device.platform.name.strip(),
+            name=device.name.strip(),
+            driver=device.driver_version.strip(),
+            kind=next((name for name, bit in kinds.items() if device.type & bit), "other"),
+            compute_units=int(device.max_compute_units),
+            global_memory=int(device.global_mem_size),
+            default=not found,
+            promise=f"same draws to float rounding: no {', no '.join(lacking)}" if lacking else SAME_BITS,
+        )
+        found.append((device, record))
+    return found
 
 
 def weaknesses(device: Any) -> list[str]:
@@ -201,21 +207,7 @@ def weaknesses(device: Any) -> list[str]:
 
 def devices() -> list[DeviceRecord]:
     """List all OpenCL devices, the default one first. Raises DeviceError if there is none, or no linker."""
-    return [
-        DeviceRecord(
-            platform=device.platform.name.strip(),
-            name=device.name.strip(),
-            driver=device.driver_version.strip(),
-            kind=_kind(device),
-            compute_units=int(device.max_compute_units),
-            global_memory=int(device.global_mem_size),
-            default=index == 0,
-            promise=f"same draws to float rounding: no {', no '.join(lacking)}"
-            if (lacking := weaknesses(device))
-            else SAME_BITS,
-        )
-        for index, device in enumerate(_devices())
-    ]
+    return [record for _, record in _found()]
 
 
 def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
@@ -223,13 +215,11 @@ def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
 
     Raises DeviceError, with a list of all devices, if none matches.
     """
-    handles, records = _devices(), devices()
-    if wanted is None:
-        return handles[0], records[0]
-    for index, record in enumerate(records):
-        if wanted == str(index) or wanted.casefold() in record.label.casefold():
-            return handles[index], record
-    present = "; ".join(f"{index} = {record.label}" for index, record in enumerate(records))
+    found = _found()
+    for index, (handle, record) in enumerate(found):
+        if wanted is None or wanted == str(index) or wanted.casefold() in record.label.casefold():
+            return handle, record
+    present = "; ".join(f"{index} = {record.label}" for index, (_, record) in enumerate(found))
     raise DeviceError(f"device {wanted!r} is not here; use one of: {present}", "unknown device")
 
 
@@ -299,13 +289,8 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     cache = kernel_cache()
     # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
     # store, and the installation, since PoCL compiles a program of another installation again at every start.
-    target = (
-        device.name,
-        device.version,
-        device.driver_version,
-        str(choose_processor_level(device, _devices)),
-        sys.prefix,
-    )
+    level = str(choose_processor_level(device, lambda: [handle for handle, _ in _found()]))
+    target = (device.name, device.version, device.driver_version, level, sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = cache.restore(key)
     try:

@@ -221,21 +221,26 @@ class Engine:
         """
         request = SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
         sums = SnrSums(request)
-        sums.add(0, pack_snr(self._snr(request, Shard(0, request.start, request.realisations))))
+        sums.add(0, self.count(request, Shard(0, request.start, request.realisations)))
         return sums.answer()
 
     def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
         """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
+        self.open_device.check_process()
         match request:
             case DetectRequest():
                 return pack_detection(*self._detection(request, shard))
             case SnrRequest():
-                return pack_snr(self._snr(request, shard))
+                scene, observed = request.scene, elements(request.expectation)
+                counts = Counts(scene.n_pixel, len(observed))
+                with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
+                    launches.observe(observers(request.expectation, scene), observed)
+                    self._tiles.for_each(shard.start, shard.count, 0, lambda tile, _: launches.histogram(tile, counts))
+                    launches.flush_counts(counts)
+                return pack_snr(counts)
             case RealiseRequest():
-                x, seed = request.expectation, request.seed
-                how = request.drawing.options
-                rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
-                return {"rows": rows}
+                how: Any = {"start": shard.start, "count": shard.count, "seed": request.seed, "out": out}
+                return {"rows": self.realise(request.expectation, **how, **request.drawing.options)}
         # Exposures do not need the modules of stares.
         from mauvecl.device.stares import Stares
         from mauvecl.flares.stare_scene import StaresRequest
@@ -243,16 +248,6 @@ class Engine:
         if isinstance(request, StaresRequest):
             return Stares(self.open_device, tiles=self._tiles).reduced(request, shard)
         raise TypeError(f"a request is needed, not {type(request).__name__}")
-
-    def _snr(self, request: SnrRequest, shard: Shard) -> Counts:
-        self.open_device.check_process()
-        scene, observed = request.scene, elements(request.expectation)
-        counts = Counts(scene.n_pixel, len(observed))
-        with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
-            launches.observe(observers(request.expectation, scene), observed)
-            self._tiles.for_each(shard.start, shard.count, 0, lambda tile, done: launches.histogram(tile, counts))
-            launches.flush_counts(counts)
-        return counts
 
     def detect(
         self,

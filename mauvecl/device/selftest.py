@@ -149,15 +149,25 @@ def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
 
 
 def child(request: dict[str, Any]) -> None:
-    """Build and run kernels within the limits; print the reason of a failure and exit with code 1."""
+    """Draw a small scene within the limits; print the reason of a failure and exit with code 1."""
     limit(request)
+    name, number = request["name"], str(request["number"])
     try:
-        why = _build(request)
+        handle, record = choose_device(number)
+        if record.label != request["label"]:
+            raise DeviceError(f"device {number} is {record.label} in a new process, not {request['label']}")
+        if name is not None and not drivers.set_processor_name(handle, name):
+            raise DeviceError("PoCL's record of the device is not understood")
+        drivers.settled[int(handle.int_ptr)] = name
+        engine, quiet, flare = Engine(number), toy(), toy(flare=0.3)
+        raw = engine.realise(quiet, count=64, seed=1)
+        engine.detect(quiet, [flare], realisations=64, seed=1)
+        same = np.array_equal(raw, reference.realise(prepare([quiet]), np.arange(64, dtype=np.uint64), 1))
+        if not same and record.promise == SAME_BITS:
+            raise DeviceError("draws other counts than NumPy")
     except Exception as error:
-        why = str(error).splitlines()[0] if str(error) else type(error).__name__
-    if why:
-        print(why)
-    sys.exit(1 if why else 0)
+        print(str(error).splitlines()[0] if str(error) else type(error).__name__)
+        sys.exit(1)
 
 
 def limit(request: dict[str, Any]) -> None:
@@ -179,22 +189,6 @@ def _lower(what: int, soft: int, hard: int) -> None:
     # macOS defines some limits without enforcing them.
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(what, (min(soft, most), most))
-
-
-def _build(request: dict[str, Any]) -> str:
-    """Draw a small scene and return a message if its counts are wrong, or an empty string."""
-    handle, record = choose_device(str(request["number"]))
-    if record.label != request["label"]:
-        raise DeviceError(f"device {request['number']} is {record.label} in a new process, not {request['label']}")
-    name = request["name"]
-    if name is not None and not drivers.set_processor_name(handle, name):
-        return "PoCL's record of the device is not understood"
-    drivers.settled[int(handle.int_ptr)] = name
-    engine, quiet, flare = Engine(str(request["number"])), toy(), toy(flare=0.3)
-    raw = engine.realise(quiet, count=64, seed=1)
-    engine.detect(quiet, [flare], realisations=64, seed=1)
-    same = np.array_equal(raw, reference.realise(prepare([quiet]), np.arange(64, dtype=np.uint64), 1))
-    return "" if same or record.promise != SAME_BITS else "draws other counts than NumPy"
 
 
 #: Small stares that run every branch: options of `toy`, unknowns of the stare, number of sums.
