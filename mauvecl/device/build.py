@@ -332,7 +332,7 @@ class Device:
         self._vector_forms = self.width == 16 and self.record.platform == POCL
         self._programs: dict[str, Any] = {}
         self._kernels: dict[tuple[str, str], Any] = {}
-        self._pid = os.getpid()
+        self.pid = os.getpid()
 
     @property
     def variant(self) -> Variant:
@@ -352,8 +352,3 @@ class Device:
         if (source, name) not in self._kernels:
             self._kernels[source, name] = self.cl.Kernel(self._programs[source], name)
         return self._kernels[source, name]
-
-    def check_process(self) -> None:
-        """Raise DeviceError after a fork, which PoCL's threads do not survive: its next call would wait forever."""
-        if os.getpid() != self._pid:
-            raise DeviceError("this Engine was made before a fork; make one in this process (use spawn)")

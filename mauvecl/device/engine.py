@@ -170,7 +170,6 @@ class Engine:
         clipped : ndarray of uint32, shape (count,)
             Number of samples (pixels times frames) clipped at zero or saturation.
         """
-        self.open_device.check_process()
         check_last(start, count)
         scene = prepare([expectation], **drawing)
         narrow = scene.n_frames == 1 and expectation.adc_max_dn < 2**16
@@ -226,7 +225,6 @@ class Engine:
 
     def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
         """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
-        self.open_device.check_process()
         match request:
             case DetectRequest():
                 return pack_detection(*self._detection(request, shard))
@@ -301,7 +299,6 @@ class Engine:
     def _detection(
         self, request: DetectRequest, shard: Shard, *, before: int = 0, total: int | None = None
     ) -> tuple[Tally, list[TailSamples | None]]:
-        self.open_device.check_process()
         plan, scene = request.plans[shard.part]
         tally, samples = Tally(plan.grids), plan.tails()
         with detection_launches(self.open_device, scene, request.seed, plan, request.hypotheses) as launches:
@@ -346,7 +343,6 @@ class Engine:
             of each scenario: ``matched`` (the null's for each flare's template) and the others in the requested order,
             including the sums that a marginalised chi2 subtracts. Finally ``paper``, in the order of ``matched``.
         """
-        self.open_device.check_process()
         how = (start, Drawing(**drawing), comparison, "counted", nuisances)
         # The request validates the arguments and turns a single flare into a sequence.
         request = DetectRequest(quiet, flares, count, seed, statistics, *how)  # type: ignore[arg-type]
@@ -361,7 +357,8 @@ class Engine:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
-                out[:, done : done + tile.wanted] = launches.values(tile)
+                for number, row in enumerate(out):
+                    row[done : done + tile.wanted] = launches.channel(tile, number)
 
             self._tiles.for_each(start, count, 4 * plan.n_rows, work)
         return out

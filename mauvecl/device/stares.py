@@ -125,22 +125,12 @@ class Stares:
         Returns
         -------
         ndarray of float32, shape (count, n_frame, n_statistic)
-            Weighted sums over pixels of raw counts minus the quiescent mean; frames of a statistic are contiguous in
-            memory. With `amplitudes`, the shape is (n_scenario, count, n_frame, n_statistic).
+            Weighted sums over pixels of raw counts minus the quiescent mean. With `amplitudes`, the shape is
+            (n_scenario, count, n_frame, n_statistic).
         """
-        _check_last(first, count)
-        flares = Flares.of(components, stare, flare, amplitudes, count)
-        shape = (len(flares.amplitudes), count, components.n_statistics, padded_frames(stare.n_frames))
-        out = np.empty(shape, np.float32)
-        with self._launches(components, stare, flares, seed, method, processes) as launches:
-
-            def work(tile: Tile, done: int) -> None:
-                launches.upload_flares(flares.part(done, tile.wanted), first + done, tile.wanted)
-                launches.draw(tile, out, done)
-
-            self._tiles.for_each(first, count, out[:, 0].nbytes, work)
-        frames = np.moveaxis(out[..., : stare.n_frames], 2, 3)
-        return frames[0] if amplitudes is None else frames
+        request = StaresRequest(components, stare, count, seed, flare, amplitudes, first, method, processes)
+        values: Floats = self.reduced(request)["values"]
+        return values if amplitudes is None else np.moveaxis(values, 0, 1)
 
     def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
         """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
@@ -148,9 +138,9 @@ class Stares:
         Return the joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
         """
         there = shard or Shard(0, request.start, request.realisations)
-        _check_last(there.start, there.count)
+        if there.start + there.count > 2**64:
+            raise InputError.of("first", there.start, f"at most {2**64 - there.count} for {there.count} stares")
         components, stare, reduction = request.components, request.stare, request.reduction or KeepStatistics()
-        how = (request.seed, request.method, request.processes)
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()
         shape = (components.n_statistics, padded_frames(stare.n_frames))
@@ -160,7 +150,7 @@ class Stares:
         piece = max(step, REDUCED_BYTES // each // step * step)
         room = np.empty(each * piece // 4, np.float32)
         glow = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
-        with self._launches(components, stare, request.flares, *how) as launches:
+        with StareLaunches(self.open_device, request) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 reduced = []
@@ -168,7 +158,7 @@ class Stares:
                     out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
                     first = few.first + few.start
                     launches.upload_flares(request.flares.part(first - request.start, few.wanted), first, few.wanted)
-                    launches.draw(few, out, 0)
+                    launches.draw(few, out)
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
                     more = []
                     if request.glow:
@@ -182,39 +172,23 @@ class Stares:
         arrays = joined(parts, adds=reduction.adds)
         return arrays | {"start": np.array(there.start)} if shard else arrays
 
-    def _launches(
-        self, components: Components, stare: Stare, flares: Flares, seed: int, method: Method, processes: Processes
-    ) -> StareLaunches:
-        self.open_device.check_process()
-        scene = _scene_of(components, stare, processes)
-        scene.check(flares)
-        if method == "cumulants":
-            check_sums(scene, flares)
-        return StareLaunches(self.open_device, scene, seed, method)
-
-
-#: Cached because callers draw a few stares of the same star at a time.
-_scene_of = lru_cache(maxsize=4)(StareScene.of)
-
-
-def _check_last(first: int, count: int) -> None:
-    """Raise InputError if the last stare has no number of 64 bits."""
-    if first + count > 2**64:
-        raise InputError.of("first", first, f"at most {2**64 - count} for {count} stares")
-
 
 #: Frames per work-item of the kernels whose lanes are frames.
 FRAMES_EACH = 1024
-#: Cached because callers draw a few stares at a time with the same weights.
-table_of = lru_cache(maxsize=4)(SumTable.of)
+#: Cached because callers draw a few stares of the same star, with the same weights, at a time.
+_scene_of, _table_of = lru_cache(maxsize=4)(StareScene.of), lru_cache(maxsize=4)(SumTable.of)
 
 
 class StareLaunches(Launches):
     """Buffers and launches of a stare; the buffers are released at the end of the `with` block."""
 
-    def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
-        self._by_sums = method == "cumulants"
-        table = table_of(stare.components) if self._by_sums else None
+    def __init__(self, device: Device, request: StaresRequest) -> None:
+        stare = _scene_of(request.components, request.stare, request.processes)
+        stare.check(request.flares)
+        self._by_sums = request.method == "cumulants"
+        if self._by_sums:
+            check_sums(stare, request.flares)
+        table = _table_of(stare.components) if self._by_sums else None
         scene = stare.scene
         variant = replace(
             device.variant,
@@ -230,8 +204,8 @@ class StareLaunches(Launches):
             jittered=any(stare.stare.jitters.values()),
             in_time=self._by_sums,
         )
-        super().__init__(device, scene, variant, seed)
-        self._seed = seed
+        super().__init__(device, scene, variant, request.seed)
+        self._seed = request.seed
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
@@ -260,16 +234,12 @@ class StareLaunches(Launches):
         self._cl.enqueue_copy(self._queue, buffer, data)
         return buffer
 
-    def draw(self, tile: Tile, out: Floats, row: int) -> None:
-        """Draw the statistics of a tile's frames into `out`, in which `row` is the index of the tile's first stare.
-
-        `out` is of float32 and of shape (n_scenario, n_stare, n_statistic, n_padded_frame).
-        """
+    def draw(self, tile: Tile, out: Floats) -> None:
+        """Draw the statistics of a tile's frames into `out`, shape (n_scenario, n_stare, n_statistic, n_padded)."""
         if self._by_sums:
-            self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
+            self._in_frames("stare_sums", self.variant, self._own, tile, out)
             return
         # Pixels are drawn a few frames of all stares at a time.
-        out = out[:, row : row + tile.wanted]
         tile = tile.narrow(self.variant.width)
         n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
         block = max(1, TILE_BYTES // (4 * each))
@@ -297,21 +267,14 @@ class StareLaunches(Launches):
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
 
     def glow(self, tile: Tile, out: Floats) -> None:
-        """Compute the values with which `Injections` add flares to a tile's frames.
+        """Compute what `Injections` need to add flares, into `out`, shape (1, n_stare, n_statistic + 1, n_padded)."""
+        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out)
 
-        `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
-        """
-        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, 0)
-
-    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
-        """Launch a kernel whose lanes are frames."""
+    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats) -> None:
+        """Launch a kernel whose lanes are frames, and which fills the first stares of `out`."""
         first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
         kernel = self._device.kernel(("stare", name), variant, name)
-        # A CPU writes to `out`; a buffer of another device contains only this tile.
-        shares_memory = self._device.record.kind == "cpu"
-        place = (out.shape[1], row) if shares_memory else (tile.wanted, 0)
-        host = out if shares_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
-        with self._output("values", host) as values:
+        with self._output("values", out) as values:
             kernel(
                 self._queue,
                 (tile.wanted, -(-out.shape[3] // each)),
@@ -322,8 +285,7 @@ class StareLaunches(Launches):
                 np.uint32(first >> 32),
                 np.uint32(each),
                 *own,
-                *map(np.uint32, place),
+                np.uint32(out.shape[1]),
+                np.uint32(0),
                 values,
             )
-        if not shares_memory:
-            out[:, row : row + tile.wanted] = host

@@ -77,7 +77,6 @@ class Loss(Shape):
 
     name = "loss"
     source = "assumed"
-    peak_at = 0.0
     square_integral = 2.0
 
     def at(self, tau: ArrayLike) -> Float:

@@ -145,8 +145,8 @@ def code_identity() -> tuple[str, str]:
     return VERSION, digest.hexdigest()[:16]
 
 
-#: Fields that do not affect a draw.
-_DESCRIPTIVE = ("provenance", "messages")
+#: Fields that do not affect a draw, and those of a request that do not affect a shard.
+_DESCRIPTIVE, _OF_RUN = ("provenance", "messages"), ("realisations", "start", "tails")
 
 
 def fingerprint(request: object) -> str:
@@ -154,35 +154,24 @@ def fingerprint(request: object) -> str:
 
     The number of realisations is excluded, since runs of different length share shards.
     """
-    digest = hashlib.sha256(f"form {FORM}".encode())
-    _feed(digest, request, leave=("realisations", "start", "tails"))
-    return digest.hexdigest()[:32]
+    if not isinstance(request, tuple):
+        kind, values = _parts(request)
+        request = kind, {name: value for name, value in values.items() if name not in _OF_RUN}
+    text = json.dumps(request, default=_parts, sort_keys=True)
+    return hashlib.sha256(f"form {FORM} {text}".encode()).hexdigest()[:32]
 
 
-def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
-    is_model = isinstance(value, BaseModel)
-    if is_model or (is_dataclass(value) and not isinstance(value, type)):
-        digest.update(f"<{type(value).__name__}".encode())
-        for name in type(value).model_fields if is_model else (each.name for each in fields(value)):
-            if name not in (*leave, *_DESCRIPTIVE):
-                digest.update(name.encode())
-                _feed(digest, getattr(value, name))
-    elif isinstance(value, np.ndarray):
-        digest.update(f"<{value.dtype.str}{value.shape}".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, Mapping):
-        for key in sorted(value):
-            digest.update(str(key).encode())
-            _feed(digest, value[key])
-    elif isinstance(value, list | tuple):
-        digest.update(f"<{len(value)}".encode())
-        for item in value:
-            _feed(digest, item)
-    elif isinstance(value, float):
-        digest.update(value.hex().encode())
-    else:
-        # None, integers, text.
-        digest.update(repr(value).encode())
+def _parts(value: Any) -> Any:
+    """Return what JSON can hold of an object: its class and fields, the digest of an array, or its text."""
+    if isinstance(value, np.ndarray):
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes())
+        return value.dtype.str, value.shape, digest.hexdigest()
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, BaseModel) or is_dataclass(value):
+        names = type(value).model_fields if isinstance(value, BaseModel) else [each.name for each in fields(value)]
+        return type(value).__name__, {name: getattr(value, name) for name in names if name not in _DESCRIPTIVE}
+    return repr(value)
 
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
