@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.device.drivers import (
     FOLDER_VARIABLES,
-    BuildError,
     DeviceError,
     choose_processor_level,
     driver_sources,
@@ -211,10 +210,7 @@ def devices() -> list[DeviceRecord]:
 
 
 def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
-    """Return the pyopencl device whose number, platform or name matches `wanted`, or the default one for None.
-
-    Raises DeviceError, with a list of all devices, if none matches.
-    """
+    """Return the device whose number, platform or name matches `wanted`, by default the first one, and its record."""
     found = _found()
     for index, (handle, record) in enumerate(found):
         if wanted is None or wanted == str(index) or wanted.casefold() in record.label.casefold():
@@ -306,7 +302,7 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
                 "processor",
             ) from error
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
-        raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error
+        raise DeviceError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}", "kernel") from error
     return program
 
 

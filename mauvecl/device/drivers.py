@@ -356,23 +356,20 @@ def _folder() -> Path | None:
 
 
 #: Kinds of failures that callers may want to tell apart.
-Kind = Literal["no device", "unknown device", "processor", "memory", "failed", "lost", ""]
+Kind = Literal["no device", "unknown device", "processor", "kernel", "memory", "failed", "lost", ""]
 
 
 class DeviceError(RuntimeError):
     """Failure of a device, a driver or a worker, with a one-sentence message.
 
-    `kind` is "no device", "unknown device" (a wrong name), "processor" (unknown to the driver), "memory" (too little),
-    "failed" (at some realisations, also in further tries), "lost" (the scheduler of a cluster), or empty for others.
+    `kind` is "no device", "unknown device" (a wrong name), "processor" (unknown to the driver), "kernel" (not compiled:
+    the message has its source and the device's log), "memory" (too little), "failed" (at some realisations, also in
+    further tries), "lost" (the scheduler of a cluster), or empty for others.
     """
 
     def __init__(self, message: str, kind: Kind = "") -> None:
         super().__init__(message)
         self.kind = kind
-
-
-class BuildError(DeviceError):
-    """Failure to compile a kernel; the message contains the numbered source and the device's log."""
 
 
 #: Variable that sets the child's limit of processor time, and its default in seconds; 0 builds without a child. The

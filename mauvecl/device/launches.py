@@ -64,11 +64,7 @@ class Tile:
 
 
 class Tiles:
-    """Division of a device's work into tiles of at most `largest` realisations.
-
-    Progress is called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the
-    work.
-    """
+    """Division of a device's work into tiles of at most `largest` realisations; progress as for `Engine`."""
 
     def __init__(self, device: Device, *, progress: Progress | None = None, largest: int | None = None) -> None:
         self._device, self._progress, self._largest, self._step = device, progress, largest, device.step

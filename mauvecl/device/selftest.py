@@ -200,11 +200,9 @@ STARE_CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
     ),
     "skewed stares": ({"pixels": 4, "dark": 120.0, "photon_noise": "poisson"}, {}, 1),
 }
+_RAYS = CosmicRays(rate_per_cm2_s=300.0)
 #: Processes of each method of drawing stares: sums by cumulants have none.
-METHODS: dict[Any, Processes] = {
-    "pixels": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0)),
-    "cumulants": NONE,
-}
+METHODS: dict[Any, Processes] = {"pixels": Processes(cosmic_rays=_RAYS), "cumulants": NONE}
 
 
 def stare_case(name: str, count: int) -> tuple[Components, Stare, NDArray[np.float64]]:
@@ -242,7 +240,6 @@ PHILOX_VECTORS = (
 )
 
 
-_RAYS = CosmicRays(rate_per_cm2_s=300.0)
 #: Small scenes that run every branch of every kernel: options of `toy`, and of the draw and comparison.
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "stack": ({}, {}),
@@ -269,10 +266,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "priors, fourth power": ({"frames": 1, "dark": 288.0}, {"processes": Processes(jitter=Uniform(0.0, 0.05))}),
     "priors, frames": (
         {"frames": 5, "photon_noise": "poisson"},
-        {
-            "mode": "frames",
-            "processes": Processes(jitter=Uniform(0.0, 0.05), detector_temperature=Uniform(13.0, 21.0)),
-        },
+        {"mode": "frames", "processes": Processes(jitter=Uniform(0.0, 0.05), detector_temperature=Uniform(13.0, 21.0))},
     ),
     "marginalised, the sky unknown": (
         {"frames": 5},

@@ -246,22 +246,12 @@ class StareLaunches(Launches):
         # The number of scenarios is rounded up to a power of two, so that few programs are built.
         variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
         kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
+        common = (*self._arguments, *self._flares, *tile.address(), *tile.rows())
         for begin in range(0, n_frames, block):
             size = min(block, n_frames - begin)
-            values = self._scratch("values", 4 * each * size)
-            kernel(
-                self._queue,
-                (tile.size // self.variant.width, size),
-                self._local,
-                *self._arguments,
-                *self._flares,
-                *tile.address(),
-                *tile.rows(),
-                np.uint32(begin),
-                *self._own,
-                np.uint32(tile.size),
-                values,
-            )
+            items, values = (tile.size // self.variant.width, size), self._scratch("values", 4 * each * size)
+            own = (np.uint32(begin), *self._own, np.uint32(tile.size))
+            kernel(self._queue, items, self._local, *common, *own, values)
             host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
             self._cl.enqueue_copy(self._queue, host, values)
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
@@ -272,20 +262,9 @@ class StareLaunches(Launches):
 
     def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats) -> None:
         """Launch a kernel whose lanes are frames, and which fills the first stares of `out`."""
-        first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
+        each = FRAMES_EACH if variant.width > 1 else 1
         kernel = self._device.kernel(("stare", name), variant, name)
+        items, place = (tile.wanted, -(-out.shape[3] // each)), (np.uint32(out.shape[1]), np.uint32(0))
+        common = (self._arguments[0], *self._flares, *tile.narrow(1).address(), np.uint32(each))
         with self._output("values", out) as values:
-            kernel(
-                self._queue,
-                (tile.wanted, -(-out.shape[3] // each)),
-                self._local,
-                self._arguments[0],
-                *self._flares,
-                np.uint32(first & 0xFFFFFFFF),
-                np.uint32(first >> 32),
-                np.uint32(each),
-                *own,
-                np.uint32(out.shape[1]),
-                np.uint32(0),
-                values,
-            )
+            kernel(self._queue, items, self._local, *common, *own, *place, values)

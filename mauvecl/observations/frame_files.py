@@ -247,11 +247,7 @@ class Quantities:
         return replace(one, quality=_flags(one.quality))
 
     def _of_frames(self, wavelength: Values, what: str) -> Quantities:
-        """Return the quantities of a long table with a row for each frame; errors and flags for each pixel.
-
-        Raises InputError if a frame lacks a wavelength that another has, has one twice, or has two exposure times or
-        temperatures.
-        """
+        """Return the quantities of a long table with a row for each frame; errors and flags for each pixel."""
         frames, frame = np.unique(_keys(self.time[0]), return_inverse=True)
         pixels, pixel = np.unique(wavelength.numbers(), return_inverse=True)
         number = frame * pixels.size + pixel
@@ -329,8 +325,16 @@ def _check_rows(file: TableFile, found: Quantities) -> None:
     if not 0 < n <= MAX_FRAMES:
         expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
         raise InputError(f"{what} must have {expected}", key="frames")
-    if found.wavelength is None:
-        _check_one_source(file)
+    # A light curve is that of one star in one band.
+    groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS and found.wavelength is None]
+    for values in (one for one in groups if len(one.shape) == 1):
+        name, texts = values.name, values.texts()
+        cells = map(str, np.unique(values.numbers())) if texts is None else texts
+        held = sorted({cell for cell in cells if not is_missing(cell)})
+        # The filter of ATLAS is called F, as is the light of others.
+        if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):
+            fault = f"{what} must hold the light of one star in one band, but has rows of {len(held)} different"
+            raise InputError(f"{fault} {name!r} ({shortened(', '.join(held), 80)}); divide the table", key="flux")
     for values in (*found.time, found.flux, found.error, found.quality, found.exposure, found.temperature):
         if values is not None and values.n_rows != n:
             fault = f"{what}: {values.name!r} must have {n} rows, as the times do, but has {values.n_rows}"
@@ -452,22 +456,6 @@ def _read_light(
     if found.quality is not None and len(found.quality.shape) == 1:
         flags = found.quality.numbers()
     return light, sd, flags, unit, remarks
-
-
-def _check_one_source(file: TableFile) -> None:
-    """Raise InputError if a column says that the rows are of several bands or stars."""
-    groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS]
-    for values in (one for one in groups if len(one.shape) == 1):
-        name, texts = values.name, values.texts()
-        cells = map(str, np.unique(values.numbers())) if texts is None else texts
-        held = sorted({cell for cell in cells if not is_missing(cell)})
-        # The filter of ATLAS is called F, as is the light of others.
-        if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):
-            raise InputError(
-                f"{file.what} must hold the light of one star in one band, but has rows of {len(held)} different "
-                f"{name!r} ({shortened(', '.join(held), 80)}); divide the table",
-                key="flux",
-            )
 
 
 def _masked(quality: Values | None, bits: QualityBits) -> Values | None:

@@ -241,10 +241,7 @@ def times_of(
 def _time_unit(
     time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
 ) -> tuple[TimeUnit, list[str]]:
-    """Return the unit of times and what it says of their zero, by the mapping, the column, its name or the header.
-
-    Raises InputError if it contradicts the header.
-    """
+    """Return the unit of times and what it says of their zero, by the mapping, the column, its name or the header."""
     if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
         names = " and ".join(repr(one.name) for one in time)
         raise InputError(f"{file.what}: {names} must have the same unit, but have different units", key="time")

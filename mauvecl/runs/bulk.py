@@ -169,10 +169,7 @@ def _completed(
 
 @validated
 def forget(path: str | Path) -> None:
-    """Remove a store.
-
-    Raises InputError, without removing anything, if the folder contains other files or another process is writing it.
-    """
+    """Remove a store, unless the folder contains other files or another process is writing it."""
     path = Path(path)
     if path.exists():
         Store.open(path)

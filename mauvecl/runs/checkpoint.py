@@ -41,10 +41,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def locked(folder: Path, what: str) -> Iterator[None]:
-    """Lock a folder for this process; the operating system releases the lock however the process ends.
-
-    Raises InputError if another process holds the lock, or the file system has no locks.
-    """
+    """Lock a folder for this process; the operating system releases the lock however the process ends."""
 
     def unusable(why: str) -> InputError:
         return InputError(f"{what} {str(folder)!r} {why}", key="lock")
@@ -218,17 +215,13 @@ class Checkpoint:
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
-        """Lock the output folder and read its state.
-
-        Raises InputError if another process writes to the folder, or it contains an unfinished run without `resume` or
-        `restart`, or one of another study (the message lists the keys that differ).
-        """
+        """Lock the output folder, and check that an unfinished run in it is to be resumed and is of this study."""
         with ExitStack() as stack:
             if not self._is_held:
                 stack.enter_context(locked(self.parent, "output folder"))
             self._look()
             self._stack = stack.pop_all()
-        self._started, self._written = time.monotonic(), any(self._files())
+        self._started, self._written = time.monotonic(), bool(self._files())
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -241,7 +234,7 @@ class Checkpoint:
     def _look(self) -> None:
         if self._restart:
             self._remove()
-        if not any(self._files()):
+        if not self._files():
             return
         if not self._resume:
             raise InputError(
@@ -306,25 +299,22 @@ class Checkpoint:
     @property
     def kept(self) -> int:
         """Number of files of shards."""
-        return sum(1 for path in self._files() if path.suffix == ".npz")
+        return sum(path.suffix == ".npz" for path in self._files())
 
     def forget(self) -> None:
         """Remove the checkpoint, which is no longer needed once the result is written."""
         self._held = []
         self._remove()
 
-    def _files(self) -> Iterator[Path]:
-        """Yield the files in the folder that belong to a checkpoint, by name.
-
-        Raises InputError if the manifest is not one of mauvecl's.
-        """
+    def _files(self) -> list[Path]:
+        """Return the files in the folder that belong to a checkpoint, by name."""
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
-        shards = [name for name in names if SHARD_NAME.fullmatch(name)]
-        if MANIFEST in names and not shards and _intact(self.folder / MANIFEST) is None:
+        own = [name for name in names if SHARD_NAME.fullmatch(name) or name == MANIFEST]
+        if own == [MANIFEST] and _intact(self.folder / MANIFEST) is None:
             raise InputError(
                 f"{str(self.folder / MANIFEST)!r} is not mauvecl's: use another output folder", key="folder"
             )
-        yield from (self.folder / name for name in names if name in shards or name == MANIFEST)
+        return [self.folder / name for name in own]
 
     def _remove(self) -> None:
         """Remove the checkpoint's files, and the folder if it is then empty."""

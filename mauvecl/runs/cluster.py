@@ -198,20 +198,19 @@ class DaskWorkers:
 
     def _sums(self, attempt: _Attempt, sent: DaskFuture[Any]) -> Arrays:
         """Return the counts of a task that has ended, or raise why there are none."""
-        while sent.status == "finished":
+        if sent.status == "finished":
+            answer: Any = None
             # Dask would wait until the task is repeated, which never happens if all workers that may do so have left;
             # it calls the functions of all finished tasks in one thread, so that every other shard would wait, too.
-            try:
-                answer = sent.result(timeout=RECOUNT_S)
-            except TimeoutError:
-                if sent.status != "finished":
-                    raise ShardLost("its worker has left with its counts", failed=False) from None
-                continue
+            while answer is None:
+                with contextlib.suppress(TimeoutError):
+                    answer = sent.result(timeout=RECOUNT_S)
+                if answer is None and sent.status != "finished":
+                    raise ShardLost("its worker has left with its counts", failed=False)
             # Workers with older code answer without theirs.
             if isinstance(answer, tuple) and answer[1] == code_identity():
                 sums: Arrays = answer[0]
                 return sums
-            break
         error = sent.exception() if sent.status == "error" else None
         if sent.status in ("finished", "error") and self._find_strangers():
             raise ShardLost("counted by a worker with other code", failed=False)

@@ -215,11 +215,7 @@ class Store:
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
-        """Open an existing store.
-
-        Raises InputError if the folder is not a store, no copy of its study is intact, or intact copies contradict each
-        other.
-        """
+        """Open an existing store; at least one copy of its study is intact, and intact copies are the same."""
         path = Path(path)
         copies: dict[str, Path] = {}
         for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
@@ -296,11 +292,7 @@ class Store:
         return sum(len(scene.chunk_numbers(first, stop)) for scene in self.scenes)
 
     def make(self) -> None:
-        """Write the description of the arrays, or check that an existing one is the same.
-
-        Raises InputError if the store exists and is another study's (the message lists keys that differ), or cannot be
-        written.
-        """
+        """Write the description of the arrays, or check that an existing one is of the same study."""
         root = self.path / "zarr.json"
         if root.exists():
             there = Store.open(self.path).study
@@ -418,10 +410,7 @@ class Store:
                 yield str(here / name), own
 
     def clear(self) -> None:
-        """Remove all files but not the folder; the study is last, so that an interrupted removal leaves a store.
-
-        Raises InputError, without removing anything, if the folder contains other files.
-        """
+        """Remove all files if no others exist; the study is last, so that an interrupted removal leaves a store."""
         files = list(self.files())
         other = [key for key, own in files if not own]
         if other:
