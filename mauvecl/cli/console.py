@@ -96,7 +96,7 @@ def guarded(app: typer.Typer) -> int:
 def _failed(error: Exception) -> int:
     """Report bad input, a wrong use of flags, a device or file that fails, or an unforeseen failure."""
     # Imported here, because verbs that draw nothing do not need it.
-    device = sys.modules.get("mauvecl.device.build")
+    device = sys.modules.get("mauvecl.device.drivers")
     if isinstance(error, InputError):
         return _say(name_flag(error), BAD_INPUT)
     if isinstance(error, MemoryError):

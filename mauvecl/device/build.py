@@ -15,14 +15,7 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.device.drivers import (
-    FOLDER_VARIABLES,
-    DeviceError,
-    choose_processor_level,
-    driver_sources,
-    kernel_cache,
-    show_intel_runtime,
-)
+from mauvecl.device import drivers
 from mauvecl.host import VERSION
 from mauvecl.noise import layout
 from mauvecl.noise.scene import PIXEL_BLOCK
@@ -65,12 +58,12 @@ def write_outcome(device: DeviceRecord, checks: list[dict[str, Any]], seconds: f
         "passed": all(check["passed"] for check in checks),
         "checks": checks,
     }
-    kernel_cache().write_text(_outcome_key(device), json.dumps(record))
+    drivers.kernel_cache().write_text(_outcome_key(device), json.dumps(record))
 
 
 def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
     """Return the latest outcome of the self-test on a device, or None."""
-    text = kernel_cache().read_text(_outcome_key(device))
+    text = drivers.kernel_cache().read_text(_outcome_key(device))
     return None if text is None else dict(json.loads(text))
 
 
@@ -127,7 +120,7 @@ def load_opencl() -> Any:
     """
     linker = shutil.which("ld", path=os.environ.get("PATH") or os.defpath)
     if linker is None:
-        raise DeviceError(
+        raise drivers.DeviceError(
             "no linker `ld` found on PATH, and PoCL needs it to link kernels: install binutils "
             "(Debian, Ubuntu: `apt-get install binutils`; Fedora: `dnf install binutils`)"
         )
@@ -135,10 +128,10 @@ def load_opencl() -> Any:
         # Without PATH, Python searches the default folders, but PoCL finds no linker and aborts the process.
         os.environ["PATH"] = os.path.dirname(linker)
     try:
-        os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
+        os.environ["POCL_CACHE_DIR"] = str(drivers.kernel_cache().work)
     except OSError as error:
-        raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
-    libraries = kernel_cache().work / "libraries"
+        raise drivers.DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
+    libraries = drivers.kernel_cache().work / "libraries"
     if not libraries.exists():
         # PoCL links kernels as a compiler links programs, with the compiler's own libraries, although kernels call none
         # of their functions. Empty archives take their places where no compiler is installed.
@@ -146,15 +139,15 @@ def load_opencl() -> Any:
         for name in ("gcc", "gcc_s", "c"):
             (libraries / f"lib{name}.a").write_bytes(b"!<arch>\n")
         os.environ["LIBRARY_PATH"] = os.pathsep.join(filter(None, (os.environ.get("LIBRARY_PATH"), str(libraries))))
-    if kernel_cache().pid != os.getpid():
+    if drivers.kernel_cache().pid != os.getpid():
         # PoCL's threads do not survive a fork; its next call would wait forever.
-        raise DeviceError("OpenCL was loaded before a fork, but needs a newly started process (use spawn)")
+        raise drivers.DeviceError("OpenCL was loaded before a fork, but needs a newly started process (use spawn)")
     # pyopencl's own cache would duplicate PoCL's.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
     try:
         import pyopencl
     except ImportError as error:
-        raise DeviceError(f"pyopencl cannot be loaded ({error}): install {driver_sources()}") from error
+        raise drivers.DeviceError(f"pyopencl cannot be loaded ({error}): install {drivers.driver_sources()}") from error
     return pyopencl
 
 
@@ -162,16 +155,16 @@ def _found() -> list[tuple[Any, DeviceRecord]]:
     """Return all OpenCL devices and their records, the default one first."""
     cl = load_opencl()
     handles, kind = list[Any](), cl.device_type
-    with contextlib.suppress(cl.Error), show_intel_runtime():
+    with contextlib.suppress(cl.Error), drivers.show_intel_runtime():
         platforms = cl.get_platforms()
         for platform in platforms:
             with contextlib.suppress(cl.Error):
                 handles += platform.get_devices()
     if not handles:
         # If a variable names a folder, loaders search only that.
-        folders = ", ".join(f"{name}={os.environ[name]}" for name in FOLDER_VARIABLES if os.environ.get(name))
+        folders = ", ".join(f"{name}={os.environ[name]}" for name in drivers.FOLDER_VARIABLES if os.environ.get(name))
         searched = f" ({folders})" if folders else ""
-        raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}", "no device")
+        raise drivers.DeviceError(f"no OpenCL device found{searched}: install {drivers.driver_sources()}", "no device")
     # PoCL on the CPU is the default.
     handles.sort(key=lambda device: (device.platform.name != POCL, not device.type & kind.CPU))
     kinds = {"cpu": kind.CPU, "gpu": kind.GPU, "accelerator": kind.ACCELERATOR}
@@ -216,7 +209,7 @@ def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
         if wanted is None or wanted == str(index) or wanted.casefold() in record.label.casefold():
             return handle, record
     present = "; ".join(f"{index} = {record.label}" for index, (_, record) in enumerate(found))
-    raise DeviceError(f"device {wanted!r} is not here; use one of: {present}", "unknown device")
+    raise drivers.DeviceError(f"device {wanted!r} is not here; use one of: {present}", "unknown device")
 
 
 @cache
@@ -252,11 +245,11 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
 
     key = hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32]
     # Rendering takes longer than loading a compiled kernel.
-    source = kernel_cache().read_text(key)
+    source = drivers.kernel_cache().read_text(key)
     if source is None:
         parts = (str(_parsed(text).render(**values)) for text in texts)
         source = "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
-        kernel_cache().write_text(key, source)
+        drivers.kernel_cache().write_text(key, source)
     return source
 
 
@@ -282,10 +275,10 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     options = ["-cl-std=CL1.2", "-w"]
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
-    cache = kernel_cache()
+    cache = drivers.kernel_cache()
     # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
     # store, and the installation, since PoCL compiles a program of another installation again at every start.
-    level = str(choose_processor_level(device, lambda: [handle for handle, _ in _found()]))
+    level = str(drivers.choose_processor_level(device, lambda: [handle for handle, _ in _found()]))
     target = (device.name, device.version, device.driver_version, level, sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = cache.restore(key)
@@ -296,13 +289,14 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
             program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
     except cl.Error as error:
         if "unknown target CPU" in str(error):
-            raise DeviceError(
+            raise drivers.DeviceError(
                 f"{device.platform.version.strip()} does not know the processor {device.name} and cannot build for it, "
                 "expected a newer PoCL or another OpenCL driver",
                 "processor",
             ) from error
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
-        raise DeviceError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}", "kernel") from error
+        fault = f"a kernel did not compile on {device.name}"
+        raise drivers.DeviceError(f"{fault}\n{numbered}\n{error}", "kernel") from error
     return program
 
 

@@ -13,20 +13,9 @@ from mauvecl.detection.requests import Shard
 from mauvecl.detection.snr import Arrays
 from mauvecl.device.build import Device, Variant
 from mauvecl.device.launches import TILE_BYTES, Launches, Progress, Tile, Tiles, contiguous, padded
+from mauvecl.flares import stare_scene
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
-from mauvecl.flares.stare_scene import (
-    Flares,
-    KeepStatistics,
-    Method,
-    StareNumber,
-    StareScene,
-    StaresRequest,
-    SumTable,
-    check_sums,
-    joined,
-    padded_frames,
-)
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -96,10 +85,10 @@ class Stares:
         stare: Stare,
         flare: NDArray[Any] | None = None,
         *,
-        first: StareNumber = 0,
+        first: stare_scene.StareNumber = 0,
         count: Realisations = 1,
         seed: Seed = DEFAULT_SEED,
-        method: Method = "pixels",
+        method: stare_scene.Method = "pixels",
         amplitudes: NDArray[Any] | None = None,
         processes: Processes = NONE,
     ) -> Floats:
@@ -128,11 +117,11 @@ class Stares:
             Weighted sums over pixels of raw counts minus the quiescent mean. With `amplitudes`, the shape is
             (n_scenario, count, n_frame, n_statistic).
         """
-        request = StaresRequest(components, stare, count, seed, flare, amplitudes, first, method, processes)
+        request = stare_scene.StaresRequest(components, stare, count, seed, flare, amplitudes, first, method, processes)
         values: Floats = self.reduced(request)["values"]
         return values if amplitudes is None else np.moveaxis(values, 0, 1)
 
-    def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
+    def reduced(self, request: stare_scene.StaresRequest, shard: Shard | None = None) -> Arrays:
         """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
 
         Return the joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
@@ -140,10 +129,11 @@ class Stares:
         there = shard or Shard(0, request.start, request.realisations)
         if there.start + there.count > 2**64:
             raise InputError.of("first", there.start, f"at most {2**64 - there.count} for {there.count} stares")
-        components, stare, reduction = request.components, request.stare, request.reduction or KeepStatistics()
+        components, stare = request.components, request.stare
+        reduction = request.reduction or stare_scene.KeepStatistics()
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()
-        shape = (components.n_statistics, padded_frames(stare.n_frames))
+        shape = (components.n_statistics, stare_scene.padded_frames(stare.n_frames))
         each = 4 * len(request.flares.amplitudes) * shape[0] * shape[1]
         # Pieces are small enough for a processor's cache; the cumulants need no full vector of long stares.
         step = 1 if request.method == "cumulants" else self.open_device.width
@@ -169,25 +159,25 @@ class Stares:
                 parts.extend(reduced)
 
             self._tiles.for_each(there.start, there.count, each, work)
-        arrays = joined(parts, adds=reduction.adds)
+        arrays = stare_scene.joined(parts, adds=reduction.adds)
         return arrays | {"start": np.array(there.start)} if shard else arrays
 
 
 #: Frames per work-item of the kernels whose lanes are frames.
 FRAMES_EACH = 1024
 #: Cached because callers draw a few stares of the same star, with the same weights, at a time.
-_scene_of, _table_of = lru_cache(maxsize=4)(StareScene.of), lru_cache(maxsize=4)(SumTable.of)
+_scene_of, _table_of = lru_cache(maxsize=4)(stare_scene.StareScene.of), lru_cache(maxsize=4)(stare_scene.SumTable.of)
 
 
 class StareLaunches(Launches):
     """Buffers and launches of a stare; the buffers are released at the end of the `with` block."""
 
-    def __init__(self, device: Device, request: StaresRequest) -> None:
+    def __init__(self, device: Device, request: stare_scene.StaresRequest) -> None:
         stare = _scene_of(request.components, request.stare, request.processes)
         stare.check(request.flares)
         self._by_sums = request.method == "cumulants"
         if self._by_sums:
-            check_sums(stare, request.flares)
+            stare_scene.check_sums(stare, request.flares)
         table = _table_of(stare.components) if self._by_sums else None
         scene = stare.scene
         variant = replace(
@@ -214,7 +204,7 @@ class StareLaunches(Launches):
         else:
             self._own = [self.upload(table.packed)]
 
-    def upload_flares(self, flares: Flares, first: int, count: int) -> None:
+    def upload_flares(self, flares: stare_scene.Flares, first: int, count: int) -> None:
         """Upload the flares and the pointing losses of the next `count` stares."""
         self._scenarios, losses = len(flares.amplitudes), np.zeros(0, np.float32)
         if self.variant.pointing:

@@ -441,6 +441,7 @@ class Selection:
         return rows
 
 
+@validated
 def export(selection: Selection, path: str | Path, *, replace: bool = False) -> Path:
     """Write spectra, calibration and origin to a file, atomically.
 
