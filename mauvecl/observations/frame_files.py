@@ -327,9 +327,9 @@ def _check_rows(file: TableFile, found: Quantities) -> None:
         raise InputError(f"{what} must have {expected}", key="frames")
     # A light curve is that of one star in one band.
     groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS and found.wavelength is None]
-    for values in (one for one in groups if len(one.shape) == 1):
-        name, texts = values.name, values.texts()
-        cells = map(str, np.unique(values.numbers())) if texts is None else texts
+    for group in (one for one in groups if len(one.shape) == 1):
+        name, texts = group.name, group.texts()
+        cells = map(str, np.unique(group.numbers())) if texts is None else texts
         held = sorted({cell for cell in cells if not is_missing(cell)})
         # The filter of ATLAS is called F, as is the light of others.
         if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):

@@ -199,7 +199,7 @@ def open_stored(place: Path | IO[bytes], what: str, name: str | None) -> Iterato
         module = import_module(package)
     except ImportError as error:
         raise missing_package(package, "a store", "bulk") from error
-    if is_store:
+    if isinstance(place, Path):
         check_folder(place, "file")
     with ExitStack() as stack:
         with parsing(what, WHOLE):

@@ -166,7 +166,7 @@ def _parts(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, BaseModel) or is_dataclass(value):
-        names = type(value).model_fields if isinstance(value, BaseModel) else [each.name for each in fields(value)]
+        names = [*type(value).model_fields] if isinstance(value, BaseModel) else [each.name for each in fields(value)]
         return type(value).__name__, {name: getattr(value, name) for name in names if name not in _DESCRIPTIVE}
     return repr(value)
 
