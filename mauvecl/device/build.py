@@ -168,7 +168,7 @@ def _found() -> list[tuple[Any, DeviceRecord]]:
     # PoCL on the CPU is the default.
     handles.sort(key=lambda device: (device.platform.name != POCL, not device.type & kind.CPU))
     kinds = {"cpu": kind.CPU, "gpu": kind.GPU, "accelerator": kind.ACCELERATOR}
-    found = []
+    found = list[tuple[Any, DeviceRecord]]()
     for device in handles:
         lacking = weaknesses(device)
         record = DeviceRecord(

@@ -13,6 +13,7 @@ from mauvecl.detection.counts import TailSamples, Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.names import DEFAULT_STATISTICS, Tails
 from mauvecl.detection.nuisances import Nuisances
+from mauvecl.detection.snr import Arrays, SnrResult
 from mauvecl.detection.statistics import Linear
 from mauvecl.device.build import Device, DeviceRecord, devices
 from mauvecl.device.drivers import DeviceError
@@ -185,7 +186,7 @@ class Engine:
         seed: Seed = DEFAULT_SEED,
         start: FirstRealisation = 0,
         **drawing: Unpack[DrawingOptions],
-    ) -> snr.SnrResult:
+    ) -> SnrResult:
         """Simulate the distributions of S/N per pixel and per resolution element (METHODS section 5).
 
         Parameters
@@ -204,9 +205,7 @@ class Engine:
         sums.add(0, self.count(request, requests.Shard(0, request.start, request.realisations)))
         return sums.answer()
 
-    def count(
-        self, request: requests.Countable, shard: requests.Shard, *, out: NDArray[Any] | None = None
-    ) -> snr.Arrays:
+    def count(self, request: requests.Countable, shard: requests.Shard, *, out: NDArray[Any] | None = None) -> Arrays:
         """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
         match request:
             case requests.DetectRequest():
