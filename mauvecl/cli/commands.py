@@ -162,13 +162,12 @@ def realise(session: Session) -> None:
     """
     from mauvecl.cli.invocation import question_room, report_interrupts, working
     from mauvecl.runs import bulk
-    from mauvecl.runs.export import ENDINGS
     from mauvecl.runs.store import Store
 
     place = session.output or Path("mauvecl-frames.zarr")
-    one_file = place.suffix in ENDINGS
+    one_file = place.suffix in bulk.ENDINGS
     if not one_file and place.suffix not in ("", ".zarr"):
-        raise InputError.of("output", str(place), f"a name ending in .zarr, {', '.join(ENDINGS)}")
+        raise InputError.of("output", str(place), f"a name ending in .zarr, {', '.join(bulk.ENDINGS)}")
     folder = bulk.unfinished(place) if one_file else place
     question_room(Store(folder, session.study), insist=session.insist)
     with (
@@ -279,10 +278,10 @@ def export(
 
     Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
     """
-    from mauvecl.runs.export import Selection, export
+    from mauvecl.runs import bulk
     from mauvecl.runs.store import Store
 
-    export(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
+    bulk.export(bulk.Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
     if not quiet:
         show([f"Wrote {file}, {file.stat().st_size / 2**20:.1f} MiB."])
 

@@ -96,7 +96,7 @@ def guarded(app: typer.Typer) -> int:
 def _failed(error: Exception) -> int:
     """Report bad input, a wrong use of flags, a device or file that fails, or an unforeseen failure."""
     # Imported here, because verbs that draw nothing do not need it.
-    device = sys.modules.get("mauvecl.device.build")
+    device = sys.modules.get("mauvecl.device.drivers")
     if isinstance(error, InputError):
         return _say(name_flag(error), BAD_INPUT)
     if isinstance(error, MemoryError):
@@ -115,7 +115,7 @@ def _failed(error: Exception) -> int:
     if type(error).__name__ == "Abort" or "KeyboardInterrupt" in f"{error!r} {error.__cause__!r}":
         return _say("interrupted", INTERRUPTED)
     if device is not None and isinstance(error, device.DeviceError):
-        return _say(str(error), BAD_INPUT, whole=isinstance(error, device.BuildError))
+        return _say(str(error), BAD_INPUT, whole=error.kind == "kernel")
     where = _write_traceback(error)
     what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return _say(

@@ -15,15 +15,7 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.device.drivers import (
-    FOLDER_VARIABLES,
-    BuildError,
-    DeviceError,
-    choose_processor_level,
-    driver_sources,
-    kernel_cache,
-    show_intel_runtime,
-)
+from mauvecl.device import drivers
 from mauvecl.host import VERSION
 from mauvecl.noise import layout
 from mauvecl.noise.scene import PIXEL_BLOCK
@@ -66,12 +58,12 @@ def write_outcome(device: DeviceRecord, checks: list[dict[str, Any]], seconds: f
         "passed": all(check["passed"] for check in checks),
         "checks": checks,
     }
-    kernel_cache().write_text(_outcome_key(device), json.dumps(record))
+    drivers.kernel_cache().write_text(_outcome_key(device), json.dumps(record))
 
 
 def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
     """Return the latest outcome of the self-test on a device, or None."""
-    text = kernel_cache().read_text(_outcome_key(device))
+    text = drivers.kernel_cache().read_text(_outcome_key(device))
     return None if text is None else dict(json.loads(text))
 
 
@@ -128,7 +120,7 @@ def load_opencl() -> Any:
     """
     linker = shutil.which("ld", path=os.environ.get("PATH") or os.defpath)
     if linker is None:
-        raise DeviceError(
+        raise drivers.DeviceError(
             "no linker `ld` found on PATH, and PoCL needs it to link kernels: install binutils "
             "(Debian, Ubuntu: `apt-get install binutils`; Fedora: `dnf install binutils`)"
         )
@@ -136,10 +128,10 @@ def load_opencl() -> Any:
         # Without PATH, Python searches the default folders, but PoCL finds no linker and aborts the process.
         os.environ["PATH"] = os.path.dirname(linker)
     try:
-        os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
+        os.environ["POCL_CACHE_DIR"] = str(drivers.kernel_cache().work)
     except OSError as error:
-        raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
-    libraries = kernel_cache().work / "libraries"
+        raise drivers.DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
+    libraries = drivers.kernel_cache().work / "libraries"
     if not libraries.exists():
         # PoCL links kernels as a compiler links programs, with the compiler's own libraries, although kernels call none
         # of their functions. Empty archives take their places where no compiler is installed.
@@ -147,44 +139,50 @@ def load_opencl() -> Any:
         for name in ("gcc", "gcc_s", "c"):
             (libraries / f"lib{name}.a").write_bytes(b"!<arch>\n")
         os.environ["LIBRARY_PATH"] = os.pathsep.join(filter(None, (os.environ.get("LIBRARY_PATH"), str(libraries))))
-    if kernel_cache().pid != os.getpid():
+    if drivers.kernel_cache().pid != os.getpid():
         # PoCL's threads do not survive a fork; its next call would wait forever.
-        raise DeviceError("OpenCL was loaded before a fork, but needs a newly started process (use spawn)")
+        raise drivers.DeviceError("OpenCL was loaded before a fork, but needs a newly started process (use spawn)")
     # pyopencl's own cache would duplicate PoCL's.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
     try:
         import pyopencl
     except ImportError as error:
-        raise DeviceError(f"pyopencl cannot be loaded ({error}): install {driver_sources()}") from error
+        raise drivers.DeviceError(f"pyopencl cannot be loaded ({error}): install {drivers.driver_sources()}") from error
     return pyopencl
 
 
-def _devices() -> list[Any]:
+def _found() -> list[tuple[Any, DeviceRecord]]:
+    """Return all OpenCL devices and their records, the default one first."""
     cl = load_opencl()
-    try:
-        with show_intel_runtime():
-            platforms = cl.get_platforms()
-    except cl.Error:
-        platforms = []
-    handles = []
-    for platform in platforms:
-        try:
-            handles += platform.get_devices()
-        except cl.Error:
-            continue
+    handles, kind = list[Any](), cl.device_type
+    with contextlib.suppress(cl.Error), drivers.show_intel_runtime():
+        platforms = cl.get_platforms()
+        for platform in platforms:
+            with contextlib.suppress(cl.Error):
+                handles += platform.get_devices()
     if not handles:
         # If a variable names a folder, loaders search only that.
-        folders = ", ".join(f"{name}={os.environ[name]}" for name in FOLDER_VARIABLES if os.environ.get(name))
+        folders = ", ".join(f"{name}={os.environ[name]}" for name in drivers.FOLDER_VARIABLES if os.environ.get(name))
         searched = f" ({folders})" if folders else ""
-        raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}", "no device")
-    # PoCL on the CPU comes first, because the first device is the default.
-    return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
-
-
-def _kind(device: Any) -> str:
-    cl = load_opencl()
-    kinds = {"cpu": cl.device_type.CPU, "gpu": cl.device_type.GPU, "accelerator": cl.device_type.ACCELERATOR}
-    return next((name for name, bit in kinds.items() if device.type & bit), "other")
+        raise drivers.DeviceError(f"no OpenCL device found{searched}: install {drivers.driver_sources()}", "no device")
+    # PoCL on the CPU is the default.
+    handles.sort(key=lambda device: (device.platform.name != POCL, not device.type & kind.CPU))
+    kinds = {"cpu": kind.CPU, "gpu": kind.GPU, "accelerator": kind.ACCELERATOR}
+    found = list[tuple[Any, DeviceRecord]]()
+    for device in handles:
+        lacking = weaknesses(device)
+        record = DeviceRecord(
+            platform=device.platform.name.strip(),
+            name=device.name.strip(),
+            driver=device.driver_version.strip(),
+            kind=next((name for name, bit in kinds.items() if device.type & bit), "other"),
+            compute_units=int(device.max_compute_units),
+            global_memory=int(device.global_mem_size),
+            default=not found,
+            promise=f"same draws to float rounding: no {', no '.join(lacking)}" if lacking else SAME_BITS,
+        )
+        found.append((device, record))
+    return found
 
 
 def weaknesses(device: Any) -> list[str]:
@@ -201,36 +199,17 @@ def weaknesses(device: Any) -> list[str]:
 
 def devices() -> list[DeviceRecord]:
     """List all OpenCL devices, the default one first. Raises DeviceError if there is none, or no linker."""
-    return [
-        DeviceRecord(
-            platform=device.platform.name.strip(),
-            name=device.name.strip(),
-            driver=device.driver_version.strip(),
-            kind=_kind(device),
-            compute_units=int(device.max_compute_units),
-            global_memory=int(device.global_mem_size),
-            default=index == 0,
-            promise=f"same draws to float rounding: no {', no '.join(lacking)}"
-            if (lacking := weaknesses(device))
-            else SAME_BITS,
-        )
-        for index, device in enumerate(_devices())
-    ]
+    return [record for _, record in _found()]
 
 
 def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
-    """Return the pyopencl device whose number, platform or name matches `wanted`, or the default one for None.
-
-    Raises DeviceError, with a list of all devices, if none matches.
-    """
-    handles, records = _devices(), devices()
-    if wanted is None:
-        return handles[0], records[0]
-    for index, record in enumerate(records):
-        if wanted == str(index) or wanted.casefold() in record.label.casefold():
-            return handles[index], record
-    present = "; ".join(f"{index} = {record.label}" for index, record in enumerate(records))
-    raise DeviceError(f"device {wanted!r} is not here; use one of: {present}", "unknown device")
+    """Return the device whose number, platform or name matches `wanted`, by default the first one, and its record."""
+    found = _found()
+    for index, (handle, record) in enumerate(found):
+        if wanted is None or wanted == str(index) or wanted.casefold() in record.label.casefold():
+            return handle, record
+    present = "; ".join(f"{index} = {record.label}" for index, (_, record) in enumerate(found))
+    raise drivers.DeviceError(f"device {wanted!r} is not here; use one of: {present}", "unknown device")
 
 
 @cache
@@ -266,11 +245,11 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
 
     key = hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32]
     # Rendering takes longer than loading a compiled kernel.
-    source = kernel_cache().read_text(key)
+    source = drivers.kernel_cache().read_text(key)
     if source is None:
         parts = (str(_parsed(text).render(**values)) for text in texts)
         source = "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
-        kernel_cache().write_text(key, source)
+        drivers.kernel_cache().write_text(key, source)
     return source
 
 
@@ -296,16 +275,11 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     options = ["-cl-std=CL1.2", "-w"]
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
-    cache = kernel_cache()
+    cache = drivers.kernel_cache()
     # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
     # store, and the installation, since PoCL compiles a program of another installation again at every start.
-    target = (
-        device.name,
-        device.version,
-        device.driver_version,
-        str(choose_processor_level(device, _devices)),
-        sys.prefix,
-    )
+    level = str(drivers.choose_processor_level(device, lambda: [handle for handle, _ in _found()]))
+    target = (device.name, device.version, device.driver_version, level, sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = cache.restore(key)
     try:
@@ -315,13 +289,14 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
             program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
     except cl.Error as error:
         if "unknown target CPU" in str(error):
-            raise DeviceError(
+            raise drivers.DeviceError(
                 f"{device.platform.version.strip()} does not know the processor {device.name} and cannot build for it, "
                 "expected a newer PoCL or another OpenCL driver",
                 "processor",
             ) from error
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
-        raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error
+        fault = f"a kernel did not compile on {device.name}"
+        raise drivers.DeviceError(f"{fault}\n{numbered}\n{error}", "kernel") from error
     return program
 
 
@@ -347,7 +322,7 @@ class Device:
         self._vector_forms = self.width == 16 and self.record.platform == POCL
         self._programs: dict[str, Any] = {}
         self._kernels: dict[tuple[str, str], Any] = {}
-        self._pid = os.getpid()
+        self.pid = os.getpid()
 
     @property
     def variant(self) -> Variant:
@@ -367,8 +342,3 @@ class Device:
         if (source, name) not in self._kernels:
             self._kernels[source, name] = self.cl.Kernel(self._programs[source], name)
         return self._kernels[source, name]
-
-    def check_process(self) -> None:
-        """Raise DeviceError after a fork, which PoCL's threads do not survive: its next call would wait forever."""
-        if os.getpid() != self._pid:
-            raise DeviceError("this Engine was made before a fork; make one in this process (use spawn)")

@@ -152,24 +152,21 @@ class KernelCache:
         self.store_programs()
 
     def store_programs(self) -> None:
-        """Store the programs that were built or completed since the last call."""
+        """Store the programs that were built or completed since the last call, and remove the oldest of too many."""
         for key, folder in self._folders.items():
             files = [path for path in (self.work / folder).rglob("*") if path.suffix in (".bc", ".so")]
-            if len(files) != self._stored.get(key):
-                self.write(key, {path.relative_to(self.work).as_posix(): path.read_bytes() for path in files})
-                self._stored[key] = len(files)
-                self._prune()
-
-    def _prune(self) -> None:
-        total = 0
-        with contextlib.suppress(OSError):
-            # A full store has a thousand archives, and is pruned twice for each program.
-            with os.scandir(self.store) as entries:
-                stored = sorted(((entry.stat(), entry.path) for entry in entries), key=lambda pair: -pair[0].st_mtime)
-            for about, path in stored:
-                total += about.st_size
-                if total > MAX_STORED:
-                    os.unlink(path)
+            if len(files) == self._stored.get(key):
+                continue
+            self.write(key, {path.relative_to(self.work).as_posix(): path.read_bytes() for path in files})
+            self._stored[key] = len(files)
+            total = 0
+            with contextlib.suppress(OSError), os.scandir(self.store) as entries:
+                # A full store has a thousand archives, and is read twice for each program.
+                stored = ((entry.stat(), entry.path) for entry in entries)
+                for about, path in sorted(stored, key=lambda pair: -pair[0].st_mtime):
+                    total += about.st_size
+                    if total > MAX_STORED:
+                        os.unlink(path)
 
     def close(self) -> None:
         """Store programs and remove the working folder, except in a forked child."""
@@ -359,23 +356,20 @@ def _folder() -> Path | None:
 
 
 #: Kinds of failures that callers may want to tell apart.
-Kind = Literal["no device", "unknown device", "processor", "memory", "failed", "lost", ""]
+Kind = Literal["no device", "unknown device", "processor", "kernel", "memory", "failed", "lost", ""]
 
 
 class DeviceError(RuntimeError):
     """Failure of a device, a driver or a worker, with a one-sentence message.
 
-    `kind` is "no device", "unknown device" (a wrong name), "processor" (unknown to the driver), "memory" (too little),
-    "failed" (at some realisations, also in further tries), "lost" (the scheduler of a cluster), or empty for others.
+    `kind` is "no device", "unknown device" (a wrong name), "processor" (unknown to the driver), "kernel" (not compiled:
+    the message has its source and the device's log), "memory" (too little), "failed" (at some realisations, also in
+    further tries), "lost" (the scheduler of a cluster), or empty for others.
     """
 
     def __init__(self, message: str, kind: Kind = "") -> None:
         super().__init__(message)
         self.kind = kind
-
-
-class BuildError(DeviceError):
-    """Failure to compile a kernel; the message contains the numbered source and the device's log."""
 
 
 #: Variable that sets the child's limit of processor time, and its default in seconds; 0 builds without a child. The

@@ -8,30 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection import requests, snr
 from mauvecl.detection.counts import TailSamples, Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.names import DEFAULT_STATISTICS, Tails
 from mauvecl.detection.nuisances import Nuisances
-from mauvecl.detection.requests import (
-    Countable,
-    DetectRequest,
-    RealiseRequest,
-    Shard,
-    SnrRequest,
-    check_last,
-    plan_channels,
-)
-from mauvecl.detection.snr import (
-    Arrays,
-    Counts,
-    DetectionSums,
-    SnrResult,
-    SnrSums,
-    elements,
-    observers,
-    pack_detection,
-    pack_snr,
-)
+from mauvecl.detection.snr import Arrays, SnrResult
 from mauvecl.detection.statistics import Linear
 from mauvecl.device.build import Device, DeviceRecord, devices
 from mauvecl.device.drivers import DeviceError
@@ -170,8 +152,7 @@ class Engine:
         clipped : ndarray of uint32, shape (count,)
             Number of samples (pixels times frames) clipped at zero or saturation.
         """
-        self.open_device.check_process()
-        check_last(start, count)
+        requests.check_last(start, count)
         scene = prepare([expectation], **drawing)
         narrow = scene.n_frames == 1 and expectation.adc_max_dn < 2**16
         shape, dtype = (count, scene.n_pixel), np.dtype(np.uint16 if narrow else np.int32)
@@ -219,23 +200,27 @@ class Engine:
         mode, recipe, processes, first_frame
             See `Drawing`.
         """
-        request = SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
-        sums = SnrSums(request)
-        sums.add(0, pack_snr(self._snr(request, Shard(0, request.start, request.realisations))))
+        request = requests.SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
+        sums = snr.SnrSums(request)
+        sums.add(0, self.count(request, requests.Shard(0, request.start, request.realisations)))
         return sums.answer()
 
-    def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
+    def count(self, request: requests.Countable, shard: requests.Shard, *, out: NDArray[Any] | None = None) -> Arrays:
         """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
         match request:
-            case DetectRequest():
-                return pack_detection(*self._detection(request, shard))
-            case SnrRequest():
-                return pack_snr(self._snr(request, shard))
-            case RealiseRequest():
-                x, seed = request.expectation, request.seed
-                how = request.drawing.options
-                rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
-                return {"rows": rows}
+            case requests.DetectRequest():
+                return snr.pack_detection(*self._detection(request, shard))
+            case requests.SnrRequest():
+                scene, observed = request.scene, snr.elements(request.expectation)
+                counts = snr.Counts(scene.n_pixel, len(observed))
+                with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
+                    launches.observe(snr.observers(request.expectation, scene), observed)
+                    self._tiles.for_each(shard.start, shard.count, 0, lambda tile, _: launches.histogram(tile, counts))
+                    launches.flush_counts(counts)
+                return snr.pack_snr(counts)
+            case requests.RealiseRequest():
+                how: Any = {"start": shard.start, "count": shard.count, "seed": request.seed, "out": out}
+                return {"rows": self.realise(request.expectation, **how, **request.drawing.options)}
         # Exposures do not need the modules of stares.
         from mauvecl.device.stares import Stares
         from mauvecl.flares.stare_scene import StaresRequest
@@ -243,16 +228,6 @@ class Engine:
         if isinstance(request, StaresRequest):
             return Stares(self.open_device, tiles=self._tiles).reduced(request, shard)
         raise TypeError(f"a request is needed, not {type(request).__name__}")
-
-    def _snr(self, request: SnrRequest, shard: Shard) -> Counts:
-        self.open_device.check_process()
-        scene, observed = request.scene, elements(request.expectation)
-        counts = Counts(scene.n_pixel, len(observed))
-        with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
-            launches.observe(observers(request.expectation, scene), observed)
-            self._tiles.for_each(shard.start, shard.count, 0, lambda tile, done: launches.histogram(tile, counts))
-            launches.flush_counts(counts)
-        return counts
 
     def detect(
         self,
@@ -295,18 +270,17 @@ class Engine:
             that are projected out.
         """
         how = (start, Drawing(**drawing), comparison, tails, nuisances)
-        request = DetectRequest(quiet, flares, realisations, seed, statistics, *how)  # type: ignore[arg-type]
-        sums, each = DetectionSums(request), request.realisations
+        request = requests.DetectRequest(quiet, flares, realisations, seed, statistics, *how)  # type: ignore[arg-type]
+        sums, each = snr.DetectionSums(request), request.realisations
         total = request.parts * each
         for part in range(request.parts):
-            shard = Shard(part, request.start, each)
-            sums.add(part, pack_detection(*self._detection(request, shard, before=part * each, total=total)))
+            shard = requests.Shard(part, request.start, each)
+            sums.add(part, snr.pack_detection(*self._detection(request, shard, before=part * each, total=total)))
         return sums.answer()
 
     def _detection(
-        self, request: DetectRequest, shard: Shard, *, before: int = 0, total: int | None = None
+        self, request: requests.DetectRequest, shard: requests.Shard, *, before: int = 0, total: int | None = None
     ) -> tuple[Tally, list[TailSamples | None]]:
-        self.open_device.check_process()
         plan, scene = request.plans[shard.part]
         tally, samples = Tally(plan.grids), plan.tails()
         with detection_launches(self.open_device, scene, request.seed, plan, request.hypotheses) as launches:
@@ -351,22 +325,22 @@ class Engine:
             of each scenario: ``matched`` (the null's for each flare's template) and the others in the requested order,
             including the sums that a marginalised chi2 subtracts. Finally ``paper``, in the order of ``matched``.
         """
-        self.open_device.check_process()
         how = (start, Drawing(**drawing), comparison, "counted", nuisances)
         # The request validates the arguments and turns a single flare into a sequence.
-        request = DetectRequest(quiet, flares, count, seed, statistics, *how)  # type: ignore[arg-type]
+        request = requests.DetectRequest(quiet, flares, count, seed, statistics, *how)  # type: ignore[arg-type]
         hypotheses, n_flares = request.hypotheses, len(request.flares)
         scene = hypotheses.scene
         if n_flares >= BATCH[scene.frames]:
             raise InputError.of("flares", n_flares, f"at most {BATCH[scene.frames] - 1} in one launch")
-        plan = plan_channels(hypotheses, range(n_flares), first=True)
+        plan = requests.plan_channels(hypotheses, range(n_flares), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 
         with detection_launches(self.open_device, scene, seed, plan, hypotheses) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
-                out[:, done : done + tile.wanted] = launches.values(tile)
+                for number, row in enumerate(out):
+                    row[done : done + tile.wanted] = launches.channel(tile, number)
 
             self._tiles.for_each(start, count, 4 * plan.n_rows, work)
         return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -63,11 +64,7 @@ class Tile:
 
 
 class Tiles:
-    """Division of a device's work into tiles of at most `largest` realisations.
-
-    Progress is called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the
-    work.
-    """
+    """Division of a device's work into tiles of at most `largest` realisations; progress as for `Engine`."""
 
     def __init__(self, device: Device, *, progress: Progress | None = None, largest: int | None = None) -> None:
         self._device, self._progress, self._largest, self._step = device, progress, largest, device.step
@@ -83,7 +80,10 @@ class Tiles:
         total: int | None = None,
     ) -> None:
         """Call `work(tile, done)` for each tile, with smaller tiles if the device's memory does not suffice."""
-        size, done = self.size(bytes_each), 0
+        memory = min(TILE_BYTES, self._device.record.global_memory // 8)
+        fit = memory // bytes_each if bytes_each else LARGEST_TILE
+        fit = min(self._largest or LARGEST_TILE, LARGEST_TILE, max(fit, 1))
+        size, done = max(1 << (fit.bit_length() - 1), self._step), 0
         report: Progress = self._progress or (lambda done, total: None)
         if not before:
             report(0, total or count)
@@ -104,13 +104,6 @@ class Tiles:
                 continue
             done += tile.wanted
             report(before + done, total or count)
-
-    def size(self, bytes_each: int) -> int:
-        """Return the number of realisations per tile, a power of two, from the memory of the device."""
-        memory = min(TILE_BYTES, self._device.record.global_memory // 8)
-        fit = memory // bytes_each if bytes_each else LARGEST_TILE
-        size = min(self._largest or LARGEST_TILE, LARGEST_TILE, max(fit, 1))
-        return int(max(1 << (size.bit_length() - 1), self._step))
 
     def at(self, index: int, left: int, size: int) -> Tile:
         """Return the tile from `index` to a multiple of `size`, so that no tile crosses a multiple of 2**32."""
@@ -133,11 +126,13 @@ class Launches:
     """Buffers and launches of a scene; the buffers are released at the end of the `with` block."""
 
     def __init__(self, device: Device, scene: Scene, variant: Variant, seed: int) -> None:
+        if os.getpid() != device.pid:
+            # PoCL's threads do not survive a fork: its next call would wait forever.
+            raise DeviceError("this Engine was made before a fork; make one in this process (use spawn)")
         self._device, self._scene, self.variant = device, scene, variant
         self._cl, self._queue = device.cl, device.queue
         self._buffers: list[Any] = []
         self._named: dict[str, Any] = {}
-        self._kernels: dict[str, Any] = {}
         self._counted = 0
         self._subtractions: list[Any] = []
         job = scene.job.copy()
@@ -202,13 +197,11 @@ class Launches:
             buffer.release()
 
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
-        if name not in self._kernels:
-            # Kernels that are always used together are built together.
-            detection = COMPARED if self.variant.compared else DETECTION
-            kernel_files = detection if name in (detection[1], "tally", "marginalise") else (name,)
-            self._kernels[name] = self._device.kernel(kernel_files, self.variant, name)
+        # Kernels that are always used together are built together.
+        detection = COMPARED if self.variant.compared else DETECTION
+        kernel_files = detection if name in (detection[1], "tally", "marginalise") else (name,)
         local = (1,) * len(items) if self.variant.width > 1 else None
-        self._kernels[name](self._queue, items, local, *arguments)
+        self._device.kernel(kernel_files, self.variant, name)(self._queue, items, local, *arguments)
 
     def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
         """Draw the raw spectra of a tile into `out`, of uint16 or int32 and shape (tile.wanted, n_pixel).
@@ -287,12 +280,6 @@ class Launches:
         if self._subtractions:
             items = (tile.size // self.variant.width,)
             self._launch("marginalise", items, *self._subtractions, np.uint32(tile.size), values)
-
-    def values(self, tile: Tile) -> NDArray[np.float32]:
-        """Return the channels of the last computed tile, shape (n_channel, tile.wanted)."""
-        host = np.empty((self._rows, tile.size), np.float32)
-        self._cl.enqueue_copy(self._queue, host, self._named["values"])
-        return host[:, tile.start : tile.stop]
 
     def channel(self, tile: Tile, number: int) -> NDArray[np.float32]:
         """Return one channel of the last computed tile, shape (tile.wanted,)."""

@@ -13,20 +13,9 @@ from mauvecl.detection.requests import Shard
 from mauvecl.detection.snr import Arrays
 from mauvecl.device.build import Device, Variant
 from mauvecl.device.launches import TILE_BYTES, Launches, Progress, Tile, Tiles, contiguous, padded
+from mauvecl.flares import stare_scene
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
-from mauvecl.flares.stare_scene import (
-    Flares,
-    KeepStatistics,
-    Method,
-    StareNumber,
-    StareScene,
-    StaresRequest,
-    SumTable,
-    check_sums,
-    joined,
-    padded_frames,
-)
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -96,10 +85,10 @@ class Stares:
         stare: Stare,
         flare: NDArray[Any] | None = None,
         *,
-        first: StareNumber = 0,
+        first: stare_scene.StareNumber = 0,
         count: Realisations = 1,
         seed: Seed = DEFAULT_SEED,
-        method: Method = "pixels",
+        method: stare_scene.Method = "pixels",
         amplitudes: NDArray[Any] | None = None,
         processes: Processes = NONE,
     ) -> Floats:
@@ -125,42 +114,33 @@ class Stares:
         Returns
         -------
         ndarray of float32, shape (count, n_frame, n_statistic)
-            Weighted sums over pixels of raw counts minus the quiescent mean; frames of a statistic are contiguous in
-            memory. With `amplitudes`, the shape is (n_scenario, count, n_frame, n_statistic).
+            Weighted sums over pixels of raw counts minus the quiescent mean. With `amplitudes`, the shape is
+            (n_scenario, count, n_frame, n_statistic).
         """
-        _check_last(first, count)
-        flares = Flares.of(components, stare, flare, amplitudes, count)
-        shape = (len(flares.amplitudes), count, components.n_statistics, padded_frames(stare.n_frames))
-        out = np.empty(shape, np.float32)
-        with self._launches(components, stare, flares, seed, method, processes) as launches:
+        request = stare_scene.StaresRequest(components, stare, count, seed, flare, amplitudes, first, method, processes)
+        values: Floats = self.reduced(request)["values"]
+        return values if amplitudes is None else np.moveaxis(values, 0, 1)
 
-            def work(tile: Tile, done: int) -> None:
-                launches.upload_flares(flares.part(done, tile.wanted), first + done, tile.wanted)
-                launches.draw(tile, out, done)
-
-            self._tiles.for_each(first, count, out[:, 0].nbytes, work)
-        frames = np.moveaxis(out[..., : stare.n_frames], 2, 3)
-        return frames[0] if amplitudes is None else frames
-
-    def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
+    def reduced(self, request: stare_scene.StaresRequest, shard: Shard | None = None) -> Arrays:
         """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
 
         Return the joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
         """
         there = shard or Shard(0, request.start, request.realisations)
-        _check_last(there.start, there.count)
-        components, stare, reduction = request.components, request.stare, request.reduction or KeepStatistics()
-        how = (request.seed, request.method, request.processes)
+        if there.start + there.count > 2**64:
+            raise InputError.of("first", there.start, f"at most {2**64 - there.count} for {there.count} stares")
+        components, stare = request.components, request.stare
+        reduction = request.reduction or stare_scene.KeepStatistics()
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()
-        shape = (components.n_statistics, padded_frames(stare.n_frames))
+        shape = (components.n_statistics, stare_scene.padded_frames(stare.n_frames))
         each = 4 * len(request.flares.amplitudes) * shape[0] * shape[1]
         # Pieces are small enough for a processor's cache; the cumulants need no full vector of long stares.
         step = 1 if request.method == "cumulants" else self.open_device.width
         piece = max(step, REDUCED_BYTES // each // step * step)
         room = np.empty(each * piece // 4, np.float32)
         glow = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
-        with self._launches(components, stare, request.flares, *how) as launches:
+        with StareLaunches(self.open_device, request) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 reduced = []
@@ -168,7 +148,7 @@ class Stares:
                     out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
                     first = few.first + few.start
                     launches.upload_flares(request.flares.part(first - request.start, few.wanted), first, few.wanted)
-                    launches.draw(few, out, 0)
+                    launches.draw(few, out)
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
                     more = []
                     if request.glow:
@@ -179,42 +159,26 @@ class Stares:
                 parts.extend(reduced)
 
             self._tiles.for_each(there.start, there.count, each, work)
-        arrays = joined(parts, adds=reduction.adds)
+        arrays = stare_scene.joined(parts, adds=reduction.adds)
         return arrays | {"start": np.array(there.start)} if shard else arrays
-
-    def _launches(
-        self, components: Components, stare: Stare, flares: Flares, seed: int, method: Method, processes: Processes
-    ) -> StareLaunches:
-        self.open_device.check_process()
-        scene = _scene_of(components, stare, processes)
-        scene.check(flares)
-        if method == "cumulants":
-            check_sums(scene, flares)
-        return StareLaunches(self.open_device, scene, seed, method)
-
-
-#: Cached because callers draw a few stares of the same star at a time.
-_scene_of = lru_cache(maxsize=4)(StareScene.of)
-
-
-def _check_last(first: int, count: int) -> None:
-    """Raise InputError if the last stare has no number of 64 bits."""
-    if first + count > 2**64:
-        raise InputError.of("first", first, f"at most {2**64 - count} for {count} stares")
 
 
 #: Frames per work-item of the kernels whose lanes are frames.
 FRAMES_EACH = 1024
-#: Cached because callers draw a few stares at a time with the same weights.
-table_of = lru_cache(maxsize=4)(SumTable.of)
+#: Cached because callers draw a few stares of the same star, with the same weights, at a time.
+_scene_of, _table_of = lru_cache(maxsize=4)(stare_scene.StareScene.of), lru_cache(maxsize=4)(stare_scene.SumTable.of)
 
 
 class StareLaunches(Launches):
     """Buffers and launches of a stare; the buffers are released at the end of the `with` block."""
 
-    def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
-        self._by_sums = method == "cumulants"
-        table = table_of(stare.components) if self._by_sums else None
+    def __init__(self, device: Device, request: stare_scene.StaresRequest) -> None:
+        stare = _scene_of(request.components, request.stare, request.processes)
+        stare.check(request.flares)
+        self._by_sums = request.method == "cumulants"
+        if self._by_sums:
+            stare_scene.check_sums(stare, request.flares)
+        table = _table_of(stare.components) if self._by_sums else None
         scene = stare.scene
         variant = replace(
             device.variant,
@@ -230,8 +194,8 @@ class StareLaunches(Launches):
             jittered=any(stare.stare.jitters.values()),
             in_time=self._by_sums,
         )
-        super().__init__(device, scene, variant, seed)
-        self._seed = seed
+        super().__init__(device, scene, variant, request.seed)
+        self._seed = request.seed
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
@@ -240,7 +204,7 @@ class StareLaunches(Launches):
         else:
             self._own = [self.upload(table.packed)]
 
-    def upload_flares(self, flares: Flares, first: int, count: int) -> None:
+    def upload_flares(self, flares: stare_scene.Flares, first: int, count: int) -> None:
         """Upload the flares and the pointing losses of the next `count` stares."""
         self._scenarios, losses = len(flares.amplitudes), np.zeros(0, np.float32)
         if self.variant.pointing:
@@ -260,70 +224,37 @@ class StareLaunches(Launches):
         self._cl.enqueue_copy(self._queue, buffer, data)
         return buffer
 
-    def draw(self, tile: Tile, out: Floats, row: int) -> None:
-        """Draw the statistics of a tile's frames into `out`, in which `row` is the index of the tile's first stare.
-
-        `out` is of float32 and of shape (n_scenario, n_stare, n_statistic, n_padded_frame).
-        """
+    def draw(self, tile: Tile, out: Floats) -> None:
+        """Draw the statistics of a tile's frames into `out`, shape (n_scenario, n_stare, n_statistic, n_padded)."""
         if self._by_sums:
-            self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
+            self._in_frames("stare_sums", self.variant, self._own, tile, out)
             return
         # Pixels are drawn a few frames of all stares at a time.
-        out = out[:, row : row + tile.wanted]
         tile = tile.narrow(self.variant.width)
         n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
         block = max(1, TILE_BYTES // (4 * each))
         # The number of scenarios is rounded up to a power of two, so that few programs are built.
         variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
         kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
+        common = (*self._arguments, *self._flares, *tile.address(), *tile.rows())
         for begin in range(0, n_frames, block):
             size = min(block, n_frames - begin)
-            values = self._scratch("values", 4 * each * size)
-            kernel(
-                self._queue,
-                (tile.size // self.variant.width, size),
-                self._local,
-                *self._arguments,
-                *self._flares,
-                *tile.address(),
-                *tile.rows(),
-                np.uint32(begin),
-                *self._own,
-                np.uint32(tile.size),
-                values,
-            )
+            items, values = (tile.size // self.variant.width, size), self._scratch("values", 4 * each * size)
+            own = (np.uint32(begin), *self._own, np.uint32(tile.size))
+            kernel(self._queue, items, self._local, *common, *own, values)
             host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
             self._cl.enqueue_copy(self._queue, host, values)
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
 
     def glow(self, tile: Tile, out: Floats) -> None:
-        """Compute the values with which `Injections` add flares to a tile's frames.
+        """Compute what `Injections` need to add flares, into `out`, shape (1, n_stare, n_statistic + 1, n_padded)."""
+        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out)
 
-        `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
-        """
-        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, 0)
-
-    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
-        """Launch a kernel whose lanes are frames."""
-        first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
+    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats) -> None:
+        """Launch a kernel whose lanes are frames, and which fills the first stares of `out`."""
+        each = FRAMES_EACH if variant.width > 1 else 1
         kernel = self._device.kernel(("stare", name), variant, name)
-        # A CPU writes to `out`; a buffer of another device contains only this tile.
-        shares_memory = self._device.record.kind == "cpu"
-        place = (out.shape[1], row) if shares_memory else (tile.wanted, 0)
-        host = out if shares_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
-        with self._output("values", host) as values:
-            kernel(
-                self._queue,
-                (tile.wanted, -(-out.shape[3] // each)),
-                self._local,
-                self._arguments[0],
-                *self._flares,
-                np.uint32(first & 0xFFFFFFFF),
-                np.uint32(first >> 32),
-                np.uint32(each),
-                *own,
-                *map(np.uint32, place),
-                values,
-            )
-        if not shares_memory:
-            out[:, row : row + tile.wanted] = host
+        items, place = (tile.wanted, -(-out.shape[3] // each)), (np.uint32(out.shape[1]), np.uint32(0))
+        common = (self._arguments[0], *self._flares, *tile.narrow(1).address(), np.uint32(each))
+        with self._output("values", out) as values:
+            kernel(self._queue, items, self._local, *common, *own, *place, values)

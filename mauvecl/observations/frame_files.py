@@ -37,8 +37,7 @@ from mauvecl.observations.stored_frames import (
     Light,
     PixelStatistics,
     StoredFile,
-    open_hdf5,
-    open_store,
+    open_stored,
     stored_in_fits,
     weighted_sums,
     whole_or_reduced,
@@ -94,7 +93,7 @@ def read_frames(
             how = file.mapping(raw=True)
         if quality_bits is not None:
             how = how.model_copy(update={"quality_bits": quality_bits})
-        return _frames_in(file, how, stem)
+        return _frames_in(file, Quantities.of(file, how), how, stem)
 
 
 def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any = None) -> Frames:
@@ -129,7 +128,8 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         container = Table(columns, meta=dict(container.meta or {}), units=units)
         mapping = FrameMapping(**dict(zip(columns, columns, strict=True)))
     file = MemoryTable(container, type(container).__name__)
-    return _frames_in(file, mapping or recognised(file), str(container.meta.get("LABEL", "frames")))
+    mapping = mapping or recognised(file)
+    return _frames_in(file, Quantities.of(file, mapping), mapping, str(container.meta.get("LABEL", "frames")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +155,13 @@ def reduce_frames(
     mapping : FrameMapping or path, optional
     """
     with _frame_file(path, mapping) as (file, how, stem):
-        _, flux, error, _ = _light(found := Quantities.of(file, how), how)
+        found = Quantities.of(file, how)
+        _, flux, error, _ = _light(found, how)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
         quality = _masked(found.quality, QualityBits.of(file.header, how.quality_bits, file.what))
         lights, pixels = weighted_sums(flux, error, quality, weights)
-        return ReducedFrames(tuple(_frames_in(file, how, stem, light) for light in lights), pixels)
+        return ReducedFrames(tuple(_frames_in(file, found, how, stem, light) for light in lights), pixels)
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ def _frame_file(
         if not place.is_dir():
             opened = _opened(place, what, name, how, check, large=True)
         elif (place / "zarr.json").is_file():
-            opened = open_store(place, name, what)
+            opened = open_stored(place, what, name)
         elif how is None:
             fault = f"{what} is not a store of spectra; give a mapping that says where its quantities are"
             raise InputError(fault, key="mapping")
@@ -213,7 +214,7 @@ def _opened(
     def of_fits(hdus: Any, what: str) -> TableFile:
         return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, wanted)
 
-    return open_table(path, what, check=check, large=large, of_fits=of_fits, of_hdf5=partial(open_hdf5, name=name))
+    return open_table(path, what, check=check, large=large, of_fits=of_fits, of_hdf5=partial(open_stored, name=name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,24 +236,18 @@ class Quantities:
         names = {name: getattr(mapping, name) for name in ("flux", "error", "quality", "exposure", "temperature")}
         found: dict[str, Any] = {key: None if name is None else file.find(name) for key, name in names.items()}
         one = cls(times, **found, wavelength=_wavelength(file, mapping))
-        nm, flux = one.wavelength, one.flux
-        if nm is None or not nm.shape == flux.shape == times[0].shape or isinstance(file, FolderFile):
-            _check_rows(file, one)
-            return replace(one, quality=_flags(one.quality))
-        if 32 * flux.n_rows > (most := limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")):
-            fault = f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}"
-            limit = "MAUVECL_LARGEST_CONTENT_MIB"
-            raise InputError(f"{fault}; {limit} sets the limit", key=limit)
-        one = replace(one, quality=_flags(one.quality))._of_frames(nm, file.what)
+        nm, flux, limit = one.wavelength, one.flux, "MAUVECL_LARGEST_CONTENT_MIB"
+        if nm is not None and nm.shape == flux.shape == times[0].shape and not isinstance(file, FolderFile):
+            if 32 * flux.n_rows > (most := limit_bytes(limit)):
+                fault = f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}"
+                raise InputError(f"{fault}; {limit} sets the limit", key=limit)
+            one = replace(one, quality=_flags(one.quality))._of_frames(nm, file.what)
         _check_rows(file, one)
-        return one
+        # Those of pixels are left as they are.
+        return replace(one, quality=_flags(one.quality))
 
     def _of_frames(self, wavelength: Values, what: str) -> Quantities:
-        """Return the quantities of a long table with a row for each frame; errors and flags for each pixel.
-
-        Raises InputError if a frame lacks a wavelength that another has, has one twice, or has two exposure times or
-        temperatures.
-        """
+        """Return the quantities of a long table with a row for each frame; errors and flags for each pixel."""
         frames, frame = np.unique(_keys(self.time[0]), return_inverse=True)
         pixels, pixel = np.unique(wavelength.numbers(), return_inverse=True)
         number = frame * pixels.size + pixel
@@ -330,8 +325,16 @@ def _check_rows(file: TableFile, found: Quantities) -> None:
     if not 0 < n <= MAX_FRAMES:
         expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
         raise InputError(f"{what} must have {expected}", key="frames")
-    if found.wavelength is None:
-        _check_one_source(file)
+    # A light curve is that of one star in one band.
+    groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS and found.wavelength is None]
+    for group in (one for one in groups if len(one.shape) == 1):
+        name, texts = group.name, group.texts()
+        cells = map(str, np.unique(group.numbers())) if texts is None else texts
+        held = sorted({cell for cell in cells if not is_missing(cell)})
+        # The filter of ATLAS is called F, as is the light of others.
+        if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):
+            fault = f"{what} must hold the light of one star in one band, but has rows of {len(held)} different"
+            raise InputError(f"{fault} {name!r} ({shortened(', '.join(held), 80)}); divide the table", key="flux")
     for values in (*found.time, found.flux, found.error, found.quality, found.exposure, found.temperature):
         if values is not None and values.n_rows != n:
             fault = f"{what}: {values.name!r} must have {n} rows, as the times do, but has {values.n_rows}"
@@ -386,10 +389,11 @@ def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float |
     return light, sd, unit, said
 
 
-def _frames_in(file: TableFile, mapping: FrameMapping, stem: str, reduced: Light | None = None) -> Frames:
-    """Build frames from a file and the names of its quantities; with `reduced` light, which is not read again."""
+def _frames_in(
+    file: TableFile, found: Quantities, mapping: FrameMapping, stem: str, reduced: Light | None = None
+) -> Frames:
+    """Build frames from a file and its quantities; with `reduced` light, which is not read again."""
     what, header = file.what, file.header
-    found = Quantities.of(file, mapping)
     time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
     each = _conditions(file, found, mapping, between_edges_s)
     bits = QualityBits.of(header, mapping.quality_bits, what)
@@ -452,22 +456,6 @@ def _read_light(
     if found.quality is not None and len(found.quality.shape) == 1:
         flags = found.quality.numbers()
     return light, sd, flags, unit, remarks
-
-
-def _check_one_source(file: TableFile) -> None:
-    """Raise InputError if a column says that the rows are of several bands or stars."""
-    groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS]
-    for values in (one for one in groups if len(one.shape) == 1):
-        name, texts = values.name, values.texts()
-        cells = map(str, np.unique(values.numbers())) if texts is None else texts
-        held = sorted({cell for cell in cells if not is_missing(cell)})
-        # The filter of ATLAS is called F, as is the light of others.
-        if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):
-            raise InputError(
-                f"{file.what} must hold the light of one star in one band, but has rows of {len(held)} different "
-                f"{name!r} ({shortened(', '.join(held), 80)}); divide the table",
-                key="flux",
-            )
 
 
 def _masked(quality: Values | None, bits: QualityBits) -> Values | None:

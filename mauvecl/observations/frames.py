@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
@@ -131,25 +131,25 @@ class Reason(IntFlag):
 
 def _cadence_of(name: str, time: Float, light: Float) -> float:
     """Return the median step of times; raise InputError for frames of a wrong shape or size, too near or too far."""
-    n = time.size
+    n, refused = time.size, partial(InputError.of, where=name)
     if time.ndim != 1 or light.ndim not in (1, 2) or len(light) != n:
-        raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
+        raise refused("shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
     if not MIN_FRAMES <= n <= MAX_FRAMES:
-        raise _bad(name, "frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
+        raise refused("frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
     if (beyond := light[np.isfinite(light) & (np.abs(light) > MAX_FLUX)]).size:
-        raise _bad(name, "flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
+        raise refused("flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
     if not np.isfinite(time).all():
-        raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
-                   "finite times")  # fmt: skip
+        row = int(np.argmin(np.isfinite(time)))
+        raise refused("time", f"{time[row]} in row {row}", "finite times")
     step = np.diff(np.sort(time))
     cadence = float(np.median(step))
     if not cadence > 0 or (step < MIN_STEP * cadence).any():
         least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
         least = least if cadence > 0 else "a different time for each frame"
-        raise _bad(name, "time", f"{step.min():g} s from one frame to the next", least)
+        raise refused("time", f"{step.min():g} s from one frame to the next", least)
     if not (span := float(np.ptp(time))) <= MAX_SPAN * cadence:
         most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
-        raise _bad(name, "time", f"{span:g} s from the first frame to the last", most)
+        raise refused("time", f"{span:g} s from the first frame to the last", most)
     return cadence
 
 
@@ -204,36 +204,36 @@ class Frames:
             Other attributes.
         """
         time, light = np.asarray(time_s, np.float64), np.asarray(flux, np.float64)
-        cadence = _cadence_of(name, time, light)
+        cadence, refused = _cadence_of(name, time, light), partial(InputError.of, where=name)
         n, order = time.size, np.argsort(time, kind="stable")
         if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
-            raise _bad(name, "quality", "a value that is not finite", "whole numbers")
+            raise refused("quality", "a value that is not finite", "whole numbers")
         if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
-            raise _bad(name, "exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
+            raise refused("exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
         exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
         if not (np.isfinite(exposure) & (exposure > 0)).all():
-            raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+            raise refused("exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
         each: dict[str, Any] = {"error": error, "temperature_c": how.pop("temperature_c", None),
                                 "quality": np.zeros(n) if quality is None else quality}  # fmt: skip
         for key, given in each.items():
             if given is not None:
                 values = np.asarray(given, np.int64 if key == "quality" else np.float64)
                 if values.shape != (shape := light.shape if key == "error" else (n,)):
-                    raise _bad(name, key.removesuffix("_c"), values.shape, f"the shape {shape}")
+                    raise refused(key.removesuffix("_c"), values.shape, f"the shape {shape}")
                 each[key] = values[order]
         made = cls(time[order], exposure[order], light[order], name=name, **each, **how)
         if (np.diff(time) < 0).any():
             made = made.with_remarks((f"the times of {name} are not ascending; its frames were sorted by time",))
         wavelength = made.wavelength_nm
         if (wavelength is None) != (light.ndim == 1) or (wavelength is not None and wavelength.size != light.shape[1]):
-            raise _bad(name, "wavelength", None if wavelength is None else wavelength.shape,
-                       "one wavelength for each pixel of spectra, none for a light curve")  # fmt: skip
+            found = None if wavelength is None else wavelength.shape
+            raise refused("wavelength", found, "one wavelength for each pixel of spectra, none for a light curve")
         return made if wavelength is None else made._with_sorted_live_pixels(wavelength)
 
     def _with_sorted_live_pixels(self, wavelength: Float) -> Self:
         """Return spectra in order of wavelength, without the pixels that are not finite in most frames."""
         if not (np.isfinite(wavelength).all() and (wavelength > 0).all()):
-            raise _bad(self.name, "wavelength", float(wavelength.min()), "wavelengths above 0 nm")
+            raise InputError.of("wavelength", float(wavelength.min()), "wavelengths above 0 nm", where=self.name)
         finite = np.isfinite(self.flux) if self.error is None else np.isfinite(self.flux) & np.isfinite(self.error)
         live = live_pixels(finite.sum(axis=0), self.n_frames, self.name)
         order = np.argsort(wavelength, kind="stable")
@@ -332,10 +332,6 @@ def dead_pixel_remarks(number: int, name: str) -> tuple[str, ...]:
     """Return the remark on pixels that are left out; none for no pixel."""
     words = "1 pixel is" if number == 1 else f"{number} pixels are"
     return (f"{words} not finite in most frames of {name} and left out",) if number else ()
-
-
-def _bad(name: str, key: str, value: Any, expected: str) -> InputError:
-    return InputError.of(key, value, expected, where=name)
 
 
 #: Speed of light, km/s (exact).

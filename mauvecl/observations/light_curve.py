@@ -12,16 +12,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
 from mauvecl.host.arrays import true_runs
-from mauvecl.observations.detection import (
-    END_FRAMES,
-    LONG_S,
-    PROVISIONAL,
-    alternate,
-    criterion,
-    detect_events,
-    fit_quiet_light,
-    light_of_events,
-)
+from mauvecl.observations import detection
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import (
     FAR,
@@ -77,7 +68,6 @@ class Loss(Shape):
 
     name = "loss"
     source = "assumed"
-    peak_at = 0.0
     square_integral = 2.0
 
     def at(self, tau: ArrayLike) -> Float:
@@ -114,12 +104,12 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
-    guessed = detect_events(down, PROVISIONAL, steps)[1]
+    guessed = detection.detect_events(down, detection.PROVISIONAL, steps)[1]
 
     @cache
     def usual() -> float:
         """Return the criterion of flares without losses."""
-        return criterion(fitted, light_of_events(fitted, taken), taken)
+        return detection.criterion(fitted, detection.light_of_events(fitted, taken), taken)
 
     # Those of a star that varies are most of its frames; eclipses repeat.
     if active and guessed.mean() >= MOST_LOST:
@@ -127,14 +117,15 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
         if lost.any():
             none[dark] = lost
             return none
-    other, losses = alternate(down, guessed, None, steps)
+    other, losses = detection.alternate(down, guessed, None, steps)
     # The star is constant between losses, or before and after one; not only before or after a step.
-    returns = np.count_nonzero(np.diff(true_runs(~losses)) > END_FRAMES) > 1
+    returns = np.count_nonzero(np.diff(true_runs(~losses)) > detection.END_FRAMES) > 1
     constant = returns and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
         simpler = constant and losses.mean() < taken.mean() and process.excess > MOST_EXCESS
-        if simpler or criterion(other, light_of_events(other, losses), losses, shapeless=True) < usual():
+        light = detection.light_of_events(other, losses)
+        if simpler or detection.criterion(other, light, losses, shapeless=True) < usual():
             none[dark] = losses
     return none
 
@@ -146,23 +137,23 @@ def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     if not 0 < guessed.mean() < MOST_LOST:
         return none
     part = survey.frames(~guessed)
-    fitted, taken = fit_quiet_light(part, guess_flares(part.stare.numbers, part.flux))
+    fitted, taken = detection.fit_quiet_light(part, guess_flares(part.stare.numbers, part.flux))
     # The light in eclipses may have any smooth shape.
     dim = survey.frames(guessed)
     data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
     size = float(np.log(guessed.size))
     cost = EPHEMERIS * size + criterion_of_process(fit_process(data), data, size)
-    if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual():
+    if detection.criterion(fitted, detection.light_of_events(fitted, taken), taken) + cost >= usual():
         return none
     quiet = ~guessed
     quiet[quiet] = ~taken
     whole = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
-    sigma = uniform_filter1d(whole.along(0, quiet), END_FRAMES)
+    sigma = uniform_filter1d(whole.along(0, quiet), detection.END_FRAMES)
     # Frames at the ends of the guess that are as bright as the star are searched.
     for first, end in true_runs(guessed):
         faint = first + np.flatnonzero(sigma[first:end] < -FAINT)
         if faint.size:
-            none[max(first, faint[0] - END_FRAMES) : min(end, faint[-1] + END_FRAMES + 1)] = True
+            none[max(first, faint[0] - detection.END_FRAMES) : min(end, faint[-1] + detection.END_FRAMES + 1)] = True
     return none
 
 
@@ -259,7 +250,7 @@ def survey_light_curve(
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
-        survey, taken = fit_quiet_light(new, guessed[used], survey, fits)
+        survey, taken = detection.fit_quiet_light(new, guessed[used], survey, fits)
         if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken, fits)).any():
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
@@ -293,7 +284,7 @@ def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], 
     check_usable(frames, reasons)
     if counts is None:
         reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
-        if np.ptp(frames.time_s) > LONG_S:
+        if np.ptp(frames.time_s) > detection.LONG_S:
             at = np.flatnonzero(reasons == 0)
             relative = relative_level(frames.time_s[at], frames.numbers[at], flux[at], frames.cadence_s)
             # Frames that are not searched have the level of the next one that is.

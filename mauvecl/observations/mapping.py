@@ -11,24 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
+from mauvecl.host.tables import units
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
 from mauvecl.host.tables.table import TableFile, Values, converted, unit_in, unit_in_name
-from mauvecl.host.tables.units import (
-    EPOCHS_MJD,
-    MISSIONS,
-    SCALES,
-    TimeSystem,
-    TimeUnit,
-    is_dated,
-    mjd_of,
-    offline,
-    position_of,
-    scale_of,
-    seconds_from_first,
-    time_in_name,
-    time_unit,
-)
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Accepted
 from mauvecl.schema.physical import DAY_S, Exposure
@@ -83,8 +69,8 @@ class FrameMapping(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.scale and scale_of(self.scale) not in SCALES.values():
-            raise InputError.of("scale", self.scale, f"one of {', '.join(sorted(set(SCALES.values())))}")
+        if self.scale and units.scale_of(self.scale) not in units.SCALES.values():
+            raise InputError.of("scale", self.scale, f"one of {', '.join(sorted(set(units.SCALES.values())))}")
         given = [self.exposure is not None, self.exposure_s is not None, not isinstance(self.time, str)]
         if sum(given) > 1:
             fault = "the exposure time is given twice; give only one of exposure, exposure_s and two columns of time"
@@ -110,15 +96,15 @@ class FrameMapping(Record):
         """Modified Julian date of time zero, or None if unknown."""
         if self.epoch is None:
             return None
-        if self.epoch.lower() in EPOCHS_MJD:
-            return EPOCHS_MJD[self.epoch.lower()]
+        if self.epoch.lower() in units.EPOCHS_MJD:
+            return units.EPOCHS_MJD[self.epoch.lower()]
         from mauvecl.host.exposure.background import parse_time
 
-        with offline():
+        with units.offline():
             try:
                 return float(parse_time(self.epoch).mjd)
             except InputError as error:
-                expected = f"one of {', '.join(EPOCHS_MJD)}, or a date such as 2026-03-01T12:00:00"
+                expected = f"one of {', '.join(units.EPOCHS_MJD)}, or a date such as 2026-03-01T12:00:00"
                 raise InputError.of("epoch", self.epoch, expected) from error
 
 
@@ -143,9 +129,9 @@ DATES_MJD = (-5000.0, 150_000.0)
 #: in TCB less 2455197.5 (documentation of vari_epoch_photometry), and GALEX, Unix time less 315964800 s (user guide of
 #: gPhoton), of which the columns are those of gPhoton's light curves.
 TIMES_OF_COLUMNS = (
-    ({"transit_id", "rejected_by_photometry"}, TimeUnit("d", 55_197.0, "tcb", "BARYCENTER"),
+    ({"transit_id", "rejected_by_photometry"}, units.TimeUnit("d", 55_197.0, "tcb", "BARYCENTER"),
      "days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"),
-    ({"t0", "t1", "cps", "cps_err"}, TimeUnit("s", EPOCHS_MJD["gps"], "utc"),
+    ({"t0", "t1", "cps", "cps_err"}, units.TimeUnit("s", units.EPOCHS_MJD["gps"], "utc"),
      "seconds from 1980-01-06 in UTC, as in GALEX light curves of gPhoton"),
 )  # fmt: skip
 #: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
@@ -161,7 +147,7 @@ def recognised(file: TableFile) -> FrameMapping:
     names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
     columns: dict[str, Any] = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
     if columns["time"] is None:
-        said = {name: found for name in names if (found := time_in_name(name)) is not None}
+        said = {name: found for name in names if (found := units.time_in_name(name)) is not None}
         dated = [name for name, one in said.items() if one.epoch_mjd is not None]
         for place in ("BARYCENTER", "HELIOCENTER"):
             # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
@@ -201,17 +187,18 @@ def recognised(file: TableFile) -> FrameMapping:
 
 def times_of(
     time: tuple[Values, ...], file: TableFile, mapping: FrameMapping
-) -> tuple[Float, Float | None, TimeSystem, tuple[str, ...]]:
+) -> tuple[Float, Float | None, units.TimeSystem, tuple[str, ...]]:
     """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
     import astropy.units as u
 
-    stated = TimeSystem.of(file.header, file.what)
-    scale, position = scale_of(mapping.scale) or stated.scale, position_of(mapping.position) or stated.position
+    stated = units.TimeSystem.of(file.header, file.what)
+    scale = units.scale_of(mapping.scale) or stated.scale
+    position = units.position_of(mapping.position) or stated.position
     epoch, remarks = mapping.epoch_mjd, []
     texts = [one.texts() for one in time]
-    if all(text is not None and any(is_dated(cell) for cell in text) for text in texts):
+    if all(text is not None and any(units.is_dated(cell) for cell in text) for text in texts):
         scale, unit, epoch, offset = scale or stated.default_scale or "utc", u.d, 0.0, 0.0
-        edges = [mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
+        edges = [units.mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
         if not (mapping.scale or stated.scale or stated.default_scale):
             remarks.append(f"the dates of {file.what} state no time scale and are assumed to be in UTC")
     else:
@@ -228,7 +215,7 @@ def times_of(
             f"{time[0].name} of {file.what} is in TT, as in all files of CHEOPS; UTC is the scale of its other dates"
         )
     exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
-    seconds, first_d = seconds_from_first(np.mean(edges, axis=0) + offset, unit)
+    seconds, first_d = units.seconds_from_first(np.mean(edges, axis=0) + offset, unit)
     at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
     if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
         span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))
@@ -239,22 +226,19 @@ def times_of(
 
 
 def _time_unit(
-    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
-) -> tuple[TimeUnit, list[str]]:
-    """Return the unit of times and what it says of their zero, by the mapping, the column, its name or the header.
-
-    Raises InputError if it contradicts the header.
-    """
+    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: units.TimeSystem
+) -> tuple[units.TimeUnit, list[str]]:
+    """Return the unit of times and what it says of their zero, by the mapping, the column, its name or the header."""
     if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
         names = " and ".join(repr(one.name) for one in time)
         raise InputError(f"{file.what}: {names} must have the same unit, but have different units", key="time")
     text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
-    named = time_in_name(time[0].name)
-    said = time_unit(text) if text else named
-    if said is None and (text := text or stated.unit) and (said := time_unit(text)) is None:
+    named = units.time_in_name(time[0].name)
+    said = units.time_unit(text) if text else named
+    if said is None and (text := text or stated.unit) and (said := units.time_unit(text)) is None:
         # Checks the unit; times keep theirs, so that long times lose no digits.
         converted(replace(time[0], unit=text), None, "s", "time_unit")
-        said = TimeUnit(str(unit_in(text)))
+        said = units.TimeUnit(str(unit_in(text)))
     remarks = list[str]()
     if said is None:
         held = {*map(key_of, file.columns)}
@@ -262,12 +246,12 @@ def _time_unit(
             said, text = known[0]
         else:
             keywords = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
-            mission = next((one for one in MISSIONS if one in keywords), None)
+            mission = next((one for one in units.MISSIONS if one in keywords), None)
             finite = values[np.isfinite(values)]
             if mission is None or not (finite.size and 0 < float(np.median(finite)) < 20_000):
                 converted(time[0], None, "s", "time_unit")
-            name = MISSIONS[mission or "TESS"].upper()
-            said, text = time_unit(name) or TimeUnit("d"), f"{name}, days, as in files of {mission}"
+            name = units.MISSIONS[mission or "TESS"].upper()
+            said, text = units.time_unit(name) or units.TimeUnit("d"), f"{name}, days, as in files of {mission}"
         remarks = [f"ASSUMED: the times of {file.what} are {text}; it states no unit"]
     elif said.epoch_mjd is None and named is not None and named.unit == said.unit:
         said = named

@@ -73,20 +73,27 @@ class SeriesSurvey:
     @classmethod
     def of(
         cls, frames: Frames, flux: Float, variance: Float, used: Bool, level: float, photon: float, shape: Shape,
-        counts: float = 0.0,
+        counts: float = 0.0, weighted: tuple[Templates, Float] | None = None,
     ) -> SeriesSurvey:  # fmt: skip
-        """Prepare the frames of a light curve that can be searched, `used`, without a process; see the attributes."""
+        """Prepare the frames that can be searched, `used`, without a process; see the attributes.
+
+        What is searched is the flux, or sums of spectra, given `weighted` with their templates.
+        """
         stare = stare_of(frames, used)
         scale = float(np.sqrt(np.median(variance[used])))
         typical = abs(level)
-        size, noise = typical / scale, photon * typical / scale**2
-        templates = Templates(
-            (NO_COLOUR_K,), np.ones((1, 1)), np.full((1, 1), size), np.array([size]), np.full((1, 1, 1), noise)
-        )
         net, part = flux[used] / scale, variance[used] / scale**2
+        if weighted is None:
+            size, noise, directions, sums = typical / scale, photon * typical / scale**2, np.ones((1, 1)), net[:, None]
+            templates = Templates(
+                (NO_COLOUR_K,), directions, np.full((1, 1), size), np.array([size]), np.full((1, 1, 1), noise)
+            )
+        else:
+            templates, sums = weighted[0], weighted[1][used]
+            directions = templates.directions[list(templates.chosen)]
         return cls(
-            stare, bank_of(stare, np.ones((1, 1)), shape), templates, net[:, None], part, (WHITE,), net, WHITE, scale,
-            typical, photon, frames.time_s[used], counts,
+            stare, bank_of(stare, directions, shape), templates, sums, part, (WHITE,) * sums.shape[1], net, WHITE,
+            scale, typical, photon, frames.time_s[used], counts, weighted is not None,
         )  # fmt: skip
 
     @cached_property

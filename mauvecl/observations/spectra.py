@@ -30,13 +30,12 @@ from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_curve import check_usable, quiescent_light
 from mauvecl.observations.process import UNREPORTED, Steps
-from mauvecl.observations.search import MIN_BASELINE, WHITE, DetectedEvent, SeriesSurvey, bank_of, stare_of
+from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
 
 if TYPE_CHECKING:
     from mauvecl.flares.shapes import Shape
-    from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -144,7 +143,8 @@ def survey_spectra(
     """
     fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
-    flux, _ = frames.white_light
+    flux, error = frames.white_light
+    assert error is not None
     reasons = frames.faults | np.where(cleaned.saturated, Reason.SATURATED, 0)
     check_usable(frames, reasons)
     used = reasons == 0
@@ -152,8 +152,11 @@ def survey_spectra(
     events[used] = guess_flares(frames.numbers[used], flux[used])
     for _ in range(ROUNDS):
         series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
-        typical = abs(float(np.median(flux[used & ~events])))
-        survey = _survey(frames, series, templates, sums, used, shape, typical)
+        lit, level = np.maximum(series.light, 0.0), float(np.median(flux[used & ~events]))
+        # Frames without light, such as dark frames, have no photon noise to weight by.
+        photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
+        # The noise of the sums follows that of the whole light in time.
+        survey = SeriesSurvey.of(frames, flux, error**2, used, level, photon, shape, weighted=(templates, sums))
         survey, taken = fit_quiet_light(survey, events[used], None, fits)
         now = np.zeros(flux.size, np.bool_)
         now[used] = taken
@@ -169,26 +172,6 @@ def survey_spectra(
     survey = survey.frames(reasons[np.searchsorted(frames.time_s, survey.time_s)] == 0)
     series = replace(series, excess=series.excess[used])
     return survey, series, quiescent_light(frames, survey, reasons, ~events, seed, steps.part(0.9, 1.0))
-
-
-def _survey(
-    frames: Frames, series: SpectralSeries, templates: Templates, sums: Float, used: Bool, shape: Shape, level: float
-) -> SeriesSurvey:
-    """Return the survey of the weighted sums of the frames that are searched, without processes."""
-    flux, error = frames.white_light
-    assert error is not None
-    stare = stare_of(frames, used)
-    scale = float(np.median(error[used]))
-    # The noise follows that of the whole light in time.
-    variance = (error[used] / scale) ** 2
-    lit = np.maximum(series.light, 0.0)
-    # Frames without light, such as dark frames, have no photon noise to weight by.
-    photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
-    bank = bank_of(stare, templates.directions[list(templates.chosen)], shape)
-    return SeriesSurvey(
-        stare, bank, templates, sums[used], variance, (WHITE,) * sums.shape[1], flux[used] / scale, WHITE, scale, level,
-        photon, frames.time_s[used], weighted=True,
-    )  # fmt: skip
 
 
 def _weighted_sums(

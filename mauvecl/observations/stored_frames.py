@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -191,23 +191,33 @@ class StoredFile(TableFile):
 
 
 @contextmanager
-def open_store(path: Path, name: str | None, what: str) -> Iterator[StoredFile]:
-    """Open a scene of a Zarr store."""
-    zarr = _module("zarr")
-    check_folder(path, "file")
-    with parsing(what, WHOLE):
-        group = zarr.open_group(path, mode="r")
-    yield _in_groups(group, name, what)
-
-
-@contextmanager
-def open_hdf5(file: IO[bytes], what: str, name: str | None) -> Iterator[StoredFile]:
-    """Open a scene of an HDF5 file."""
-    h5py = _module("h5py")
-    with parsing(what, WHOLE):
-        opened = h5py.File(file, "r")
-    with opened:
-        yield _in_groups(opened, name, what)
+def open_stored(place: Path | IO[bytes], what: str, name: str | None) -> Iterator[StoredFile]:
+    """Open a scene of a Zarr store or of an HDF5 file, which have the same layout."""
+    is_store = isinstance(place, Path)
+    package = "zarr" if is_store else "h5py"
+    try:
+        module = import_module(package)
+    except ImportError as error:
+        raise missing_package(package, "a store", "bulk") from error
+    if isinstance(place, Path):
+        check_folder(place, "file")
+    with ExitStack() as stack:
+        with parsing(what, WHOLE):
+            root: Any = module.open_group(place, mode="r") if is_store else stack.enter_context(module.File(place, "r"))
+            found = [f"{star}/{scene}" for star in sorted(root) if star.startswith("star-")
+                     for scene in sorted(root[star])
+                     if scene == "quiescent" or (scene.startswith("flare-") and scene[6:].isdigit())]  # fmt: skip
+            path = _chosen(sorted(found, key=lambda one: "flare" in one), name, what)
+            group = root[path.partition("/")[0]]
+            names = ("wavelength_nm", "bias_dn", "dark_dn", "read_noise_dn", "gain_dn_per_electron")
+            largest = max(int(group[key].size) for key in names)
+            if largest > MAX_PIXELS:
+                # A header may claim any number.
+                raise InputError(f"{what} must hold at most {MAX_PIXELS} pixels, but holds {largest}", key="file")
+            of = {key: np.asarray(group[key][:], np.float64) for key in names}
+            frames = np.asarray(group["frame"][:], np.int64) if "frame" in group else None
+            stored = StoredFile(what, path, root[path], of, dict(group.attrs), frames)
+        yield stored
 
 
 def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
@@ -234,24 +244,6 @@ def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
         return StoredFile(file.what, path, hdu.section, of, attributes, frames)
 
 
-def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
-    """Return a scene in the groups of a Zarr store or an HDF5 file, which have the same layout."""
-    with parsing(what, WHOLE):
-        found = [f"{star}/{scene}" for star in sorted(root) if star.startswith("star-") for scene in sorted(root[star])
-                 if scene == "quiescent" or (scene.startswith("flare-") and scene[6:].isdigit())]  # fmt: skip
-        path = _chosen(sorted(found, key=lambda one: "flare" in one), name, what)
-        star, _, _ = path.partition("/")
-        group, array = root[star], root[path]
-        names = ("wavelength_nm", "bias_dn", "dark_dn", "read_noise_dn", "gain_dn_per_electron")
-        largest = max(int(group[key].size) for key in names)
-        if largest > MAX_PIXELS:
-            # A header may claim any number.
-            raise InputError(f"{what} must hold at most {MAX_PIXELS} pixels, but holds {largest}", key="file")
-        of = {key: np.asarray(group[key][:], np.float64) for key in names}
-        frames = np.asarray(group["frame"][:], np.int64) if "frame" in group else None
-        return StoredFile(what, path, array, of, dict(group.attrs), frames)
-
-
 def _chosen(found: list[str], name: str | None, what: str) -> str:
     """Return the requested scene, or the only one."""
     if not found:
@@ -263,13 +255,6 @@ def _chosen(found: list[str], name: str | None, what: str) -> str:
     if wanted not in found:
         raise InputError.of("hdu", wanted, f"one of {', '.join(found[:8])}", where=what)
     return wanted
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise missing_package(name, "a store", "bulk") from error
 
 
 #: Light, errors and quality of frames, and remarks.

@@ -56,10 +56,7 @@ class Recovery:
 
 
 def visit_times_d(windows: Windows, visits: int, exposure_s: float, seed: int) -> Float:
-    """Draw the middles of visits in windows, evenly over the time in which an exposure fits, in days; ascending.
-
-    Raises InputError if no window is long enough.
-    """
+    """Draw the middles of visits in windows, evenly over the time in which an exposure fits, in days; ascending."""
     room = np.maximum(windows.length_s - exposure_s, 0.0)
     if not room.sum() > 0:
         longest = windows.length_s.max(initial=0.0)

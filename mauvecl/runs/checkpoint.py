@@ -41,10 +41,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def locked(folder: Path, what: str) -> Iterator[None]:
-    """Lock a folder for this process; the operating system releases the lock however the process ends.
-
-    Raises InputError if another process holds the lock, or the file system has no locks.
-    """
+    """Lock a folder for this process; the operating system releases the lock however the process ends."""
 
     def unusable(why: str) -> InputError:
         return InputError(f"{what} {str(folder)!r} {why}", key="lock")
@@ -145,8 +142,8 @@ def code_identity() -> tuple[str, str]:
     return VERSION, digest.hexdigest()[:16]
 
 
-#: Fields that do not affect a draw.
-_DESCRIPTIVE = ("provenance", "messages")
+#: Fields that do not affect a draw, and those of a request that do not affect a shard.
+_DESCRIPTIVE, _OF_RUN = ("provenance", "messages"), ("realisations", "start", "tails")
 
 
 def fingerprint(request: object) -> str:
@@ -154,35 +151,24 @@ def fingerprint(request: object) -> str:
 
     The number of realisations is excluded, since runs of different length share shards.
     """
-    digest = hashlib.sha256(f"form {FORM}".encode())
-    _feed(digest, request, leave=("realisations", "start", "tails"))
-    return digest.hexdigest()[:32]
+    if not isinstance(request, tuple):
+        kind, values = _parts(request)
+        request = kind, {name: value for name, value in values.items() if name not in _OF_RUN}
+    text = json.dumps(request, default=_parts, sort_keys=True)
+    return hashlib.sha256(f"form {FORM} {text}".encode()).hexdigest()[:32]
 
 
-def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
-    is_model = isinstance(value, BaseModel)
-    if is_model or (is_dataclass(value) and not isinstance(value, type)):
-        digest.update(f"<{type(value).__name__}".encode())
-        for name in type(value).model_fields if is_model else (each.name for each in fields(value)):
-            if name not in (*leave, *_DESCRIPTIVE):
-                digest.update(name.encode())
-                _feed(digest, getattr(value, name))
-    elif isinstance(value, np.ndarray):
-        digest.update(f"<{value.dtype.str}{value.shape}".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, Mapping):
-        for key in sorted(value):
-            digest.update(str(key).encode())
-            _feed(digest, value[key])
-    elif isinstance(value, list | tuple):
-        digest.update(f"<{len(value)}".encode())
-        for item in value:
-            _feed(digest, item)
-    elif isinstance(value, float):
-        digest.update(value.hex().encode())
-    else:
-        # None, integers, text.
-        digest.update(repr(value).encode())
+def _parts(value: Any) -> Any:
+    """Return what JSON can hold of an object: its class and fields, the digest of an array, or its text."""
+    if isinstance(value, np.ndarray):
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes())
+        return value.dtype.str, value.shape, digest.hexdigest()
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, BaseModel) or is_dataclass(value):
+        names = [*type(value).model_fields] if isinstance(value, BaseModel) else [each.name for each in fields(value)]
+        return type(value).__name__, {name: getattr(value, name) for name in names if name not in _DESCRIPTIVE}
+    return repr(value)
 
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
@@ -229,17 +215,13 @@ class Checkpoint:
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
-        """Lock the output folder and read its state.
-
-        Raises InputError if another process writes to the folder, or it contains an unfinished run without `resume` or
-        `restart`, or one of another study (the message lists the keys that differ).
-        """
+        """Lock the output folder, and check that an unfinished run in it is to be resumed and is of this study."""
         with ExitStack() as stack:
             if not self._is_held:
                 stack.enter_context(locked(self.parent, "output folder"))
             self._look()
             self._stack = stack.pop_all()
-        self._started, self._written = time.monotonic(), any(self._files())
+        self._started, self._written = time.monotonic(), bool(self._files())
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -252,7 +234,7 @@ class Checkpoint:
     def _look(self) -> None:
         if self._restart:
             self._remove()
-        if not any(self._files()):
+        if not self._files():
             return
         if not self._resume:
             raise InputError(
@@ -317,25 +299,22 @@ class Checkpoint:
     @property
     def kept(self) -> int:
         """Number of files of shards."""
-        return sum(1 for path in self._files() if path.suffix == ".npz")
+        return sum(path.suffix == ".npz" for path in self._files())
 
     def forget(self) -> None:
         """Remove the checkpoint, which is no longer needed once the result is written."""
         self._held = []
         self._remove()
 
-    def _files(self) -> Iterator[Path]:
-        """Yield the files in the folder that belong to a checkpoint, by name.
-
-        Raises InputError if the manifest is not one of mauvecl's.
-        """
+    def _files(self) -> list[Path]:
+        """Return the files in the folder that belong to a checkpoint, by name."""
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
-        shards = [name for name in names if SHARD_NAME.fullmatch(name)]
-        if MANIFEST in names and not shards and _intact(self.folder / MANIFEST) is None:
+        own = [name for name in names if SHARD_NAME.fullmatch(name) or name == MANIFEST]
+        if own == [MANIFEST] and _intact(self.folder / MANIFEST) is None:
             raise InputError(
                 f"{str(self.folder / MANIFEST)!r} is not mauvecl's: use another output folder", key="folder"
             )
-        yield from (self.folder / name for name in names if name in shards or name == MANIFEST)
+        return [self.folder / name for name in own]
 
     def _remove(self) -> None:
         """Remove the checkpoint's files, and the folder if it is then empty."""

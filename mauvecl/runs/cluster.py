@@ -199,7 +199,14 @@ class DaskWorkers:
     def _sums(self, attempt: _Attempt, sent: DaskFuture[Any]) -> Arrays:
         """Return the counts of a task that has ended, or raise why there are none."""
         if sent.status == "finished":
-            answer = _result(sent)
+            answer: Any = None
+            # Dask would wait until the task is repeated, which never happens if all workers that may do so have left;
+            # it calls the functions of all finished tasks in one thread, so that every other shard would wait, too.
+            while answer is None:
+                with contextlib.suppress(TimeoutError):
+                    answer = sent.result(timeout=RECOUNT_S)
+                if answer is None and sent.status != "finished":
+                    raise ShardLost("its worker has left with its counts", failed=False)
             # Workers with older code answer without theirs.
             if isinstance(answer, tuple) and answer[1] == code_identity():
                 sums: Arrays = answer[0]
@@ -240,20 +247,6 @@ class DaskWorkers:
         self._closing = True
         self._given.clear()
         self._open.close()
-
-
-def _result(sent: DaskFuture[Any]) -> Any:
-    """Return the result of a finished task; raise `ShardLost` if its worker has left with it.
-
-    Dask would wait until the task is repeated, which never happens if all workers that may do so have left; it calls
-    the functions of all finished tasks in one thread, so that every other shard would wait, too.
-    """
-    while True:
-        try:
-            return sent.result(timeout=RECOUNT_S)
-        except TimeoutError:
-            if sent.status != "finished":
-                raise ShardLost("its worker has left with its counts", failed=False) from None
 
 
 @contextlib.contextmanager

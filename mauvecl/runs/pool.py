@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -59,7 +60,7 @@ class LocalWorkers:
 
     def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
         self._make, self._devices = make, list(devices)
-        self._ticks: list[Callable[[int], None] | None] = [None] * len(devices)
+        self._ticks: list[Callable[[int], None]] = [lambda done: None] * len(devices)
         self._stopping = False
         self._engines: list[Engine] = [self._made(place) for place in range(len(devices))]
         self._free: SimpleQueue[int] = SimpleQueue()
@@ -71,8 +72,7 @@ class LocalWorkers:
         def progress(done: int, total: int) -> None:
             if self._stopping:
                 raise Stopped
-            if (tick := self._ticks[place]) is not None:
-                tick(done)
+            self._ticks[place](done)
 
         return self._make(self._devices[place], progress=progress)
 
@@ -109,7 +109,6 @@ class LocalWorkers:
             self._engines[place] = self._made(place)
             raise ShardLost(f"{engine.device_name}: {error}") from error
         finally:
-            self._ticks[place] = None
             self._free.put(place)
 
     def stop(self) -> None:
@@ -255,8 +254,14 @@ class Pool:
         """Count tasks with all workers, and yield them with their arrays, in the order in which they are finished."""
         waiting: dict[Future[Arrays], Task] = {}
         failures: Counter[str] = Counter()
-
-        def finished() -> Iterator[tuple[Task, Arrays]]:
+        todo = iter(tasks)
+        while True:
+            for task in islice(todo, max(self.workers.count * SHARDS_PER_WORKER - len(waiting), 0)):
+                if self._stopping:
+                    raise Stopped
+                waiting[self.workers.submit(task)] = task
+            if not waiting:
+                return
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                 task = waiting.pop(future)
                 try:
@@ -264,23 +269,13 @@ class Pool:
                 except ShardLost as lost:
                     failures[task.name] += lost.failed
                     if failures[task.name] >= MAX_FAILURES:
-                        raise DeviceError(
-                            f"{task.shard} failed {MAX_FAILURES} times, the last time with: {lost}", "failed"
-                        ) from lost
+                        fault = f"{task.shard} failed {MAX_FAILURES} times, the last time with: {lost}"
+                        raise DeviceError(fault, "failed") from lost
                     with self._lock:
                         self._retries += 1
                     waiting[self.workers.submit(task)] = task
                 else:
                     yield task, counted
-
-        for task in tasks:
-            if self._stopping:
-                raise Stopped
-            while len(waiting) >= self.workers.count * SHARDS_PER_WORKER:
-                yield from finished()
-            waiting[self.workers.submit(task)] = task
-        while waiting:
-            yield from finished()
 
     def _tick(self, name: str, done: int) -> None:
         with self._lock:

@@ -13,7 +13,8 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.util import find_spec
@@ -49,32 +50,24 @@ COMMON_DRAWS = (
 )
 NOMINAL = "the throughput is nominal, not a flight calibration"
 
-#: Attributes of a star that stores of earlier versions do not have.
-LATER_ATTRIBUTES = ("instrument", "saturation_dn", "dark_unit", "temperature_c")
-
-
-#: Attributes in which stores of version 1 state the study and the instrument by other defaults and names.
-OTHERWISE_IN_VERSION_1 = ("study", "study_sha256", "instrument", "provenance")
-
-
-def without(described: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return the description of a group without some attributes."""
-    attributes = described.get("attributes", {})
-    return described | {"attributes": {key: value for key, value in attributes.items() if key not in names}}
-
 
 def _describe(root: Any, scene: StoredScene, study: Study) -> None:
     """Write the description of an array to its group, and with the quiescent array that of the star."""
     from zarr.codecs import Crc32cCodec
 
-    x, group, signature = scene.expectation, root.require_group(scene.group), signed(study.toml())
+    x, group = scene.expectation, root.require_group(scene.group)
+
+    def store(name: str, values: NDArray[Any], unit: str, dimension: str = "pixel") -> None:
+        how: Any = {"chunks": values.shape, "compressors": [Crc32cCodec()], "dimension_names": [dimension]}
+        group.create_array(name, data=values, **how).attrs["units"] = unit
+
     if scene.name == "quiescent":
         group.attrs.update({"star": scene.star, **scene.at})
         group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
         for name, unit in CALIBRATION.items():
-            _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
+            store(name, np.asarray(getattr(x, name)), unit)
         if scene.frames is not None:
-            _values(group, "frame", np.array(scene.frames), "", ["frame"])
+            store("frame", np.array(scene.frames), "", "frame")
     if study.bulk.components:
         n = x.n_frames if scene.frames is None else 1
         gain = n * x.gain_dn_per_electron
@@ -84,7 +77,7 @@ def _describe(root: Any, scene: StoredScene, study: Study) -> None:
             *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
             ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
         ):
-            _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
+            store(f"{scene.name}-{name}", values, "DN")
     array = group.create_array(
         scene.name,
         shape=(scene.rows, *scene.row),
@@ -94,8 +87,8 @@ def _describe(root: Any, scene: StoredScene, study: Study) -> None:
         fill_value=0,
         dimension_names=scene.dimensions,
     )
-    origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signature
-    array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
+    array.attrs.update({"star": scene.star, "provenance": dict(x.provenance), **signed(study.toml())})
+    array.attrs.update({"units": "DN", "amplitude": scene.amplitude})
 
 
 def exposure_attributes(x: Expectation) -> dict[str, float | str]:
@@ -105,28 +98,9 @@ def exposure_attributes(x: Expectation) -> dict[str, float | str]:
     return attributes | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})
 
 
-def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:
-    from zarr.codecs import Crc32cCodec
-
-    array = group.create_array(
-        name, data=values, chunks=values.shape, compressors=[Crc32cCodec()], dimension_names=dimensions
-    )
-    array.attrs["units"] = unit
-
-
 def signed(study: str) -> dict[str, str]:
     """Return a study's text and its digest, of which a store has several copies."""
     return {"study": study, "study_sha256": hashlib.sha256(study.encode()).hexdigest()}
-
-
-def study_in(place: Path) -> str | None:
-    """Return the study's text in a description if its digest is correct, else None."""
-    try:
-        attributes = json.loads(read_bytes(place, "description"))["attributes"]
-        text = attributes["study"]
-        return text if signed(text).items() <= attributes.items() else None
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return None
 
 
 #: Approximate size of a chunk, bytes.
@@ -160,7 +134,7 @@ class StoredScene:
     @property
     def dimensions(self) -> list[str]:
         """Names of the array's dimensions."""
-        return ["realisation", *(["frame"] if self.frames is not None else []), "pixel"]
+        return ["realisation", "pixel"] if self.frames is None else ["realisation", "frame", "pixel"]
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -186,7 +160,8 @@ class StoredScene:
     def chunk(self, number: int) -> Chunk:
         """Return a chunk by number."""
         start = number * self.chunk_rows
-        return Chunk(self, number, start, min(start + self.chunk_rows, self.rows))
+        name = "/".join(["c", str(number), *["0"] * len(self.row)])
+        return Chunk(self, name, start, min(start + self.chunk_rows, self.rows))
 
 
 #: Columns of the table of arrays.
@@ -208,14 +183,9 @@ class Chunk:
     """A chunk of a scene: rows `start` to `stop - 1` of its array."""
 
     scene: StoredScene
-    number: int
+    name: str  # path of the file in the array's folder
     start: int
     stop: int
-
-    @property
-    def name(self) -> str:
-        """Path of the file in the array's folder."""
-        return "/".join(["c", str(self.number), *["0"] * len(self.scene.row)])
 
     @property
     def key(self) -> str:
@@ -245,17 +215,15 @@ class Store:
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
-        """Open an existing store.
-
-        Raises InputError if the folder is not a store, no copy of its study is intact, or intact copies contradict each
-        other.
-        """
+        """Open an existing store; at least one copy of its study is intact, and intact copies are the same."""
         path = Path(path)
         copies: dict[str, Path] = {}
         for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
-            text = study_in(place)
-            if text is not None:
-                copies.setdefault(text, place.relative_to(path))
+            # Only intact copies count: those whose digest is correct.
+            with suppress(ValueError, LookupError, TypeError, AttributeError, RecursionError):
+                attributes = json.loads(read_bytes(place, "description"))["attributes"]
+                if signed(attributes["study"]).items() <= attributes.items():
+                    copies.setdefault(attributes["study"], place.relative_to(path))
         if not copies:
             raise InputError(
                 f"{str(path)!r} is not a store of spectra: give a folder that `mauvecl realise` wrote, with an intact "
@@ -324,11 +292,7 @@ class Store:
         return sum(len(scene.chunk_numbers(first, stop)) for scene in self.scenes)
 
     def make(self) -> None:
-        """Write the description of the arrays, or check that an existing one is the same.
-
-        Raises InputError if the store exists and is another study's (the message lists keys that differ), or cannot be
-        written.
-        """
+        """Write the description of the arrays, or check that an existing one is of the same study."""
         root = self.path / "zarr.json"
         if root.exists():
             there = Store.open(self.path).study
@@ -389,9 +353,8 @@ class Store:
             except InputError:
                 continue
             for line in text.splitlines():
-                name, _, rest = line.partition(" ")
-                written, _, check = rest.partition(" ")
-                if check == _check(name, written):
+                name, written = [*line.split(" "), ""][:2]
+                if line == _line(name, written):
                     self.digests[f"{scene.path}/{name}"] = written
 
     def sort_digests(self) -> None:
@@ -400,7 +363,7 @@ class Store:
             place, start = self.path / scene.path / DIGESTS, f"{scene.path}/"
             names = [key.removeprefix(start) for key in self.digests if key.startswith(f"{start}c/")]
             names.sort(key=lambda name: int(name.split("/")[1]))
-            text = "".join(_line(name, self.digests[start + name]) for name in names).encode()
+            text = "".join(f"{_line(name, self.digests[start + name])}\n" for name in names).encode()
             if names and place.read_bytes() != text:
                 write_whole(place, text)
 
@@ -420,7 +383,7 @@ class Store:
         what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
         with self._listing, writing(what, NO_ROOM, key="store"), place.open("ab", buffering=0) as file:
             # A single short write, which first ends a line that a full disk has cut short.
-            file.write(f"\n{_line(chunk.name, written)}".encode())
+            file.write(f"\n{_line(chunk.name, written)}\n".encode())
 
     def has(self, chunk: Chunk) -> bool:
         """Return whether a chunk was written, by digest list and file size; `bulk.state` checks its content."""
@@ -447,10 +410,7 @@ class Store:
                 yield str(here / name), own
 
     def clear(self) -> None:
-        """Remove all files but not the folder; the study is last, so that an interrupted removal leaves a store.
-
-        Raises InputError, without removing anything, if the folder contains other files.
-        """
+        """Remove all files if no others exist; the study is last, so that an interrupted removal leaves a store."""
         files = list(self.files())
         other = [key for key, own in files if not own]
         if other:
@@ -483,10 +443,7 @@ def digest(*parts: bytes | memoryview) -> str:
     return hashed.hexdigest()
 
 
-def _line(name: str, digest_text: str) -> str:
-    """Return the line of a chunk in a list of digests."""
-    return f"{name} {digest_text} {_check(name, digest_text)}\n"
-
-
-def _check(*words: str) -> str:
-    return digest(" ".join(words).encode())[:8]
+def _line(name: str, written: str) -> str:
+    """Return the line of a chunk in a list of digests, which ends with a check of itself."""
+    text = f"{name} {written}"
+    return f"{text} {digest(text.encode())[:8]}"
