@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
@@ -69,21 +69,25 @@ class BestFit:
 
 
 class Profile:
-    """Profile likelihood of the temperature for the sums of some frames, with a blackbody of at least zero."""
+    """Profile likelihood of the temperature for the sums of some frames.
 
-    bounded: ClassVar[bool] = False
+    The blackbody's amplitude is at least zero; if it is `bounded`, so are those of the fixed components.
+    """
 
-    def __init__(self, reduction: MeanSums, sums: Float, light: Float | None = None) -> None:
+    def __init__(
+        self, reduction: MeanSums, sums: Float, light: Float | None = None, *, bounded: bool = False
+    ) -> None:  # fmt: skip
         """Take the sums of frames, (n, n_sum), and those of the factor on light, (n,), if it is unknown."""
-        self.reduction, self.sums, self.light = reduction, sums, light
+        self.reduction, self.sums, self.light, self.bounded = reduction, sums, light, bounded
         self.nodes = reduction.log_k
         basis, _ = reduction.basis
         #: Sums less what the fixed components explain.
         self.rest = sums - (sums @ basis.T) @ basis
 
-    def rows(self, rows: NDArray[np.intp]) -> tuple[MeanSums, Float, Float | None]:
-        """Return what makes a profile of some of the frames."""
-        return self.reduction, self.sums[rows], None if self.light is None else self.light[rows]
+    def bounded_rows(self, rows: NDArray[np.intp], reduction: MeanSums | None = None) -> Profile:
+        """Return the bounded profile of some of the frames, optionally for another reduction to the same sums."""
+        light = None if self.light is None else self.light[rows]
+        return Profile(reduction or self.reduction, self.sums[rows], light, bounded=True)
 
     def products(self, log_k: Float) -> Products:
         """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
@@ -115,8 +119,13 @@ class Profile:
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        face = self.face(log_k)
-        return np.asarray(face.gain - np.minimum(face.amplitude, 0.0) ** 2 * face.power)
+        if not self.bounded:
+            face = self.face(log_k)
+            return np.asarray(face.gain - np.minimum(face.amplitude, 0.0) ** 2 * face.power)
+        gain = np.zeros((len(self.sums), *log_k.shape[1:]))
+        for face in self.faces(self.products(log_k)):
+            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
+        return gain
 
     def gain_at_nodes(self, every: int = 1) -> Float:
         """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
@@ -137,7 +146,11 @@ class Profile:
         return FactorAt(without, np.moveaxis(light.weights_of(log_k), -1, 0), light.scale**-2.0)
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
-        """Return the best fit of each frame.
+        """Return the best fit of each frame, from `gain_at_nodes` if it is known."""
+        return self.solution(self._narrowed(at_nodes) if self.bounded else self._stationary(at_nodes))
+
+    def _stationary(self, at_nodes: Float | None) -> Float:
+        """Return the best temperatures without bounds on fixed components, shape (n,).
 
         The gain is the squared product of the sums with a unit vector, which is a cubic polynomial of the temperature
         between two nodes, so that its maximum has a closed form.
@@ -152,7 +165,24 @@ class Profile:
         with np.errstate(divide="ignore", invalid="ignore"):
             top = c[2] / (np.sqrt(c[1] ** 2 - 3 * c[0] * c[2]) - c[1])
         # Otherwise the best node is an end of the model's temperatures, or no light is found.
-        return self.solution(np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node]))
+        return np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node])
+
+    def _narrowed(self, at_nodes: Float | None) -> Float:
+        """Return the best temperatures with bounds, which may bend the gain sharply, by ever narrower grids."""
+        every = COARSE if at_nodes is None else 1
+        gain = self.gain_at_nodes(every) if at_nodes is None else at_nodes
+        x, rows = self.nodes[::every][gain.argmax(axis=1)], np.arange(len(gain))
+        step = every * float(self.nodes[1] - self.nodes[0])
+        for _ in range(NARROWED):
+            there = np.clip(x[:, None] + step * GRID, self.nodes[0], self.nodes[-1])
+            gain = self.gain(there)
+            best = gain.argmax(axis=1)
+            x, step = there[rows, best], step * float(GRID[1] - GRID[0])
+        # The vertex of the parabola through the best three.
+        _, slope, bend = _parabola(gain, np.clip(best, 1, GRID.size - 2) + GRID.size * rows)
+        vertex = np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0)
+        vertex[(best == 0) | (best == GRID.size - 1)] = 0.0
+        return np.clip(x + step * np.clip(vertex, -1.0, 1.0), self.nodes[0], self.nodes[-1])
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -250,7 +280,7 @@ def intervals(
         elif derived.ratio is None:
             ends = ends_of_sum(spline)
         else:
-            lowest, highest = _ratio_ends(products, faces, spline(x), least)
+            lowest, highest = _ratio_ends(faces, spline(x), least)
             ends = derived.offset + lowest, derived.offset + highest
         # Light that contradicts every factor above zero limits nothing.
         none = ends[0] > ends[1]
@@ -279,44 +309,28 @@ def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: Fac
     return extreme(lows, -1.0), extreme(highs, 1.0)
 
 
-def _ratio_ends(products: Products, faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
+def _ratio_ends(faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
     """Return the ends of per x (fixed component 0) / (blackbody): Fieller's at each temperature, then the hull."""
     lows, highs = np.full(per.shape, np.inf), np.full(per.shape, -np.inf)
+    factors, falls = np.zeros((2, 1 + max(len(face.some) for face in faces), *per.shape))
+    factors[1], falls[0] = per, -1.0
+    body = FactorAt(np.zeros(()), falls, 0.0)
     for face in faces:
-        if 0 not in face.some or not face.hot:
-            allowed = (face.gain >= least) & face.positive(face.amplitude, face.others)
-            if 0 not in face.some:
-                np.copyto(lows, 0.0, where=allowed)
-                np.maximum(highs, 0.0, out=highs, where=allowed)
-            if not face.hot:
-                # Without a blackbody the light is recombination, or there is none, which every ratio allows.
-                np.copyto(highs, np.inf, where=allowed)
-            continue
-        # Products of sums y, blackbody t and recombination f, the fixed component 0 over `per`, less their projections
-        # on the lines of the face.
-        lines, edge = face.some[1:], products.gram[0, 0] / per**2
-        y, t, f = products.fixed[lines], products.cross[lines], products.gram[lines, 0].reshape(-1, 1, 1) / per
-        inverse = np.linalg.inv(products.gram[np.ix_(lines, lines)])
-        by_y, by_t, by_f = (np.tensordot(inverse, each, 1) for each in (y, t, f))
-        yt, tt = (each - np.sum(t * by, axis=0) for each, by in ((products.along, by_y), (products.power, by_t)))
-        yf, tf, ff = (
-            each - np.sum(f * by, axis=0)
-            for each, by in ((products.fixed[0] / per, by_y), (products.cross[0] / per, by_t), (edge, by_f))
-        )
-        rest = least - np.sum(y * by_y, axis=0)
-        # (yt + r yf)^2 = rest |t + r f|^2 at the ends r.
-        a, b, c = yf**2 - rest * ff, yt * yf - rest * tf, yt**2 - rest * tt
-        inside = b**2 - a * c
-        root = np.sqrt(np.where(inside >= -1e-9 * b**2, np.maximum(inside, 0.0), np.nan))
-        for sign in (-1.0, 1.0):
-            with np.errstate(divide="ignore", invalid="ignore"):
-                r = (-b + sign * root) / a
-                amplitude = (yt + r * yf) / (tt + 2 * r * tf + r**2 * ff)
-                there = amplitude >= 0
-                if face.bounded:
-                    there &= (r >= 0) & (by_y - amplitude * (by_t + r * by_f) >= 0).all(axis=0)
-            np.minimum(lows, r, out=lows, where=there)
-            np.maximum(highs, r, out=highs, where=there)
+        left = face.gain - least
+        allowed = (left >= 0.0) & face.positive(face.amplitude, face.others)
+        if 0 not in face.some:
+            np.copyto(lows, 0.0, where=allowed)
+            np.maximum(highs, 0.0, out=highs, where=allowed)
+        if not face.hot:
+            # Without a blackbody the light is recombination, or there is none, which every ratio allows.
+            np.copyto(highs, np.inf, where=allowed)
+        elif 0 in face.some:
+            ratio = face.ratio(factors, body)
+            for sign in (-1.0, 1.0):
+                end = ratio.root(left, sign)
+                there = (left >= 0.0) & face.positive(*face.reached(ratio, end, factors, body))
+                np.minimum(lows, end, out=lows, where=there)
+                np.maximum(highs, end, out=highs, where=there)
     return extreme(lows, -1.0), extreme(highs, 1.0)
 
 
@@ -573,13 +587,9 @@ def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
     return gradient
 
 
-#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
-REFINEMENTS, NARROWER = 3, 8.0
-#: The search for the best temperature starts from every `COARSE`-th node of the model.
-COARSE = 4
-#: Share of a refinement's step above which a best temperature still moves; distance in nodes at which the gain beside
-#: it is then tried, its least rise that counts, and the number of narrowing grids that follow it.
-SETTLED, BESIDE, LEAST_RISE, CLIMBS = 0.5, 0.05, 1e-3, 4
+#: The search for the best temperature with bounds starts from every `COARSE`-th node of the model; a grid in units of
+#: the step, and how often it is narrowed.
+COARSE, GRID, NARROWED = 4, np.linspace(-1.0, 1.0, 9), 4
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
@@ -689,67 +699,7 @@ class Face:
         return self.amplitude + reach * step, self.others + reach * others
 
 
-class BoundedProfile(Profile):
-    """Profile likelihood of the temperature for the sums of some frames, with amplitudes of at least zero."""
-
-    bounded: ClassVar[bool] = True
-
-    def gain(self, log_k: Float) -> Float:
-        """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        gain = np.zeros((len(self.sums), *log_k.shape[1:]))
-        for face in self.faces(self.products(log_k)):
-            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
-        return gain
-
-    def best(self, at_nodes: Float | None = None) -> BestFit:
-        """Return the best fit of each frame."""
-        every = COARSE if at_nodes is None else 1
-        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
-        low, high = self.nodes[0], self.nodes[-1]
-        step = every * float(self.nodes[1] - self.nodes[0])
-        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
-        for _ in range(REFINEMENTS):
-            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
-            g = self.gain(there)
-            # The vertex of the parabola through three points, or the best point if there is no maximum.
-            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
-            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
-            under = right * a - left * b
-            over = right * a**2 - left * b**2
-            inside = np.abs(under) > 1e-300
-            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
-            three = there[np.arange(x.size), np.argmax(g, axis=1)]
-            good = inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2])
-            vertex = np.where(good, vertex, three)
-            reached = self.gain(vertex)
-            x = np.where(reached >= g.max(axis=1), vertex, three)
-            # A smooth maximum moves less and less; bounds may bend the gain sharply.
-            moving = np.abs(x - there[:, 1]) > SETTLED * step
-            step /= NARROWER
-        return self.solution(self._climbed(x, np.flatnonzero(moving)))
-
-    def _climbed(self, x: Float, moving: NDArray[np.intp]) -> Float:
-        """Return the temperatures; those from which the gain still rises are moved to its maximum nearby."""
-        if not moving.size:
-            return x
-        low, high = self.nodes[0], self.nodes[-1]
-        step = float(self.nodes[1] - self.nodes[0])
-        beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
-        gain = BoundedProfile(*self.rows(moving)).gain(beside)
-        rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
-        if not rising.size:
-            return x
-        own, best = BoundedProfile(*self.rows(rising)), x[rising]
-        for _ in range(CLIMBS):
-            there = np.clip(best[:, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
-            best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]
-            step /= 4.0
-        climbed = x.copy()
-        climbed[rising] = best
-        return climbed
-
-
 def with_bounds(reduction: ReducedSums, sums: Float, best: BestFit) -> BestFit:
     """Return fits with amplitudes of at least zero, from fits without this bound."""
     negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
-    return best.replaced(negative, BoundedProfile(reduction, sums[negative]).best()) if negative.size else best
+    return best.replaced(negative, Profile(reduction, sums[negative], bounded=True).best()) if negative.size else best

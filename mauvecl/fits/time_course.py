@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
@@ -26,7 +26,6 @@ from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare
-from mauvecl.host.arrays import array_cache
 from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
@@ -301,15 +300,8 @@ class _Data:
         """Return values of the frames that are proportional to the light, before the known losses of it."""
         return np.asarray(values / np.where(self.light > 0, self.light, 1.0))
 
-    @cached_property
-    def flare(self) -> Callable[[Float], tuple[Float, Float, Float, Float]]:
-        """Function of the parameters that returns the amplitude and log temperature of each frame, and their slopes.
-
-        These are the derivatives by the parameters, each of shape (6, n_frame).
-        """
-        return array_cache(2)(self._flare)
-
-    def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
+    def flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
+        """Return the amplitude and log temperature of each frame, and their derivatives, of shape (6, n_frame)."""
         width, amplitude, fold = np.exp(theta[[1, 2, 5]])
         rise = amplitude * self.light * self.shape.mean_over(self.edges, theta[0], width)
         # Temperatures over that at the peak, as in `Cooling`.
@@ -331,9 +323,7 @@ class _Data:
     def whitening(self, theta: Float | None, *, none: bool = False) -> Whiten:
         """Return the whitening of residuals for the covariances of a flare, or of frames without one.
 
-        Unknown levels shrink the values along their directions.
-
-        With `none`, the unknown levels are those of frames without a flare, whose residuals are then compared.
+        Unknown levels shrink the values along their directions; with `none`, those of frames without a flare.
         """
         covariance, flare = self.quiet_covariance, None
         if theta is not None:
