@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
-from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.search import DetectedEvent, SeriesSurvey
+from mauvecl.observations.search import DetectedEvent, ProcessSearch, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import REACH
 
