@@ -136,11 +136,6 @@ class Components:
         """Mean sums of each component at a coefficient of one, shape (4 + n_flare, n_statistic)."""
         return self.sum_cumulants(1)[1]
 
-    @cached_property
-    def _covariances(self) -> tuple[Float, Float]:
-        """`sum_cumulants` of the second order."""
-        return self.sum_cumulants(2)
-
     def coefficients(self, stare: Stare, flare: Float | None = None) -> Float:
         """Return the known coefficients of star, sky, dark, neighbours and flares, shape (n_frame, 4 + n_flare).
 
@@ -165,7 +160,7 @@ class Components:
 
     def covariance(self, coefficients: Float) -> Float:
         """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
-        constant, each = self._covariances
+        constant, each = self.sum_cumulants(2)
         return np.asarray(constant + np.tensordot(coefficients, each, 1))
 
     def jittered_covariance(self, coefficients: Float, stare: Stare) -> Float:
@@ -276,7 +271,7 @@ class StareExpectation:
             frames[:, some] += draw(self.components(np.eye(self.used.size)[some]))
         return frames
 
-    @cached_property
+    @property
     def mean_raw(self) -> Float:
         """Mean raw counts of each pixel, DN, shape (n_frame, n_pixel)."""
         return np.asarray(self.coefficients @ self._bare.mean_dn + self.quiet.bias_dn)
