@@ -203,41 +203,29 @@ class Profile:
 
         An end is NaN if chi-squared does not rise that far within the model's temperatures.
         """
-        inside, last = best.gain[:, None] - at_nodes <= allowed, self.nodes.size - 1
+        inside, last, middle = best.gain[:, None] - at_nodes <= allowed, self.nodes.size - 1, best.log_k[:, None]
         # Outermost temperatures inside: nodes, or those of the fits.
-        first, final = self.nodes[inside.argmax(axis=1)], self.nodes[last - inside[:, ::-1].argmax(axis=1)]
-        some = inside.any(axis=1)
-        first = np.where(some, np.minimum(first, best.log_k), best.log_k)
-        final = np.where(some, np.maximum(final, best.log_k), best.log_k)
-        ends = []
-        for start, beyond in (
-            (first, np.searchsorted(self.nodes, first, side="left") - 1),
-            (final, np.searchsorted(self.nodes, final, side="right")),
-        ):
-            closed = (beyond >= 0) & (beyond <= last)
-            stop = np.where(closed, self.nodes[np.clip(beyond, 0, last)], start)
-            ends.append(np.where(closed, self._crossing(best.gain, allowed, start, stop), np.nan))
-        return ends[0], ends[1]
-
-    def _crossing(self, gain: Float, allowed: float, inner: Float, outer: Float) -> Float:
-        """Return where chi-squared has risen by `allowed` between two temperatures (Illinois method on its root)."""
-        root = np.sqrt(allowed)
+        inner = self.nodes[np.column_stack([inside.argmax(axis=1), last - inside[:, ::-1].argmax(axis=1)])]
+        inner = np.where(inside.any(axis=1, keepdims=True), inner, middle)
+        inner[:, :1], inner[:, 1:] = np.minimum(inner[:, :1], middle), np.maximum(inner[:, 1:], middle)
+        beyond = np.searchsorted(self.nodes, inner[:, 0]) - 1, np.searchsorted(self.nodes, inner[:, 1], side="right")
+        node = np.column_stack(beyond)
+        closed = (node >= 0) & (node <= last)
 
         def over(x: Float) -> Float:
-            return np.asarray(np.sqrt(np.maximum(gain - self.gain(x), 0.0)) - root)
+            return np.sqrt(np.maximum(best.gain[:, None] - self.gain(x), 0.0)) - np.sqrt(allowed)
 
-        a, b = inner, outer
-        fa, fb = over(a), over(b)
-        x = b
+        # The Illinois method on the root of the rise.
+        a, x = inner, np.where(closed, self.nodes[np.clip(node, 0, last)], inner)
+        fa, fx = over(a), over(x)
         for _ in range(STEPS):
-            spread = fb - fa
+            b, fb, spread = x, fx, fx - fa
             x = np.where(np.abs(spread) > 1e-14, b - fb * (b - a) / np.where(spread == 0.0, 1.0, spread), b)
             fx = over(x)
             crossed = fx * fb < 0.0
-            fa = np.where(crossed, fb, 0.5 * fa)
-            a = np.where(crossed, b, a)
-            b, fb = x, fx
-        return x
+            a, fa = np.where(crossed, b, a), np.where(crossed, fb, 0.5 * fa)
+        low, high = np.where(closed, x, np.nan).T
+        return low, high
 
 
 def intervals(
