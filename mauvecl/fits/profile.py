@@ -508,13 +508,9 @@ def _noise(n: int) -> Float:
     return np.concatenate([half, -half])
 
 
-@dataclass(frozen=True, eq=False)
-class Slopes:
-    """Derivatives with respect to a parameter of n fits."""
-
-    sums: Float  # shape (n, n_sum)
-    quantities: Float  # shape (n, n_derived), as they are recorded
-    light: Float  # shape (n,); of the sum of the factor on light
+#: Derivatives of n fits with respect to a parameter: of the sums, (n, n_sum), of the quantities as they are recorded,
+#: (n, n_derived), and of the sum of the factor on light, (n,).
+Slopes = tuple[Float, Float, Float]
 
 
 def covariance(
@@ -530,8 +526,8 @@ def covariance(
     columns = [reduction.spline(log_k)[:, None], fixed, (linear[:, :1] * reduction.spline(log_k, 1))[:, None]]
     gradients = [_gradient(model, log_k, linear)]
     if other is not None:
-        columns.append(other.sums[:, None])
-        gradients.append(other.quantities[:, :, None])
+        columns.append(other[0][:, None])
+        gradients.append(other[1][:, :, None])
     jacobian, gradient = np.concatenate(columns, axis=1), np.concatenate(gradients, axis=2)
     information = jacobian @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.einsum("nii->ni", information))
@@ -549,7 +545,7 @@ def covariance(
     gradient[:, which] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
     by_factor = np.where(which, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
-    slopes = [linear[:, 0] * light.spline(log_k, 1)] + ([] if other is None else [other.light])
+    slopes = [linear[:, 0] * light.spline(log_k, 1)] + ([] if other is None else [other[2]])
     follows = -np.column_stack([light.weights_of(log_k), *(slope / light.scale for slope in slopes)])
     gradient += by_factor[:, :, None] * follows[:, None, :]
     own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2

@@ -453,8 +453,6 @@ MAX_VALUES, MAX_LENGTH = 2**23, 2**16
 BATCH = 2**20
 #: Probability of the upper end of the rate that sets thresholds: one standard error above it.
 UPPER = 0.8413447460685429
-#: Probability of a dip as large as the largest from noise below which the noise of the light is not symmetric.
-CHANCE_DIP = 1e-3
 #: Second half of the generator's key, which makes the draws independent of others.
 SIMULATION_KEY = 0x73696D75
 
@@ -544,19 +542,6 @@ def simulated_rates(
         measured.append(part.search.largest(coloured(residual[rows.reshape(size, -1)[:, :n]])))
     of_model, of_residuals = (np.sort(np.concatenate(values)) for values in (modelled, measured))
     return SimulatedRate(of_model, days, bool(survey.counts)), SimulatedRate(of_residuals, days, True)
-
-
-def largest_dip(survey: SeriesSurvey, quiet: Bool, least: float) -> float:
-    """Return the largest statistic of sudden dips, and of slow ones that end suddenly; below `least` it may be missed.
-
-    Quiescent frames are searched upside down, in both directions of time. Losses of light have larger dips than noise.
-    """
-    down = survey.frames(quiet).inverted()
-    start = down.stare.start_s
-    stare = replace(down.stare, start_s=start[-1] + start[0] - start[::-1])
-    back = replace(down, stare=stare, sums=down.sums[::-1], variance=down.variance[::-1])
-    values = (one.search.values(one.sums[None], least) for one in (down, back))
-    return max(float(rho.max(initial=-np.inf)) for found in values for _, rho in found)
 
 
 def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
