@@ -58,20 +58,18 @@ class Components:
             spectra = np.asarray(getattr(self, name), np.float64)
             if spectra.ndim != 2 or spectra.shape[1] != n_pixel or len(spectra) < least:
                 raise InputError(f"{what} must have the shape (n, {n_pixel}), not {spectra.shape}", key=name)
-            if not np.isfinite(spectra).all():
-                pixel = int(np.argmin(np.isfinite(spectra).all(axis=0)))
-                raise InputError(f"{what} must be finite, but those of pixel {pixel} are not", key=name)
             set_read_only(self, **{name: spectra})
-        if (self.flare_electrons < 0).any():
-            pixel = int(np.argmax((self.flare_electrons < 0).any(axis=0)))
-            raise InputError(
-                f"flare spectra must be 0 or above, but a flare takes light from pixel {pixel}", key="flare_electrons"
-            )
         if len(self.flare_electrons) > MOST_FLARES:
             raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
-        unusable = self.quiet.saturated & (self.weights != 0).any(axis=0)
-        if unusable.any():
-            raise InputError(f"pixel {int(np.argmax(unusable))} saturates, so its weights must be 0", key="weights")
+        flares, weights, finite = self.flare_electrons, self.weights, "must be finite, but those of pixel {} are not"
+        for key, wrong, fault in (
+            ("flare_electrons", ~np.isfinite(flares), f"flare spectra {finite}"),
+            ("weights", ~np.isfinite(weights), f"spectral weights {finite}"),
+            ("flare_electrons", flares < 0, "flare spectra must be 0 or above, but a flare takes light from pixel {}"),
+            ("weights", self.quiet.saturated & (weights != 0), "pixel {} saturates, so its weights must be 0"),
+        ):
+            if wrong.any():
+                raise InputError(fault.format(int(np.argmax(wrong.any(axis=0)))), key=key)
 
     @classmethod
     def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:

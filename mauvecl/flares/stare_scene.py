@@ -481,20 +481,15 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
         variance = x.read_noise_dn**2 + x.gain_dn_per_electron * light + dark * x.dark_variance_dn2
         sd = np.sqrt(variance)
         near = used & ((mean - RAIL_SIGMA * sd < 0.0) | (mean + RAIL_SIGMA * sd > x.highest_dn))
-        if near.any():
-            pixel = int(np.argmax(near))
-            raise InputError(
-                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight; "
-                "use method 'pixels', which clips, or give the pixel the weight 0",
-                key="method",
-            )
-        if (used & (variance < LEAST_VARIANCE)).any():
-            pixel = int(np.argmax(used & (variance < LEAST_VARIANCE)))
-            raise InputError(
-                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise; "
-                "use method 'pixels'",
-                key="method",
-            )
+        for wrong, fault in (
+            (near, f"comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight; use method 'pixels', "
+                   "which clips, or give the pixel the weight 0"),
+            (used & (variance < LEAST_VARIANCE), "scatters by {:.2g} DN, too little for its rounding to be noise; use "
+                                                 "method 'pixels'"),
+        ):  # fmt: skip
+            if wrong.any():
+                pixel = int(np.argmax(wrong))
+                raise InputError(f"pixel {pixel} of {x.name} {fault.format(sd[pixel])}", key="method")
 
 
 def method_for(components: Components, stare: Stare, processes: Processes = NONE) -> Method:
