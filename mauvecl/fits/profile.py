@@ -172,8 +172,9 @@ class Profile:
         every = COARSE if at_nodes is None else 1
         gain = self.gain_at_nodes(every) if at_nodes is None else at_nodes
         x, rows = self.nodes[::every][gain.argmax(axis=1)], np.arange(len(gain))
-        step = every * float(self.nodes[1] - self.nodes[0])
-        for _ in range(NARROWED):
+        width = float(self.nodes[1] - self.nodes[0])
+        step = every * width
+        while step > FINE * width:
             there = np.clip(x[:, None] + step * GRID, self.nodes[0], self.nodes[-1])
             gain = self.gain(there)
             best = gain.argmax(axis=1)
@@ -571,9 +572,9 @@ def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
     return gradient
 
 
-#: The search for the best temperature with bounds starts from every `COARSE`-th node of the model; a grid in units of
-#: the step, and how often it is narrowed.
-COARSE, GRID, NARROWED = 4, np.linspace(-1.0, 1.0, 9), 4
+#: The search for the best temperature with bounds starts from every `COARSE`-th node of the model; the grid in units of
+#: its reach, and the reach in nodes at which it ends.
+COARSE, GRID, FINE = 4, np.linspace(-1.0, 1.0, 9), 0.02
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
