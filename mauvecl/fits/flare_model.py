@@ -495,14 +495,18 @@ class MeanSums:
         q, r = np.linalg.qr(self.fixed.T)
         return q.T, np.linalg.inv(r)
 
+    def free(self, sums: Float) -> Float:
+        """Return sums, (n, n_sum), less what the fixed components explain."""
+        basis, _ = self.basis
+        return np.asarray(sums - (sums @ basis.T) @ basis)
+
     @cached_property
     def directions(self) -> tuple[Float, Float]:
         """Unit vectors of blackbodies less their projections on the fixed components, and their cubics over log_k.
 
         Shapes (n_node, n_sum) and, of the spline's coefficients, (n_node - 1, 4, n_sum).
         """
-        basis, _ = self.basis
-        free = self.hot - (self.hot @ basis.T) @ basis
+        free = self.free(self.hot)
         units = free / np.linalg.norm(free, axis=1)[:, None]
         return units, np.moveaxis(scipy.interpolate.CubicSpline(self.log_k, units).c, 0, 1).copy()
 

@@ -80,9 +80,7 @@ class Profile:
         """Take the sums of frames, (n, n_sum), and those of the factor on light, (n,), if it is unknown."""
         self.reduction, self.sums, self.light, self.bounded = reduction, sums, light, bounded
         self.nodes = reduction.log_k
-        basis, _ = reduction.basis
-        #: Sums less what the fixed components explain.
-        self.rest = sums - (sums @ basis.T) @ basis
+        self.rest = reduction.free(sums)
 
     def bounded_rows(self, rows: NDArray[np.intp], reduction: MeanSums | None = None) -> Profile:
         """Return the bounded profile of some of the frames, optionally for another reduction to the same sums."""
@@ -418,13 +416,9 @@ def _sums_at_end(
     """
     reduction = profile.reduction
     there, (basis, inverse) = _held_direction(reduction, spline, x), reduction.basis
-
-    def free(sums: Float) -> Float:
-        return np.asarray(sums - (sums @ basis.T) @ basis)
-
     # The fitted sums at the end, with the quantity moved there.
     hot = reduction.spline(x)
-    body = free(hot)
+    body = reduction.free(hot)
     body /= np.linalg.norm(body, axis=1)[:, None]
     mean = profile.sums[rows] - profile.rest[rows] + np.vecdot(profile.rest[rows], body)[:, None] * body
     mean += (moved / np.linalg.norm(there, axis=1))[:, None] * there
@@ -432,7 +426,7 @@ def _sums_at_end(
     others = (mean @ basis.T - amplitude[:, None] * (hot @ basis.T)) @ inverse.T
     # The gradient of the quantity: that at this temperature, and along the change of the mean with temperature.
     slope = reduction.spline(x, 1)
-    change = free(slope)
+    change = reduction.free(slope)
     change -= np.vecdot(change, body)[:, None] * body
     steeper = np.vecdot(spline(x, 1), np.column_stack([amplitude, others]))
     steeper -= amplitude * np.vecdot(there, slope)
