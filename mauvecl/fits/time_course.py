@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
@@ -26,6 +26,7 @@ from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare
+from mauvecl.host.arrays import array_cache
 from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
@@ -300,8 +301,12 @@ class _Data:
         """Return values of the frames that are proportional to the light, before the known losses of it."""
         return np.asarray(values / np.where(self.light > 0, self.light, 1.0))
 
-    def flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
-        """Return the amplitude and log temperature of each frame, and their derivatives, of shape (6, n_frame)."""
+    @cached_property
+    def flare(self) -> Callable[[Float], tuple[Float, Float, Float, Float]]:
+        """Function of the parameters: amplitude and log temperature of each frame, and their slopes, (6, n_frame)."""
+        return array_cache(2)(self._flare)
+
+    def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
         width, amplitude, fold = np.exp(theta[[1, 2, 5]])
         rise = amplitude * self.light * self.shape.mean_over(self.edges, theta[0], width)
         # Temperatures over that at the peak, as in `Cooling`.
