@@ -145,7 +145,7 @@ class Profile:
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
         """Return the best fit of each frame, from `gain_at_nodes` if it is known."""
-        return self.solution(self._narrowed(at_nodes) if self.bounded else self._stationary(at_nodes))
+        return self.solution(self._refined(at_nodes) if self.bounded else self._stationary(at_nodes))
 
     def _stationary(self, at_nodes: Float | None) -> Float:
         """Return the best temperatures without bounds on fixed components, shape (n,).
@@ -165,23 +165,48 @@ class Profile:
         # Otherwise the best node is an end of the model's temperatures, or no light is found.
         return np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node])
 
-    def _narrowed(self, at_nodes: Float | None) -> Float:
-        """Return the best temperatures with bounds, which may bend the gain sharply, by ever narrower grids."""
+    def _refined(self, at_nodes: Float | None) -> Float:
+        """Return the best temperatures with bounds on all components, shape (n,)."""
         every = COARSE if at_nodes is None else 1
-        gain = self.gain_at_nodes(every) if at_nodes is None else at_nodes
-        x, rows = self.nodes[::every][gain.argmax(axis=1)], np.arange(len(gain))
-        width = float(self.nodes[1] - self.nodes[0])
-        step = every * width
-        while step > FINE * width:
-            there = np.clip(x[:, None] + step * GRID, self.nodes[0], self.nodes[-1])
-            gain = self.gain(there)
-            best = gain.argmax(axis=1)
-            x, step = there[rows, best], step * float(GRID[1] - GRID[0])
-        # The vertex of the parabola through the best three.
-        _, slope, bend = _parabola(gain, np.clip(best, 1, GRID.size - 2) + GRID.size * rows)
-        vertex = np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0)
-        vertex[(best == 0) | (best == GRID.size - 1)] = 0.0
-        return np.clip(x + step * np.clip(vertex, -1.0, 1.0), self.nodes[0], self.nodes[-1])
+        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
+        low, high = self.nodes[0], self.nodes[-1]
+        step = every * float(self.nodes[1] - self.nodes[0])
+        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
+        for _ in range(REFINEMENTS):
+            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
+            g = self.gain(there)
+            # The vertex of the parabola through three points, or the best point if there is no maximum.
+            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
+            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
+            under = right * a - left * b
+            over = right * a**2 - left * b**2
+            inside = np.abs(under) > 1e-300
+            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
+            three = there[np.arange(x.size), np.argmax(g, axis=1)]
+            vertex = np.where(inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2]), vertex, three)
+            x = np.where(self.gain(vertex) >= g.max(axis=1), vertex, three)
+            # A smooth maximum moves less and less; bounds may bend the gain sharply.
+            moving = np.abs(x - there[:, 1]) > SETTLED * step
+            step /= NARROWER
+        self._climb(x, np.flatnonzero(moving))
+        return x
+
+    def _climb(self, x: Float, moving: NDArray[np.intp]) -> None:
+        """Move the temperatures from which the gain still rises to its maximum nearby."""
+        if not moving.size:
+            return
+        low, high = self.nodes[0], self.nodes[-1]
+        step = float(self.nodes[1] - self.nodes[0])
+        beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
+        gain = self.bounded_rows(moving).gain(beside)
+        rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
+        if not rising.size:
+            return
+        own = self.bounded_rows(rising)
+        for _ in range(CLIMBS):
+            there = np.clip(x[rising, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
+            x[rising] = there[np.arange(rising.size), np.argmax(own.gain(there), axis=1)]
+            step /= 4.0
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -566,9 +591,13 @@ def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
     return gradient
 
 
-#: The search for the best temperature with bounds starts from every `COARSE`-th node of the model; the grid in units of
-#: its reach, and the reach in nodes at which it ends.
-COARSE, GRID, FINE = 4, np.linspace(-1.0, 1.0, 9), 0.02
+#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
+REFINEMENTS, NARROWER = 3, 8.0
+#: The search for the best temperature starts from every `COARSE`-th node of the model.
+COARSE = 4
+#: Share of a refinement's step above which a best temperature still moves; distance in nodes at which the gain beside
+#: it is then tried, its least rise that counts, and the number of narrowing grids that follow it.
+SETTLED, BESIDE, LEAST_RISE, CLIMBS = 0.5, 0.05, 1e-3, 4
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
