@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
+from mauvecl.flares.energies import EnergyScale, amplitude_of
 from mauvecl.flares.settings import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.host.arrays import set_read_only
@@ -83,7 +83,7 @@ class Event:
         shape: Shape | str = "davenport2014",
     ) -> Self:
         """Return the flare with a maximum relative rise, which is not the amplitude of every shape."""
-        return cls(peak_s, half_width_s, amplitude_of_peak(peak, shape), temperature, shape)
+        return cls(peak_s, half_width_s, peak / shape_of(shape).peak, temperature, shape)
 
     @classmethod
     def of_equivalent_duration(
@@ -131,7 +131,7 @@ class Event:
     @property
     def equivalent_duration_s(self) -> float:
         """Equivalent duration in the band, s."""
-        return equivalent_duration(self.amplitude, self.half_width_s, self.form)
+        return self.amplitude * self.half_width_s * self.form.equivalent_duration
 
     def energy(self, scale: EnergyScale) -> float:
         """Return the energy, erg."""
