@@ -163,7 +163,8 @@ class Profile:
         with np.errstate(divide="ignore", invalid="ignore"):
             top = c[2] / (np.sqrt(c[1] ** 2 - 3 * c[0] * c[2]) - c[1])
         # Otherwise the best node is an end of the model's temperatures, or no light is found.
-        return np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node])
+        best = np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node])
+        return np.asarray(best)
 
     def _refined(self, at_nodes: Float | None) -> Float:
         """Return the best temperatures with bounds on all components, shape (n,)."""
@@ -237,7 +238,7 @@ class Profile:
         closed = (node >= 0) & (node <= last)
 
         def over(x: Float) -> Float:
-            return np.sqrt(np.maximum(best.gain[:, None] - self.gain(x), 0.0)) - np.sqrt(allowed)
+            return np.asarray(np.sqrt(np.maximum(best.gain[:, None] - self.gain(x), 0.0)) - np.sqrt(allowed))
 
         # The Illinois method on the root of the rise.
         a, x = inner, np.where(closed, self.nodes[np.clip(node, 0, last)], inner)

@@ -79,8 +79,8 @@ class Shape(Integrable):
         for reach in (1.0, -1.0):
             while float(self.at(self.peak_at + reach)) > self.peak / 2:
                 reach *= 2
-            between = sorted((self.peak_at, self.peak_at + reach))
-            ends.append(scipy.optimize.brentq(lambda t: float(self.at(t)) - self.peak / 2, *between, xtol=1e-13))
+            low, high = sorted((self.peak_at, self.peak_at + reach))
+            ends.append(scipy.optimize.brentq(lambda t: float(self.at(t)) - self.peak / 2, low, high, xtol=1e-13))
         return float(ends[0] - ends[1])
 
     def integral(self, first: ArrayLike, last: ArrayLike) -> Float:

@@ -192,8 +192,8 @@ def alternate(
             columns, fits = [*survey.sums.T, *([survey.flux] if survey.weighted else [])], list[Process]()
             befores = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
             for column, start in zip(columns, befores, strict=False):
-                quiet = (each[~taken] for each in (survey.stare.start_s, column, survey.variance))
-                fits.append(fit_process(Binned.of(*quiet, survey.stare.frame_s), start, steps))
+                time, values, variance = (each[~taken] for each in (survey.stare.start_s, column, survey.variance))
+                fits.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), start, steps))
             fitted = replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
             rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
         fitted, now = rounds[key]
