@@ -190,7 +190,7 @@ class Profile:
             moving = np.abs(x - there[:, 1]) > SETTLED * step
             step /= NARROWER
         self._climb(x, np.flatnonzero(moving))
-        return x
+        return np.asarray(x)
 
     def _climb(self, x: Float, moving: NDArray[np.intp]) -> None:
         """Move the temperatures from which the gain still rises to its maximum nearby."""
