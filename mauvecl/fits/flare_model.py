@@ -163,14 +163,21 @@ class FlareModel:
         nodes = [BalmerFlare().nodes_nm, np.ravel(bands_nm), *(line.nodes_nm for line in chosen)]
         grid = np.unique(np.concatenate([GRID_NM, *nodes]))
         bodies = np.array([blackbody(grid, float(k)) for k in kelvin])
-        scale = _flux_ratios(star, band, kelvin)
+        in_band = photons(star.wavelength_nm, star.flux_flam, band)
+        if not in_band > 0.0:
+            raise InputError(f"the star must have light in the band {band}, but has none", key="band")
+        # Flux at the telescope over that at the surface for an amplitude of one.
+        nm = star.wavelength_nm
+        scale = np.array([in_band / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
         balmer = [balmer_continuum(grid, electron_temperature_k)] if jump else []
         names = ("amplitude", *(["balmer"] if jump else []), *(f"line {line.name}" for line in chosen))
         fluxes = np.vstack([scale[:, None] * bodies, *balmer, *(line.profile(grid) for line in chosen)])
         dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
         counts = np.asarray((response_matrix(instrument, grid, order) @ fluxes.T).T) * dn
         # Flux of each component in each range, and over all wavelengths, for an amplitude of one.
-        light = [(f"{low:g}-{high:g} nm", _between(grid, fluxes, low, high)) for low, high in bands_nm]
+        ranges = [(low, high, (grid >= low) & (grid <= high)) for low, high in bands_nm]
+        light = [(f"{low:g}-{high:g} nm", 10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
+                 for low, high, inside in ranges]  # fmt: skip
         edge = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
         whole = [(edge.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(edge.edge_flux)] if jump else []
         bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
@@ -184,11 +191,11 @@ class FlareModel:
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
         """Return the model of exposures that are n times as long, of which a share `light` of all light arrives."""
-        derived = list(self.derived)
-        for k, each in enumerate(derived):
-            if each.name.startswith("energy") and each.factors is not None:
-                derived[k] = replace(each, factors=n * each.factors)
-        return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=tuple(derived))
+        derived = tuple(
+            replace(each, factors=n * each.factors) if each.unit == "erg" and each.factors is not None else each
+            for each in self.derived
+        )
+        return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=derived)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -290,20 +297,6 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
             values[:, q] = derived.offset + ratio(log_k) * over
     return values
-
-
-def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
-    """Return flux at the telescope over that at the surface of flares with an amplitude of one, shape of `kelvin`."""
-    nm = star.wavelength_nm
-    light = photons(nm, star.flux_flam, band)
-    if not light > 0.0:
-        raise InputError(f"the star must have light in the band {band}, but has none", key="band")
-    return np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
-
-
-def _between(grid: Float, fluxes: Float, low: float, high: float) -> Float:
-    inside = (grid >= low) & (grid <= high)
-    return np.asarray(10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
 
 
 def _derived(
@@ -447,6 +440,18 @@ class Ratio:
         """Return the variance of top - ratio x bottom."""
         return self.top_variance - 2.0 * ratio * self.covariance + ratio**2 * self.bottom_variance
 
+    def root(self, left: Float, sign: float) -> Float:
+        """Return one of the two ratios at which chi-squared has risen by `left`: the end if the bottom is not zero."""
+        a = self.bottom**2 - left * self.bottom_variance
+        b = self.top * self.bottom - left * self.covariance
+        # The root of b^2 - a c, without its cancellation.
+        spread = self.bottom**2 * self.top_variance - 2.0 * self.top * self.bottom * self.covariance
+        spread = spread + self.top**2 * self.bottom_variance
+        rest = self.top_variance * self.bottom_variance - self.covariance**2
+        root = np.sqrt(np.maximum(left * (spread - left * rest), 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((b + sign * root) / a)
+
     def end(self, left: Float, sign: float) -> Float:
         """Return the end of the set of ratios that raise chi-squared by at most `left`, with a positive bottom.
 
@@ -455,20 +460,10 @@ class Ratio:
         left = np.maximum(left, 0.0)
         if not self.bottom_variance.any():
             return np.asarray((self.top + sign * np.sqrt(left * self.top_variance)) / self.bottom)
-        a = self.bottom**2 - left * self.bottom_variance
-        b = self.top * self.bottom - left * self.covariance
-        c = self.top**2 - left * self.top_variance
-        # The root of b^2 - a c, without its cancellation.
-        spread = self.bottom**2 * self.top_variance - 2.0 * self.top * self.bottom * self.covariance
-        spread = spread + self.top**2 * self.bottom_variance
-        rest = self.top_variance * self.bottom_variance - self.covariance**2
-        root = np.sqrt(np.maximum(left * (spread - left * rest), 0.0))
-        positive = self.bottom > 0.0
-        with np.errstate(divide="ignore", invalid="ignore"):
-            closed = (b + sign * root) / a
-            # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.
-            open_end = np.where((c > 0.0) & (sign * self.top < 0.0), c / (b - sign * root), sign * np.inf)
-        return np.asarray(np.where(a > 0.0, np.where(positive, closed, -sign * np.inf), open_end))
+        end, may_be_zero = self.root(left, sign), self.bottom**2 <= left * self.bottom_variance
+        # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.
+        closed = ~may_be_zero | ((self.top**2 > left * self.top_variance) & (sign * self.top < 0.0))
+        return np.where(may_be_zero | (self.bottom > 0.0), np.where(closed, end, sign * np.inf), -sign * np.inf)
 
 
 Ranges = Sequence[tuple[float, float]]
@@ -500,14 +495,18 @@ class MeanSums:
         q, r = np.linalg.qr(self.fixed.T)
         return q.T, np.linalg.inv(r)
 
+    def free(self, sums: Float) -> Float:
+        """Return sums, (n, n_sum), less what the fixed components explain."""
+        basis, _ = self.basis
+        return np.asarray(sums - (sums @ basis.T) @ basis)
+
     @cached_property
     def directions(self) -> tuple[Float, Float]:
         """Unit vectors of blackbodies less their projections on the fixed components, and their cubics over log_k.
 
         Shapes (n_node, n_sum) and, of the spline's coefficients, (n_node - 1, 4, n_sum).
         """
-        basis, _ = self.basis
-        free = self.hot - (self.hot @ basis.T) @ basis
+        free = self.free(self.hot)
         units = free / np.linalg.norm(free, axis=1)[:, None]
         return units, np.moveaxis(scipy.interpolate.CubicSpline(self.log_k, units).c, 0, 1).copy()
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
@@ -69,21 +69,23 @@ class BestFit:
 
 
 class Profile:
-    """Profile likelihood of the temperature for the sums of some frames, with a blackbody of at least zero."""
+    """Profile likelihood of the temperature for the sums of some frames.
 
-    bounded: ClassVar[bool] = False
+    The blackbody's amplitude is at least zero; if it is `bounded`, so are those of the fixed components.
+    """
 
-    def __init__(self, reduction: MeanSums, sums: Float, light: Float | None = None) -> None:
+    def __init__(
+        self, reduction: MeanSums, sums: Float, light: Float | None = None, *, bounded: bool = False
+    ) -> None:  # fmt: skip
         """Take the sums of frames, (n, n_sum), and those of the factor on light, (n,), if it is unknown."""
-        self.reduction, self.sums, self.light = reduction, sums, light
+        self.reduction, self.sums, self.light, self.bounded = reduction, sums, light, bounded
         self.nodes = reduction.log_k
-        basis, _ = reduction.basis
-        #: Sums less what the fixed components explain.
-        self.rest = sums - (sums @ basis.T) @ basis
+        self.rest = reduction.free(sums)
 
-    def rows(self, rows: NDArray[np.intp]) -> tuple[MeanSums, Float, Float | None]:
-        """Return what makes a profile of some of the frames."""
-        return self.reduction, self.sums[rows], None if self.light is None else self.light[rows]
+    def bounded_rows(self, rows: NDArray[np.intp], reduction: MeanSums | None = None) -> Profile:
+        """Return the bounded profile of some of the frames, optionally for another reduction to the same sums."""
+        light = None if self.light is None else self.light[rows]
+        return Profile(reduction or self.reduction, self.sums[rows], light, bounded=True)
 
     def products(self, log_k: Float) -> Products:
         """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
@@ -115,8 +117,13 @@ class Profile:
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        face = self.face(log_k)
-        return np.asarray(face.gain - np.minimum(face.amplitude, 0.0) ** 2 * face.power)
+        if not self.bounded:
+            face = self.face(log_k)
+            return np.asarray(face.gain - np.minimum(face.amplitude, 0.0) ** 2 * face.power)
+        gain = np.zeros((len(self.sums), *log_k.shape[1:]))
+        for face in self.faces(self.products(log_k)):
+            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
+        return gain
 
     def gain_at_nodes(self, every: int = 1) -> Float:
         """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
@@ -137,7 +144,11 @@ class Profile:
         return FactorAt(without, np.moveaxis(light.weights_of(log_k), -1, 0), light.scale**-2.0)
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
-        """Return the best fit of each frame.
+        """Return the best fit of each frame, from `gain_at_nodes` if it is known."""
+        return self.solution(self._refined(at_nodes) if self.bounded else self._stationary(at_nodes))
+
+    def _stationary(self, at_nodes: Float | None) -> Float:
+        """Return the best temperatures without bounds on fixed components, shape (n,).
 
         The gain is the squared product of the sums with a unit vector, which is a cubic polynomial of the temperature
         between two nodes, so that its maximum has a closed form.
@@ -152,7 +163,51 @@ class Profile:
         with np.errstate(divide="ignore", invalid="ignore"):
             top = c[2] / (np.sqrt(c[1] ** 2 - 3 * c[0] * c[2]) - c[1])
         # Otherwise the best node is an end of the model's temperatures, or no light is found.
-        return self.solution(np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node]))
+        best = np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node])
+        return np.asarray(best)
+
+    def _refined(self, at_nodes: Float | None) -> Float:
+        """Return the best temperatures with bounds on all components, shape (n,)."""
+        every = COARSE if at_nodes is None else 1
+        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
+        low, high = self.nodes[0], self.nodes[-1]
+        step = every * float(self.nodes[1] - self.nodes[0])
+        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
+        for _ in range(REFINEMENTS):
+            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
+            g = self.gain(there)
+            # The vertex of the parabola through three points, or the best point if there is no maximum.
+            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
+            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
+            under = right * a - left * b
+            over = right * a**2 - left * b**2
+            inside = np.abs(under) > 1e-300
+            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
+            three = there[np.arange(x.size), np.argmax(g, axis=1)]
+            vertex = np.where(inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2]), vertex, three)
+            x = np.where(self.gain(vertex) >= g.max(axis=1), vertex, three)
+            # A smooth maximum moves less and less; bounds may bend the gain sharply.
+            moving = np.abs(x - there[:, 1]) > SETTLED * step
+            step /= NARROWER
+        self._climb(x, np.flatnonzero(moving))
+        return np.asarray(x)
+
+    def _climb(self, x: Float, moving: NDArray[np.intp]) -> None:
+        """Move the temperatures from which the gain still rises to its maximum nearby."""
+        if not moving.size:
+            return
+        low, high = self.nodes[0], self.nodes[-1]
+        step = float(self.nodes[1] - self.nodes[0])
+        beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
+        gain = self.bounded_rows(moving).gain(beside)
+        rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
+        if not rising.size:
+            return
+        own = self.bounded_rows(rising)
+        for _ in range(CLIMBS):
+            there = np.clip(x[rising, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
+            x[rising] = there[np.arange(rising.size), np.argmax(own.gain(there), axis=1)]
+            step /= 4.0
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -173,41 +228,29 @@ class Profile:
 
         An end is NaN if chi-squared does not rise that far within the model's temperatures.
         """
-        inside, last = best.gain[:, None] - at_nodes <= allowed, self.nodes.size - 1
+        inside, last, middle = best.gain[:, None] - at_nodes <= allowed, self.nodes.size - 1, best.log_k[:, None]
         # Outermost temperatures inside: nodes, or those of the fits.
-        first, final = self.nodes[inside.argmax(axis=1)], self.nodes[last - inside[:, ::-1].argmax(axis=1)]
-        some = inside.any(axis=1)
-        first = np.where(some, np.minimum(first, best.log_k), best.log_k)
-        final = np.where(some, np.maximum(final, best.log_k), best.log_k)
-        ends = []
-        for start, beyond in (
-            (first, np.searchsorted(self.nodes, first, side="left") - 1),
-            (final, np.searchsorted(self.nodes, final, side="right")),
-        ):
-            closed = (beyond >= 0) & (beyond <= last)
-            stop = np.where(closed, self.nodes[np.clip(beyond, 0, last)], start)
-            ends.append(np.where(closed, self._crossing(best.gain, allowed, start, stop), np.nan))
-        return ends[0], ends[1]
-
-    def _crossing(self, gain: Float, allowed: float, inner: Float, outer: Float) -> Float:
-        """Return where chi-squared has risen by `allowed` between two temperatures (Illinois method on its root)."""
-        root = np.sqrt(allowed)
+        inner = self.nodes[np.column_stack([inside.argmax(axis=1), last - inside[:, ::-1].argmax(axis=1)])]
+        inner = np.where(inside.any(axis=1, keepdims=True), inner, middle)
+        inner[:, :1], inner[:, 1:] = np.minimum(inner[:, :1], middle), np.maximum(inner[:, 1:], middle)
+        beyond = np.searchsorted(self.nodes, inner[:, 0]) - 1, np.searchsorted(self.nodes, inner[:, 1], side="right")
+        node = np.column_stack(beyond)
+        closed = (node >= 0) & (node <= last)
 
         def over(x: Float) -> Float:
-            return np.asarray(np.sqrt(np.maximum(gain - self.gain(x), 0.0)) - root)
+            return np.asarray(np.sqrt(np.maximum(best.gain[:, None] - self.gain(x), 0.0)) - np.sqrt(allowed))
 
-        a, b = inner, outer
-        fa, fb = over(a), over(b)
-        x = b
+        # The Illinois method on the root of the rise.
+        a, x = inner, np.where(closed, self.nodes[np.clip(node, 0, last)], inner)
+        fa, fx = over(a), over(x)
         for _ in range(STEPS):
-            spread = fb - fa
+            b, fb, spread = x, fx, fx - fa
             x = np.where(np.abs(spread) > 1e-14, b - fb * (b - a) / np.where(spread == 0.0, 1.0, spread), b)
             fx = over(x)
             crossed = fx * fb < 0.0
-            fa = np.where(crossed, fb, 0.5 * fa)
-            a = np.where(crossed, b, a)
-            b, fb = x, fx
-        return x
+            a, fa = np.where(crossed, b, a), np.where(crossed, fb, 0.5 * fa)
+        low, high = np.where(closed, x, np.nan).T
+        return low, high
 
 
 def intervals(
@@ -250,7 +293,7 @@ def intervals(
         elif derived.ratio is None:
             ends = ends_of_sum(spline)
         else:
-            lowest, highest = _ratio_ends(products, faces, spline(x), least)
+            lowest, highest = _ratio_ends(faces, spline(x), least)
             ends = derived.offset + lowest, derived.offset + highest
         # Light that contradicts every factor above zero limits nothing.
         none = ends[0] > ends[1]
@@ -279,44 +322,28 @@ def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: Fac
     return extreme(lows, -1.0), extreme(highs, 1.0)
 
 
-def _ratio_ends(products: Products, faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
+def _ratio_ends(faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
     """Return the ends of per x (fixed component 0) / (blackbody): Fieller's at each temperature, then the hull."""
     lows, highs = np.full(per.shape, np.inf), np.full(per.shape, -np.inf)
+    factors, falls = np.zeros((2, 1 + max(len(face.some) for face in faces), *per.shape))
+    factors[1], falls[0] = per, -1.0
+    body = FactorAt(np.zeros(()), falls, 0.0)
     for face in faces:
-        if 0 not in face.some or not face.hot:
-            allowed = (face.gain >= least) & face.positive(face.amplitude, face.others)
-            if 0 not in face.some:
-                np.copyto(lows, 0.0, where=allowed)
-                np.maximum(highs, 0.0, out=highs, where=allowed)
-            if not face.hot:
-                # Without a blackbody the light is recombination, or there is none, which every ratio allows.
-                np.copyto(highs, np.inf, where=allowed)
-            continue
-        # Products of sums y, blackbody t and recombination f, the fixed component 0 over `per`, less their projections
-        # on the lines of the face.
-        lines, edge = face.some[1:], products.gram[0, 0] / per**2
-        y, t, f = products.fixed[lines], products.cross[lines], products.gram[lines, 0].reshape(-1, 1, 1) / per
-        inverse = np.linalg.inv(products.gram[np.ix_(lines, lines)])
-        by_y, by_t, by_f = (np.tensordot(inverse, each, 1) for each in (y, t, f))
-        yt, tt = (each - np.sum(t * by, axis=0) for each, by in ((products.along, by_y), (products.power, by_t)))
-        yf, tf, ff = (
-            each - np.sum(f * by, axis=0)
-            for each, by in ((products.fixed[0] / per, by_y), (products.cross[0] / per, by_t), (edge, by_f))
-        )
-        rest = least - np.sum(y * by_y, axis=0)
-        # (yt + r yf)^2 = rest |t + r f|^2 at the ends r.
-        a, b, c = yf**2 - rest * ff, yt * yf - rest * tf, yt**2 - rest * tt
-        inside = b**2 - a * c
-        root = np.sqrt(np.where(inside >= -1e-9 * b**2, np.maximum(inside, 0.0), np.nan))
-        for sign in (-1.0, 1.0):
-            with np.errstate(divide="ignore", invalid="ignore"):
-                r = (-b + sign * root) / a
-                amplitude = (yt + r * yf) / (tt + 2 * r * tf + r**2 * ff)
-                there = amplitude >= 0
-                if face.bounded:
-                    there &= (r >= 0) & (by_y - amplitude * (by_t + r * by_f) >= 0).all(axis=0)
-            np.minimum(lows, r, out=lows, where=there)
-            np.maximum(highs, r, out=highs, where=there)
+        left = face.gain - least
+        allowed = (left >= 0.0) & face.positive(face.amplitude, face.others)
+        if 0 not in face.some:
+            np.copyto(lows, 0.0, where=allowed)
+            np.maximum(highs, 0.0, out=highs, where=allowed)
+        if not face.hot:
+            # Without a blackbody the light is recombination, or there is none, which every ratio allows.
+            np.copyto(highs, np.inf, where=allowed)
+        elif 0 in face.some:
+            ratio = face.ratio(factors, body)
+            for sign in (-1.0, 1.0):
+                end = ratio.root(left, sign)
+                there = (left >= 0.0) & face.positive(*face.reached(ratio, end, factors, body))
+                np.minimum(lows, end, out=lows, where=there)
+                np.maximum(highs, end, out=highs, where=there)
     return extreme(lows, -1.0), extreme(highs, 1.0)
 
 
@@ -415,13 +442,9 @@ def _sums_at_end(
     """
     reduction = profile.reduction
     there, (basis, inverse) = _held_direction(reduction, spline, x), reduction.basis
-
-    def free(sums: Float) -> Float:
-        return np.asarray(sums - (sums @ basis.T) @ basis)
-
     # The fitted sums at the end, with the quantity moved there.
     hot = reduction.spline(x)
-    body = free(hot)
+    body = reduction.free(hot)
     body /= np.linalg.norm(body, axis=1)[:, None]
     mean = profile.sums[rows] - profile.rest[rows] + np.vecdot(profile.rest[rows], body)[:, None] * body
     mean += (moved / np.linalg.norm(there, axis=1))[:, None] * there
@@ -429,7 +452,7 @@ def _sums_at_end(
     others = (mean @ basis.T - amplitude[:, None] * (hot @ basis.T)) @ inverse.T
     # The gradient of the quantity: that at this temperature, and along the change of the mean with temperature.
     slope = reduction.spline(x, 1)
-    change = free(slope)
+    change = reduction.free(slope)
     change -= np.vecdot(change, body)[:, None] * body
     steeper = np.vecdot(spline(x, 1), np.column_stack([amplitude, others]))
     steeper -= amplitude * np.vecdot(there, slope)
@@ -506,13 +529,9 @@ def _noise(n: int) -> Float:
     return np.concatenate([half, -half])
 
 
-@dataclass(frozen=True, eq=False)
-class Slopes:
-    """Derivatives with respect to a parameter of n fits."""
-
-    sums: Float  # shape (n, n_sum)
-    quantities: Float  # shape (n, n_derived), as they are recorded
-    light: Float  # shape (n,); of the sum of the factor on light
+#: Derivatives of n fits with respect to a parameter: of the sums, (n, n_sum), of the quantities as they are recorded,
+#: (n, n_derived), and of the sum of the factor on light, (n,).
+Slopes = tuple[Float, Float, Float]
 
 
 def covariance(
@@ -528,8 +547,8 @@ def covariance(
     columns = [reduction.spline(log_k)[:, None], fixed, (linear[:, :1] * reduction.spline(log_k, 1))[:, None]]
     gradients = [_gradient(model, log_k, linear)]
     if other is not None:
-        columns.append(other.sums[:, None])
-        gradients.append(other.quantities[:, :, None])
+        columns.append(other[0][:, None])
+        gradients.append(other[1][:, :, None])
     jacobian, gradient = np.concatenate(columns, axis=1), np.concatenate(gradients, axis=2)
     information = jacobian @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.einsum("nii->ni", information))
@@ -547,7 +566,7 @@ def covariance(
     gradient[:, which] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
     by_factor = np.where(which, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
-    slopes = [linear[:, 0] * light.spline(log_k, 1)] + ([] if other is None else [other.light])
+    slopes = [linear[:, 0] * light.spline(log_k, 1)] + ([] if other is None else [other[2]])
     follows = -np.column_stack([light.weights_of(log_k), *(slope / light.scale for slope in slopes)])
     gradient += by_factor[:, :, None] * follows[:, None, :]
     own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
@@ -689,67 +708,7 @@ class Face:
         return self.amplitude + reach * step, self.others + reach * others
 
 
-class BoundedProfile(Profile):
-    """Profile likelihood of the temperature for the sums of some frames, with amplitudes of at least zero."""
-
-    bounded: ClassVar[bool] = True
-
-    def gain(self, log_k: Float) -> Float:
-        """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        gain = np.zeros((len(self.sums), *log_k.shape[1:]))
-        for face in self.faces(self.products(log_k)):
-            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
-        return gain
-
-    def best(self, at_nodes: Float | None = None) -> BestFit:
-        """Return the best fit of each frame."""
-        every = COARSE if at_nodes is None else 1
-        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
-        low, high = self.nodes[0], self.nodes[-1]
-        step = every * float(self.nodes[1] - self.nodes[0])
-        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
-        for _ in range(REFINEMENTS):
-            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
-            g = self.gain(there)
-            # The vertex of the parabola through three points, or the best point if there is no maximum.
-            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
-            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
-            under = right * a - left * b
-            over = right * a**2 - left * b**2
-            inside = np.abs(under) > 1e-300
-            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
-            three = there[np.arange(x.size), np.argmax(g, axis=1)]
-            good = inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2])
-            vertex = np.where(good, vertex, three)
-            reached = self.gain(vertex)
-            x = np.where(reached >= g.max(axis=1), vertex, three)
-            # A smooth maximum moves less and less; bounds may bend the gain sharply.
-            moving = np.abs(x - there[:, 1]) > SETTLED * step
-            step /= NARROWER
-        return self.solution(self._climbed(x, np.flatnonzero(moving)))
-
-    def _climbed(self, x: Float, moving: NDArray[np.intp]) -> Float:
-        """Return the temperatures; those from which the gain still rises are moved to its maximum nearby."""
-        if not moving.size:
-            return x
-        low, high = self.nodes[0], self.nodes[-1]
-        step = float(self.nodes[1] - self.nodes[0])
-        beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
-        gain = BoundedProfile(*self.rows(moving)).gain(beside)
-        rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
-        if not rising.size:
-            return x
-        own, best = BoundedProfile(*self.rows(rising)), x[rising]
-        for _ in range(CLIMBS):
-            there = np.clip(best[:, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
-            best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]
-            step /= 4.0
-        climbed = x.copy()
-        climbed[rising] = best
-        return climbed
-
-
 def with_bounds(reduction: ReducedSums, sums: Float, best: BestFit) -> BestFit:
     """Return fits with amplitudes of at least zero, from fits without this bound."""
     negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
-    return best.replaced(negative, BoundedProfile(reduction, sums[negative]).best()) if negative.size else best
+    return best.replaced(negative, Profile(reduction, sums[negative], bounded=True).best()) if negative.size else best

@@ -29,7 +29,6 @@ from mauvecl.fits.flare_model import (
 )
 from mauvecl.fits.profile import (
     BestFit,
-    BoundedProfile,
     Profile,
     Slopes,
     covariance,
@@ -368,7 +367,7 @@ class _Problem:
         reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
         near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
         if near.size:
-            bounded = BoundedProfile(*profile.rows(near))
+            bounded = profile.bounded_rows(near)
             nodes = bounded.gain_at_nodes()
             there = bounded.best(nodes)
             for k, rise in enumerate(self.rises):
@@ -571,7 +570,7 @@ class TwoTemperatures:
         areas = derived_values(model, lower, linear, np.ones(1))[:, -1]
         quantities[:, -1] = areas * (self._bolometric(log_k, 1)[0] / self._bolometric(log_k)[0] - 4.0)
         light = np.zeros(1) if reduction.light is None else reduction.light.spline(log_k, 1)
-        return Slopes(amplitude[:, None] * reduction.spline(log_k, 1), quantities, amplitude * light)
+        return amplitude[:, None] * reduction.spline(log_k, 1), quantities, amplitude * light
 
 
 @validated
@@ -654,11 +653,10 @@ class _Search:
                 for share in np.linspace(0.0, 1.0, TRIES + 1):
                     wanted[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
 
-    def profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
+    def profile(self, node: int, rows: NDArray[np.intp]) -> Profile:
         """Return the profile of some exposures at a second temperature."""
         log_k = float(self.grid[node])
-        own = self._reduction.with_second(log_k, self._model.end(log_k))
-        return BoundedProfile(own, *self._whole.rows(rows)[1:])
+        return self._whole.bounded_rows(rows, self._reduction.with_second(log_k, self._model.end(log_k)))
 
     def intervals(self) -> tuple[Float, Float]:
         """Return the ends of intervals, (n_level, n, n_derived): the outermost ones at all second temperatures."""
@@ -675,22 +673,15 @@ class _Search:
                 if not there.size:
                     continue
                 limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
-                some = BoundedProfile(*profile.rows(there))
+                some = profile.bounded_rows(there)
                 low, high = intervals(model, some, limit, at_nodes[there], rise)
                 lows[k, rows[there]] = np.minimum(lows[k, rows[there]], low)
                 highs[k, rows[there]] = np.maximum(highs[k, rows[there]], high)
         for k, n in np.ndindex(shape[:2]):
-            lows[k, n, -2], highs[k, n, -2] = self._second_ends(n, np.sqrt(self._allowed[k]))
+            # Ends of the second temperature, interpolated between the tried nodes.
+            tried = np.isfinite(self.gain[n])
+            x, over = self.grid[tried], np.sqrt(gain[n] - self.gain[n, tried]) - np.sqrt(self._allowed[k])
+            a, b = np.flatnonzero(over <= 0)[[0, -1]]
+            lows[k, n, -2] = np.exp(np.interp(0.0, over[[a, a - 1]], x[[a, a - 1]])) if a > 0 else -np.inf
+            highs[k, n, -2] = np.exp(np.interp(0.0, over[[b, b + 1]], x[[b, b + 1]])) if b < x.size - 1 else np.inf
         return lows, highs
-
-    def _second_ends(self, n: int, root: float) -> tuple[float, float]:
-        """Return the ends of the second temperature's interval of an exposure, interpolated between the tried nodes."""
-        tried = np.isfinite(self.gain[n])
-        x, gain, low, high = self.grid[tried], self.gain[n, tried], -np.inf, np.inf
-        over = np.sqrt(gain.max() - gain) - root
-        a, b = np.flatnonzero(over <= 0)[[0, -1]]
-        if a > 0:
-            low = float(np.exp(np.interp(0.0, [over[a], over[a - 1]], [x[a], x[a - 1]])))
-        if b < x.size - 1:
-            high = float(np.exp(np.interp(0.0, [over[b], over[b + 1]], [x[b], x[b + 1]])))
-        return low, high

@@ -303,10 +303,7 @@ class _Data:
 
     @cached_property
     def flare(self) -> Callable[[Float], tuple[Float, Float, Float, Float]]:
-        """Function of the parameters that returns the amplitude and log temperature of each frame, and their slopes.
-
-        These are the derivatives by the parameters, each of shape (6, n_frame).
-        """
+        """Function of the parameters: amplitude and log temperature of each frame, and their slopes, (6, n_frame)."""
         return array_cache(2)(self._flare)
 
     def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
@@ -331,9 +328,7 @@ class _Data:
     def whitening(self, theta: Float | None, *, none: bool = False) -> Whiten:
         """Return the whitening of residuals for the covariances of a flare, or of frames without one.
 
-        Unknown levels shrink the values along their directions.
-
-        With `none`, the unknown levels are those of frames without a flare, whose residuals are then compared.
+        Unknown levels shrink the values along their directions; with `none`, those of frames without a flare.
         """
         covariance, flare = self.quiet_covariance, None
         if theta is not None:
@@ -388,26 +383,18 @@ class _Quantity:
     spline: scipy.interpolate.CubicSpline | None = None  # light per amplitude over log temperature
     factor: float = 1.0
 
-    def value(self, theta: Float, data: _Data) -> float:
-        """Return the quantity of some parameters."""
+    def at(self, theta: Float, data: _Data) -> tuple[float, Float]:
+        """Return the quantity of some parameters, and the derivatives of its logarithm, or of the peak time, (6,)."""
         if self.spline is not None:
-            rise, log_k, *_ = data.flare(theta)
-            return self.factor * float(np.sum(data.intrinsic(rise) * self.spline(log_k)[:, 0]))
-        if self.place == 0:
-            return float(theta[0])
+            rise, log_k, of_rise, of_log_k = data.flare(theta)
+            light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
+            total = float(np.sum(data.intrinsic(rise) * light))
+            slope = data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total
+            return self.factor * total, slope
         # The temperature at the end is relative to that at the peak.
-        return float(np.exp(theta[self.place] + (theta[3] if self.place == 4 else 0.0)))
-
-    def slope(self, theta: Float, data: _Data) -> Float:
-        """Return the derivatives of the quantity's logarithm, or of the peak time, shape (6,)."""
-        if self.spline is None:
-            gradient = np.zeros(len(PARAMETERS))
-            gradient[[self.place, 3] if self.place == 4 else self.place] = 1.0
-            return gradient
-        rise, log_k, of_rise, of_log_k = data.flare(theta)
-        light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
-        total = float(np.sum(data.intrinsic(rise) * light))
-        return np.asarray(data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total)
+        gradient = np.zeros(len(PARAMETERS))
+        gradient[[self.place, 3] if self.place == 4 else self.place] = 1.0
+        return float(theta[0] if self.place == 0 else np.exp(gradient @ theta)), gradient
 
 
 class CoolingCourse(NamedTuple):
@@ -481,9 +468,9 @@ def fit_cooling(
     jacobian = data.jacobian(theta, fit.whiten)[:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
-    estimates = np.array([quantity.value(theta, data) for quantity in quantities])
+    estimates, slopes = (np.array(each) for each in zip(*(q.at(theta, data) for q in quantities), strict=True))
     scale = np.where([quantity.place == 0 for quantity in quantities], 1.0, estimates)
-    slopes = scale[:, None] * np.array([quantity.slope(theta, data) for quantity in quantities])[:, free]
+    slopes = scale[:, None] * slopes[:, free]
     spread = slopes @ covariance @ slopes.T
     ends = fit.ends(quantities, estimates, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
@@ -508,7 +495,7 @@ def cooling_course(
         cooling = Cooling(cooling, cooling, stare.frame_s)
     logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
     theta = np.array([event.peak_s, *logs])
-    values = {quantity.name: quantity.value(theta, data) for quantity in _quantities(data, stare, cooling=True)}
+    values = {quantity.name: quantity.at(theta, data)[0] for quantity in _quantities(data, stare, cooling=True)}
     rise, log_k, *_ = data.flare(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
     strengths = known_strengths(stare, quiet)
@@ -668,7 +655,7 @@ class _BestFit:
             # A flare that does not cool leaves the cooling time without any effect.
             power = np.sum(every**2, axis=0)
             free = free[power[free] > 0.0]
-            jacobian, slope = every[:, free], quantity.slope(there, data)[free]
+            jacobian, slope = every[:, free], quantity.at(there, data)[1][free]
             information = jacobian.T @ jacobian + np.diag(RIDGE * power[free])
             back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
             if not slope @ along > 0.0:
@@ -683,5 +670,5 @@ class _BestFit:
             if outside[free].any():
                 there, free = np.clip(there, low, high), free[~outside[free]]
             elif share * length < CONVERGED:
-                return quantity.value(there, data)
+                return quantity.at(there, data)[0]
         return sign * np.inf

@@ -209,19 +209,9 @@ def quiescent_luminosity(source: Source, distance_pc: Distance, band: str = "Kep
     return sphere * _through(source.wavelength_nm, source.flux_flam, band)
 
 
-def equivalent_duration(amplitude: float, half_width_s: float, shape: Shape | str) -> float:
-    """Return the equivalent duration of a shape, s; `amplitude` is that of the shape, not always its peak."""
-    return amplitude * half_width_s * shape_of(shape).equivalent_duration
-
-
 def amplitude_of(equivalent_duration_s: float, half_width_s: float, shape: Shape | str) -> float:
     """Return the amplitude of a shape for an equivalent duration."""
     return equivalent_duration_s / half_width_s / shape_of(shape).equivalent_duration
-
-
-def amplitude_of_peak(peak: float, shape: Shape | str) -> float:
-    """Return the amplitude of a shape for its maximum, which differs from it for `tovarmendoza2022`."""
-    return peak / shape_of(shape).peak
 
 
 def flux_in_band(band: str, flare: FlareSpectrum) -> float:

@@ -58,20 +58,18 @@ class Components:
             spectra = np.asarray(getattr(self, name), np.float64)
             if spectra.ndim != 2 or spectra.shape[1] != n_pixel or len(spectra) < least:
                 raise InputError(f"{what} must have the shape (n, {n_pixel}), not {spectra.shape}", key=name)
-            if not np.isfinite(spectra).all():
-                pixel = int(np.argmin(np.isfinite(spectra).all(axis=0)))
-                raise InputError(f"{what} must be finite, but those of pixel {pixel} are not", key=name)
             set_read_only(self, **{name: spectra})
-        if (self.flare_electrons < 0).any():
-            pixel = int(np.argmax((self.flare_electrons < 0).any(axis=0)))
-            raise InputError(
-                f"flare spectra must be 0 or above, but a flare takes light from pixel {pixel}", key="flare_electrons"
-            )
         if len(self.flare_electrons) > MOST_FLARES:
             raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
-        unusable = self.quiet.saturated & (self.weights != 0).any(axis=0)
-        if unusable.any():
-            raise InputError(f"pixel {int(np.argmax(unusable))} saturates, so its weights must be 0", key="weights")
+        flares, weights, finite = self.flare_electrons, self.weights, "must be finite, but those of pixel {} are not"
+        for key, wrong, fault in (
+            ("flare_electrons", ~np.isfinite(flares), f"flare spectra {finite}"),
+            ("weights", ~np.isfinite(weights), f"spectral weights {finite}"),
+            ("flare_electrons", flares < 0, "flare spectra must be 0 or above, but a flare takes light from pixel {}"),
+            ("weights", self.quiet.saturated & (weights != 0), "pixel {} saturates, so its weights must be 0"),
+        ):
+            if wrong.any():
+                raise InputError(fault.format(int(np.argmax(wrong.any(axis=0)))), key=key)
 
     @classmethod
     def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:
@@ -136,11 +134,6 @@ class Components:
         """Mean sums of each component at a coefficient of one, shape (4 + n_flare, n_statistic)."""
         return self.sum_cumulants(1)[1]
 
-    @cached_property
-    def _covariances(self) -> tuple[Float, Float]:
-        """`sum_cumulants` of the second order."""
-        return self.sum_cumulants(2)
-
     def coefficients(self, stare: Stare, flare: Float | None = None) -> Float:
         """Return the known coefficients of star, sky, dark, neighbours and flares, shape (n_frame, 4 + n_flare).
 
@@ -165,7 +158,7 @@ class Components:
 
     def covariance(self, coefficients: Float) -> Float:
         """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
-        constant, each = self._covariances
+        constant, each = self.sum_cumulants(2)
         return np.asarray(constant + np.tensordot(coefficients, each, 1))
 
     def jittered_covariance(self, coefficients: Float, stare: Stare) -> Float:
@@ -276,7 +269,7 @@ class StareExpectation:
             frames[:, some] += draw(self.components(np.eye(self.used.size)[some]))
         return frames
 
-    @cached_property
+    @property
     def mean_raw(self) -> Float:
         """Mean raw counts of each pixel, DN, shape (n_frame, n_pixel)."""
         return np.asarray(self.coefficients @ self._bare.mean_dn + self.quiet.bias_dn)

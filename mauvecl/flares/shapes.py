@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -24,19 +24,26 @@ from mauvecl.schema.physical import Duration
 Float = NDArray[np.float64]
 
 
-class Integrable(Protocol):
-    """Time profile that can be integrated, as a `Shape`."""
+class Integrable(ABC):
+    """Time profile that can be integrated, in units of amplitude and half-width."""
 
+    @abstractmethod
     def before(self, tau: ArrayLike) -> Float:
-        """Return the integral up to tau."""
+        """Return the integral up to tau, in half-widths, shape of tau."""
 
+    @abstractmethod
     def after(self, tau: ArrayLike) -> Float:
-        """Return the integral from tau to the end, without cancellation."""
+        """Return the integral from tau to the end, in half-widths, without cancellation; shape of tau."""
+
+    @cached_property
+    def equivalent_duration(self) -> float:
+        """Total integral, in half-widths."""
+        return float(self.before(0.0) + self.after(0.0))
 
 
 @validated
-class Shape(ABC):
-    """Time profile of a flare, in units of amplitude and half-width."""
+class Shape(Integrable):
+    """Time profile of a flare."""
 
     #: Name in studies and flags, and publication.
     name: str
@@ -49,14 +56,6 @@ class Shape(ABC):
     @abstractmethod
     def at(self, tau: ArrayLike) -> Float:
         """Return the value, shape of tau."""
-
-    @abstractmethod
-    def before(self, tau: ArrayLike) -> Float:
-        """Return the integral up to tau, in half-widths, shape of tau."""
-
-    @abstractmethod
-    def after(self, tau: ArrayLike) -> Float:
-        """Return the integral from tau to the end, in half-widths, without cancellation; shape of tau."""
 
     @property
     def peak_at(self) -> float:
@@ -74,24 +73,15 @@ class Shape(ABC):
         return float(self.at(self.peak_at))
 
     @cached_property
-    def equivalent_duration(self) -> float:
-        """Total integral, in half-widths."""
-        return float(self.before(0.0) + self.after(0.0))
-
-    @cached_property
     def width(self) -> float:
         """Full width at half maximum, in half-widths."""
-        half, at = self.peak / 2, self.peak_at
-        reach = 1.0
-        while float(self.at(at + reach)) > half:
-            reach *= 2
-        back = 1.0
-        while float(self.at(at - back)) > half:
-            back *= 2
-        return float(
-            scipy.optimize.brentq(lambda t: float(self.at(t)) - half, at, at + reach, xtol=1e-13)
-            - scipy.optimize.brentq(lambda t: float(self.at(t)) - half, at - back, at, xtol=1e-13)
-        )
+        ends = []
+        for reach in (1.0, -1.0):
+            while float(self.at(self.peak_at + reach)) > self.peak / 2:
+                reach *= 2
+            low, high = sorted((self.peak_at, self.peak_at + reach))
+            ends.append(scipy.optimize.brentq(lambda t: float(self.at(t)) - self.peak / 2, low, high, xtol=1e-13))
+        return float(ends[0] - ends[1])
 
     def integral(self, first: ArrayLike, last: ArrayLike) -> Float:
         """Return the integral between two values of tau, elementwise, in half-widths."""

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
+from mauvecl.flares.energies import EnergyScale, amplitude_of
 from mauvecl.flares.settings import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.host.arrays import set_read_only
 from mauvecl.host.orbit import Limits
-from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid, Track
+from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import STARE_CHANGES, Changing
@@ -83,7 +83,7 @@ class Event:
         shape: Shape | str = "davenport2014",
     ) -> Self:
         """Return the flare with a maximum relative rise, which is not the amplitude of every shape."""
-        return cls(peak_s, half_width_s, amplitude_of_peak(peak, shape), temperature, shape)
+        return cls(peak_s, half_width_s, peak / shape_of(shape).peak, temperature, shape)
 
     @classmethod
     def of_equivalent_duration(
@@ -131,7 +131,7 @@ class Event:
     @property
     def equivalent_duration_s(self) -> float:
         """Equivalent duration in the band, s."""
-        return equivalent_duration(self.amplitude, self.half_width_s, self.form)
+        return self.amplitude * self.half_width_s * self.form.equivalent_duration
 
     def energy(self, scale: EnergyScale) -> float:
         """Return the energy, erg."""
@@ -427,10 +427,16 @@ class Stare:
                 raise InputError.of("jitters", name, f"one of {', '.join(STARE_CHANGES['jitters'])}")
         warmth = over_frames(Sinusoid(thermal) if isinstance(thermal, int | float) else thermal)
         star, light, glow = (1.0 + over_frames(curve) for curve in (variability, throughput, sky))
+        hours = (start + frame_s / 2 - (start[0] + start[-1] + frame_s) / 2) / HOUR_S
+        sine, cosine = (over_frames(Sinusoid(1.0, orbit_s, phase)) for phase in (0.0, np.pi / 2))
+        unknowns = [StareUnknown(f"{of} offset", of, sd, np.ones(start.size)) for of, sd in (offsets or {}).items()]
+        unknowns += [StareUnknown(f"{of} drift", of, sd, hours) for of, sd in (drifts or {}).items()]
+        for of, sd in (cycles or {}).items():
+            unknowns += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
         return cls(
             start, float(frame_s), star, light, glow, temperature_c + warmth,
             spread.get("light", 0.0), spread.get("sky", 0.0), spread.get("temperature", 0.0),
-            _unknowns(start, float(frame_s), orbit_s, offsets or {}, drifts or {}, cycles or {}), pointing,
+            tuple(unknowns), pointing,
         )  # fmt: skip
 
     @property
@@ -507,20 +513,6 @@ def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float
     if not outside.any():
         raise InputError.of("gaps", gaps, f"times that leave a frame of {duration_s:g} s")
     return start[outside]
-
-
-def _unknowns(
-    start: Float, frame_s: float, orbit_s: float, offsets: Mapping[Changing, float], drifts: Mapping[Changing, float],
-    cycles: Mapping[Changing, float],
-) -> tuple[StareUnknown, ...]:  # fmt: skip
-    middle = (start[0] + start[-1] + frame_s) / 2
-    hours = (start + frame_s / 2 - middle) / HOUR_S
-    sine, cosine = (Sinusoid(1.0, orbit_s, phase).mean_over(start, frame_s) for phase in (0.0, np.pi / 2))
-    unknowns = [StareUnknown(f"{of} offset", of, sd, np.ones(start.size)) for of, sd in offsets.items()]
-    unknowns += [StareUnknown(f"{of} drift", of, sd, hours) for of, sd in drifts.items()]
-    for of, sd in cycles.items():
-        unknowns += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
-    return tuple(unknowns)
 
 
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
@@ -608,18 +600,12 @@ def stare_along(
         )
     # All but the temperature follow from a stare without gaps.
     whole = Stare.of(times.n * frame_s, frame_s=frame_s, **unknowns)
-    temperature = _temperature(orbit, track, thermal)
+    # The temperature is computed from several time constants before the first frame on, in the same kind of orbit.
+    settling_s = SETTLING * thermal.time_constant_s
+    past = TimeGrid(times.iso(-settling_s, 3), settling_s / DAY_S, PAST_STEP_S)
+    before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
+    first = float(thermal.temperature_c(before.sunlight, PAST_STEP_S)[-1])
+    temperature = thermal.temperature_c(track.sunlight, times.step_s, first)
     stare = select_frames(replace(whole, temperature_c=temperature), seen)
     hits = particles.rate_per_cm2_s(track)[seen]
     return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))
-
-
-def _temperature(orbit: Orbit, track: Track, thermal: Thermal) -> Float:
-    """Return the detector temperature at each step, deg C, computed from several time constants before the first."""
-    times = track.times
-    settling_s = SETTLING * thermal.time_constant_s
-    past = TimeGrid(times.iso(-settling_s, 3), settling_s / DAY_S, PAST_STEP_S)
-    # The same kind of orbit as that of the plan.
-    before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
-    first = float(thermal.temperature_c(before.sunlight, PAST_STEP_S)[-1])
-    return thermal.temperature_c(track.sunlight, times.step_s, first)

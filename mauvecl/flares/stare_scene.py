@@ -121,7 +121,6 @@ class StareScene:
     known: Floats
     curves: Floats  # of the stare's unknowns, times their standard deviations, shape (n_unknown, n_padded_frame)
     kinds: NDArray[np.uint32]  # rows of `layout.MOVED`, shape (n_unknown,)
-    stare_job: NDArray[np.void]  # of `layout.STARE_JOB`, without the values of flares, shape ()
     mixtures: NDArray[np.void]  # of `layout.MIXTURE`, shape (n_padded,)
     spectra: Floats  # DN of flares of unit amplitude, shape (n_flare, n_padded)
     weights: Floats  # shape (n_statistic, n_padded)
@@ -157,8 +156,7 @@ class StareScene:
             components, stare, scene, _padded(stare.numbers, np.uint32),
             _padded(np.stack([*factors, stare.light]), np.float32), _padded(curves, np.float32),
             np.array([layout.MOVED.index(u.of) for u in stare.unknowns], np.uint32),
-            _stare_job(stare, x.conditions["dark_slope_per_c"]), _mixtures(components, scene.base_dn[0]),
-            spectra, weights, constants.astype(np.float32),
+            _mixtures(components, scene.base_dn[0]), spectra, weights, constants.astype(np.float32),
         )  # fmt: skip
 
     @property
@@ -167,11 +165,16 @@ class StareScene:
         return self.components.quiet.photon_noise == "poisson"
 
     def stare_struct(self, flares: Flares) -> NDArray[np.void]:
-        """Return the `layout.STARE_JOB` structure with the values of flares, shape (1,)."""
-        stare_job = self.stare_job.copy()
-        stare_job["scenario_count"], stare_job["amplitude_rows"] = flares.amplitudes.shape
-        stare_job["flare_rows"] = len(flares.given)
-        return stare_job.reshape(1)
+        """Return the `layout.STARE_JOB` structure, shape (1,)."""
+        job, stare = np.zeros(1, layout.STARE_JOB), self.stare
+        job["frame_count"], job["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
+        job["unknown_count"], job["jittered"] = len(stare.unknowns), any(stare.jitters.values())
+        job["light_jitter"], job["sky_jitter"] = stare.light_jitter, stare.sky_jitter
+        job["temperature_jitter"] = stare.temperature_jitter_c
+        job["dark_slope"] = self.components.quiet.conditions["dark_slope_per_c"]
+        job["scenario_count"], job["amplitude_rows"] = flares.amplitudes.shape
+        job["flare_rows"] = len(flares.given)
+        return job
 
     def losses(self, numbers: NDArray[np.uint64], seed: int) -> Floats:
         """Return the share of all light that padded frames of stares lose, shape (n_stare, n_padded_frame)."""
@@ -198,15 +201,15 @@ class StareScene:
     @property
     def _ends(self) -> tuple[Float, Float]:
         """Smallest and largest factors on star, sky, dark, and neighbours and flares."""
-        stare, spread = self.stare, self._spreads
+        stare, spread, quiet = self.stare, self._spreads, self.components.quiet
         ends = []
         for sign, of in ((-1.0, np.min), (1.0, np.max)):
             light, star, sky = (1.0 + sign * REACH_SIGMA * spread[name] for name in ("light", "star", "sky"))
             if sign < 0 and stare.pointing is not None:
                 light = light * (1.0 - stare.pointing.depth)
-            warm = np.exp(sign * REACH_SIGMA * abs(self.stare_job["dark_slope"]) * spread["temperature"])
+            warm = np.exp(sign * REACH_SIGMA * abs(quiet.conditions["dark_slope_per_c"]) * spread["temperature"])
             lights = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
-            dark = stare.dark_factor(self.components.quiet) * warm
+            dark = stare.dark_factor(quiet) * warm
             ends.append(np.array([float(of(values)) for values in (*lights, dark, stare.light * light)]))
         return ends[0], ends[1]
 
@@ -297,17 +300,6 @@ def _mixtures(components: Components, base_dn: NDArray[np.int64]) -> NDArray[np.
             x.gain_dn_per_electron ** (order - 1) if order == 2 or x.photon_noise == "poisson" else 0.0
         )
     return mixtures
-
-
-def _stare_job(stare: Stare, dark_slope_per_c: float) -> NDArray[np.void]:
-    """Return the `layout.STARE_JOB` structure without the values of flares."""
-    job = np.zeros((), layout.STARE_JOB)
-    job["frame_count"], job["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
-    job["unknown_count"], job["jittered"] = len(stare.unknowns), any(stare.jitters.values())
-    job["light_jitter"], job["sky_jitter"] = stare.light_jitter, stare.sky_jitter
-    job["temperature_jitter"] = stare.temperature_jitter_c
-    job["dark_slope"] = dark_slope_per_c
-    return job
 
 
 def _not_joint_error(name: str) -> InputError:
@@ -489,20 +481,15 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
         variance = x.read_noise_dn**2 + x.gain_dn_per_electron * light + dark * x.dark_variance_dn2
         sd = np.sqrt(variance)
         near = used & ((mean - RAIL_SIGMA * sd < 0.0) | (mean + RAIL_SIGMA * sd > x.highest_dn))
-        if near.any():
-            pixel = int(np.argmax(near))
-            raise InputError(
-                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight; "
-                "use method 'pixels', which clips, or give the pixel the weight 0",
-                key="method",
-            )
-        if (used & (variance < LEAST_VARIANCE)).any():
-            pixel = int(np.argmax(used & (variance < LEAST_VARIANCE)))
-            raise InputError(
-                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise; "
-                "use method 'pixels'",
-                key="method",
-            )
+        for wrong, fault in (
+            (near, f"comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight; use method 'pixels', "
+                   "which clips, or give the pixel the weight 0"),
+            (used & (variance < LEAST_VARIANCE), "scatters by {:.2g} DN, too little for its rounding to be noise; use "
+                                                 "method 'pixels'"),
+        ):  # fmt: skip
+            if wrong.any():
+                pixel = int(np.argmax(wrong))
+                raise InputError(f"pixel {pixel} of {x.name} {fault.format(sd[pixel])}", key="method")
 
 
 def method_for(components: Components, stare: Stare, processes: Processes = NONE) -> Method:

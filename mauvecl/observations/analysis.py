@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -21,12 +21,10 @@ from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import (
-    CHANCE_DIP,
     NO_COLOUR_K,
     SeriesSurvey,
     SimulatedRate,
     innovations,
-    largest_dip,
     simulated_rates,
 )
 from mauvecl.observations.spectra import (
@@ -147,6 +145,8 @@ def _power(part: SeriesSurvey, width: float) -> float:
 STAGES = (0.0, 0.45, 0.55, 0.65, 0.95, 1.0)
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
+#: Probability of a dip as large as the largest from noise below which the noise of the light is not symmetric.
+CHANCE_DIP = 1e-3
 #: Share of the searched frames in events, their number, and length of the light curve in half-widths of the longest
 #: event, above which the events are no exception from the light of the star (assumed).
 MOST_IN_EVENTS, MOST_EVENTS, LONG = 0.5, 2, 100.0
@@ -391,10 +391,19 @@ def analyse_frames(
 def _thresholds(
     survey: SeriesSurvey, quiet: NDArray[np.bool_], wanted: float, seed: int, steps: Steps
 ) -> tuple[tuple[SimulatedRate, SimulatedRate], float, float, float]:
-    """Return simulated rates of false alarms, the thresholds of events and of candidates, and the largest dip."""
+    """Return simulated rates of false alarms, the thresholds of events and of candidates, and the largest dip.
+
+    Quiescent frames are searched upside down, in both directions of time, for dips that begin or end suddenly. Losses
+    of light have larger dips than noise; those below `candidates` may be missed.
+    """
     rates = simulated_rates(survey, quiet, wanted, seed, steps)
     threshold, candidates = (max(one.threshold(each) for one in rates) for each in (wanted, max(wanted, CANDIDATES)))
-    dip = largest_dip(survey, quiet, candidates)
+    down = survey.frames(quiet).inverted()
+    start = down.stare.start_s
+    stare = replace(down.stare, start_s=start[-1] + start[0] - start[::-1])
+    back = replace(down, stare=stare, sums=down.sums[::-1], variance=down.variance[::-1])
+    values = (one.search.values(one.sums[None], candidates) for one in (down, back))
+    dip = max(float(rho.max(initial=-np.inf)) for found in values for _, rho in found)
     if -np.expm1(-max(one.rate(dip) for one in rates) * survey.stare.observed_s / DAY_S) < CHANCE_DIP:
         threshold = max(threshold, dip)
     return rates, threshold, candidates, dip

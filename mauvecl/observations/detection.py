@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
-from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.search import DetectedEvent, SeriesSurvey
+from mauvecl.observations.search import DetectedEvent, ProcessSearch, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import REACH
 
@@ -55,21 +54,6 @@ BELONGING = 0.1
 NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
 #: Mean of the last frames of an event, in standard deviations of a frame, and their number, with which it goes on.
 STILL_BRIGHT, END_FRAMES = 1.0, 4
-
-
-def _fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
-    """Return a survey with the processes that fit its sums and its flux outside the frames of events, `taken`.
-
-    The terms of `start`, a survey of nearly the same frames, are kept.
-    """
-    quiet, fitted = ~taken, []
-    # The flux of a light curve is its only sum.
-    columns = [*survey.sums.T, survey.flux] if survey.weighted else survey.sums.T
-    befores = [None] * len(columns) if start is None else [*start.processes, start.flux_process]
-    for column, before in zip(columns, befores, strict=False):
-        time, values, variance = (each[quiet] for each in (survey.stare.start_s, column, survey.variance))
-        fitted.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), before, steps))
-    return replace(survey, processes=tuple(fitted[: survey.sums.shape[1]]), flux_process=fitted[-1])
 
 
 def fit_quiet_light(
@@ -204,7 +188,13 @@ def alternate(
         # Rounds may come back to the same frames.
         key = taken.tobytes(), before
         if key not in rounds:
-            fitted = _fit_processes(survey, taken, before, steps)
+            # The flux of a light curve is its only sum.
+            columns, fits = [*survey.sums.T, *([survey.flux] if survey.weighted else [])], list[Process]()
+            befores = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
+            for column, start in zip(columns, befores, strict=False):
+                time, values, variance = (each[~taken] for each in (survey.stare.start_s, column, survey.variance))
+                fits.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), start, steps))
+            fitted = replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
             rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
         fitted, now = rounds[key]
         changed = float((now ^ taken).mean())
@@ -251,14 +241,13 @@ def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Step
             unit = survey.bank.directions[one.direction]
             rows, flux = _light_of(survey, one.peak_s, one.half_width_s, one.amplitude)
             light[rows] += flux[:, None] * unit
-        mine, free = [], int(left.sum())
+        mine = []
         for one in new:
             first, last = _extent(survey, taken, faint * noise, one)
             # Some frames are left for the level, the faintest of the event.
-            short = MIN_QUIET - free + last - first + 1
+            short = MIN_QUIET - int(np.count_nonzero(~taken)) + last - first + 1
             last = max(last - max(short, 0), first)
             mine.append((first, last))
-            free -= int(np.count_nonzero(~taken[first : last + 1]))
             taken[first : last + 1] = True
         mine = _extended(survey, taken, mine, new, crowded=faint > FAINT[0])
         for (first, last), one in zip(mine, new, strict=True):

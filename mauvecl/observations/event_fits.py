@@ -358,7 +358,7 @@ def _single(
     The grid begins from the range `box`; `last` is the grid of the first fit, if that was a fit of the same family.
     """
     outer = _ranges(window)
-    durations = family.weights @ [float(part.before(0.0) + part.after(0.0)) for part in family.parts]
+    durations = family.weights @ [part.equivalent_duration for part in family.parts]
     box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])
     fits = []
     for epsilon in family.epsilon:

@@ -52,18 +52,16 @@ GENERAL_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
-class Half:
+class Half(Integrable):
     """Rise of a flare that ends at the peak, or decay that begins there."""
 
     integral: Callable[[Float], Float]  # up to a time before the peak, or from a time after the peak on
     decays: bool = False
 
     def before(self, tau: ArrayLike) -> Float:
-        """Return the integral up to tau."""
         return self._from_peak(np.maximum(tau, 0.0)) if self.decays else self.integral(np.minimum(tau, 0.0))
 
     def after(self, tau: ArrayLike) -> Float:
-        """Return the integral from tau on."""
         return self.integral(np.maximum(tau, 0.0)) if self.decays else self._from_peak(np.minimum(tau, 0.0))
 
     def _from_peak(self, tau: Float) -> Float:
@@ -83,24 +81,17 @@ def _gaussian(tau: Float, width: float) -> Float:
 
 
 @dataclass(frozen=True)
-class WeightedSum:
+class WeightedSum(Integrable):
     """Shape of a family: a weighted sum of its parts."""
 
     name: str
     parts: tuple[tuple[float, Integrable], ...]
 
     def before(self, tau: ArrayLike) -> Float:
-        """Return the integral up to tau."""
         return np.asarray(sum(weight * part.before(tau) for weight, part in self.parts))
 
     def after(self, tau: ArrayLike) -> Float:
-        """Return the integral from tau to the end."""
         return np.asarray(sum(weight * part.after(tau) for weight, part in self.parts))
-
-    @property
-    def equivalent_duration(self) -> float:
-        """Total integral, in half-widths."""
-        return float(self.before(0.0) + self.after(0.0))
 
 
 @dataclass(frozen=True, eq=False)

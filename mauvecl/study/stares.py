@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
+from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, TableShape, shape_of
 from mauvecl.flares.stare import Event, Stare, check_contributions, temperatures_of
@@ -214,7 +214,7 @@ def _event(study: Study, choice: EventChoice) -> Event:
     temperature = kelvin if cooling is None else Cooling(kelvin, cooling.end_k, cooling.fold_s)
     amplitude = flare.amplitudes[0] if choice.amplitude is None else choice.amplitude
     if choice.peak is not None:
-        amplitude = amplitude_of_peak(choice.peak, shape)
+        amplitude = choice.peak / shape_of(shape).peak
     elif choice.equivalent_duration_s is not None:
         amplitude = amplitude_of(choice.equivalent_duration_s, half, shape)
     elif choice.energy_erg is not None:

@@ -11,7 +11,6 @@ from scipy.linalg import null_space
 
 from mauvecl import SHAPES, Frames, read_frames
 from mauvecl.observations import process as processes
-from mauvecl.observations import process_search
 from mauvecl.observations import search as searches
 
 DAVENPORT = SHAPES["davenport2014"]
@@ -32,7 +31,7 @@ LASTING = process(rotation=[4.0, 40_000.0, 1e4, 2.0, 0.1])
 def test_correlations_are_sums_over_the_kernel(n: int) -> None:
     rng = np.random.default_rng(411)
     values = rng.standard_normal((2, 1, n))
-    found = process_search.Correlations(values, 4097)
+    found = searches.Correlations(values, 4097)
     for size, first in [(1, 0), (30, -5), (1024, -1023), (1025, 3), (4097, -700)]:
         kernel = rng.standard_normal(size)
         around = np.pad(values[1, 0], 5000)
@@ -79,11 +78,11 @@ def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
     stare = searches.stare_of(frames, left)
     variance = 1 + spread * rng.standard_normal(number.size)
     bank = searches.bank_of(stare, np.ones((1, 1)), DAVENPORT)
-    search = process_search.ProcessSearch(bank, stare, (process,), variance)
+    search = searches.ProcessSearch(bank, stare, (process,), variance)
     if taken:
         left = ((number < n // 2) | (number > n // 2 + 40)) & ((number > 10) | (number == number[0]))
         number, variance = number[left], variance[left]
-        search = process_search.ProcessSearch(bank, searches.stare_of(frames, left), (process,), variance, search)
+        search = searches.ProcessSearch(bank, searches.stare_of(frames, left), (process,), variance, search)
     time = number * 120.0
     dense = np.linalg.inv(process.at(time[:, None] - time) + np.diag(variance))
     ones = dense.sum(axis=1)
@@ -110,10 +109,10 @@ def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold
     unsolved = 0
     made = []
     for above in (None, threshold):
-        whole = process_search.ProcessSearch(bank, stare, (ROTATOR,), np.ones(number.size))
+        whole = searches.ProcessSearch(bank, stare, (ROTATOR,), np.ones(number.size))
         list(whole.values(np.zeros((1, number.size, 1)), above))
         made.append(
-            process_search.ProcessSearch(bank, searches.stare_of(frames, left), (ROTATOR,), np.ones(left.sum()), whole)
+            searches.ProcessSearch(bank, searches.stare_of(frames, left), (ROTATOR,), np.ones(left.sum()), whole)
         )
     sums = rng.standard_normal((2, int(left.sum()), 1))
     exact, quick = (list(one.values(sums, above)) for one, above in zip(made, (None, threshold), strict=True))
