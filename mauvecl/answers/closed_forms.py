@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
+from mauvecl.detection import MIN_IN_TAIL
 from mauvecl.detection.distributions import CONFIDENCE_SD, Gaussian, Interval
-from mauvecl.detection.names import MIN_IN_TAIL
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, ThroughputMode, values_of

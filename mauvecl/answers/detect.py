@@ -15,6 +15,7 @@ from scipy import special
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported, share_columns
 from mauvecl.answers.verbs import Progress, by_keywords
+from mauvecl.detection import RECOMMENDED, check_fap, countable
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
     COLUMNS,
@@ -28,7 +29,6 @@ from mauvecl.detection.detection import (
     reconstruct,
 )
 from mauvecl.detection.distributions import QuadraticForm
-from mauvecl.detection.names import RECOMMENDED, check_fap, countable
 from mauvecl.detection.nuisances import read_at_pixels
 from mauvecl.detection.statistics import Linear, Matched, Setting
 from mauvecl.detection.tails import campaign, per_test

@@ -17,8 +17,8 @@ from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_columns
 from mauvecl.answers.limit_search import LimitSearch, Point, settle
 from mauvecl.answers.verbs import Progress, by_keywords
+from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.detection.distributions import Interval
-from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.noise.disturbances import Uniform
 from mauvecl.noise.unknowns import values_of

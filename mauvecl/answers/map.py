@@ -15,8 +15,8 @@ from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf
 from mauvecl.answers.limit_search import SEARCH, LimitSearch
 from mauvecl.answers.verbs import Progress, by_keywords
+from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.detection.distributions import Interval
-from mauvecl.detection.names import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, table_of

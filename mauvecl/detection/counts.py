@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection import check_probability
 from mauvecl.detection.distributions import Interval, central_counts
-from mauvecl.detection.names import check_probability
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -64,7 +64,15 @@ class SparseCounts:
 
     def count(self, keys: NDArray[np.int64]) -> None:
         """Add one for each key, in any order."""
-        self.add(*unique_counts(keys))
+        if not keys.size:
+            return
+        low = int(keys.min())
+        if int(keys.max()) - low < MAX_DENSE_KEYS:
+            counts = np.bincount(keys - low)
+            where = np.flatnonzero(counts)
+            self.add(where + low, counts[where])
+        else:
+            self.add(*np.unique_counts(keys))
 
     def _merge(self) -> None:
         if not self._waiting:
@@ -74,18 +82,6 @@ class SparseCounts:
         self._counts = np.zeros(self._keys.size, np.int64)
         np.add.at(self._counts, place, counts)
         self._waiting, self._waits = [], 0
-
-
-def unique_counts(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the distinct keys, ascending, and their counts."""
-    if not keys.size:
-        return keys, keys
-    low = int(keys.min())
-    if int(keys.max()) - low < MAX_DENSE_KEYS:
-        counts = np.bincount(keys - low)
-        where = np.flatnonzero(counts)
-        return where + low, counts[where]
-    return np.unique_counts(keys)
 
 
 def keys_of(values: NDArray[np.float32], *, above: bool) -> NDArray[np.int64]:
@@ -229,19 +225,12 @@ class Tally:
 
     def distribution(self, index: int) -> Distribution:
         """Return the distribution of a grid."""
-        packed = self.packed[index]
-        first, second = (int(value) for value in self.sums[index])
-        mine = slice(*np.searchsorted(self.fine.keys, (index * layout.BINS, (index + 1) * layout.BINS)))
+        packed, start = self.packed[index], index * layout.BINS
+        mine = slice(*np.searchsorted(self.fine.keys, (start, start + layout.BINS)))
         return Distribution(
-            centre=float(packed["centre"]),
-            step=1.0 / float(packed["steps_per_unit"]),
-            filled=self.fine.keys[mine] - index * layout.BINS,
-            filled_counts=self.fine.counts[mine].copy(),
-            first=first,
-            second=second,
-            n=self.n,
-            far=self.far[index],
-        )
+            float(packed["centre"]), 1.0 / float(packed["steps_per_unit"]), self.fine.keys[mine] - start,
+            self.fine.counts[mine].copy(), *map(int, self.sums[index]), n=self.n, far=self.far[index],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,12 +280,10 @@ class Distribution:
 
     @property
     def mean(self) -> float:
-        """Mean of the statistic."""
         return float(self._moments[0])
 
     @property
     def std(self) -> float:
-        """Standard deviation of the statistic."""
         return math.sqrt(self._moments[1])
 
     def edge(self, index: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.detection import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.detection.chi2 import Chi2, Paper, Smoothing
 from mauvecl.detection.counts import Distribution, TailSamples, Tally
 from mauvecl.detection.distributions import (
@@ -22,7 +23,6 @@ from mauvecl.detection.distributions import (
     clopper_pearson_ends,
     detection_interval,
 )
-from mauvecl.detection.names import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
 from mauvecl.detection.statistics import Differences, LinearStatistic
 from mauvecl.detection.tails import Tail, tail
@@ -161,8 +161,8 @@ DEPARTURE_COLUMNS = (
 def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
     """Return the false-alarm probability at a threshold with the noise's third and fourth cumulants."""
     scene, quiet = detection.scene, detection.quiet
-    each = 1 if scene.frames else quiet.n_frames
-    c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
+    draws = scene.n_draws
+    c = Cumulants.of(quiet, quiet.n_frames // draws)
     kind, flare = detection.statistic(statistic), detection.shape(statistic, template)
     # Cumulants of the difference between an exposure and the mean of reference exposures.
     added = kind.added_variance(detection.setting)

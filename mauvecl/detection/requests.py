@@ -16,10 +16,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
 from mauvecl.detection.counts import Grid, TailSamples
 from mauvecl.detection.distributions import Form
-from mauvecl.detection.names import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.detection import check_atom, check_probability, least_countable
 from mauvecl.detection.distributions import (
     CONFIDENCE_SD,
     Interval,
@@ -25,7 +26,6 @@ from mauvecl.detection.distributions import (
     central_counts,
     clopper_pearson,
 )
-from mauvecl.detection.names import check_atom, check_probability, least_countable
 from mauvecl.detection.statistics import Differences
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection import DEFAULT_STATISTICS, Tails
 from mauvecl.detection.counts import TailSamples, Tally
 from mauvecl.detection.detection import Detection
-from mauvecl.detection.names import DEFAULT_STATISTICS, Tails
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.requests import (
     Countable,

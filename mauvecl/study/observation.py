@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, create_model, model_validator
 
-from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
+from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
