@@ -19,10 +19,10 @@ from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from mauvecl.detection import MIN_IN_TAIL
-from mauvecl.detection.distributions import CONFIDENCE_SD, Gaussian, Interval
+from mauvecl.detection.distributions import CONFIDENCE_SD, Gaussian
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, ThroughputMode, values_of
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, values_of
 from mauvecl.schema.columns import Column, First, chance_text, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
@@ -73,34 +73,29 @@ def unknown_cost(
     return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
 
 
-def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
-    """Return a sentence on the faintest flare, or none if no flare has a signal."""
+def unknown_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
+    """Return sentences on what is marginalised over, if anything, and on the faintest flare, if any has a signal."""
+    lines, which = list[str](), f"the usual unknowns ({spoken(NuisanceChoice())})"
+    if not nuisances.none:
+        which = spoken(nuisances)
+        texts = "; ".join(PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES)
+        lines.append(f"Statistics are marginalised over {which}{f'; drawn: {texts}' if nuisances.usual else ''}.")
     shown = [cost for cost in costs if cost.known > 0]
-    if not shown:
-        return []
-    faintest = min(shown, key=lambda cost: cost.known)
-    which = spoken(nuisances) if not nuisances.none else f"the usual unknowns ({spoken(NuisanceChoice())})"
-    others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
-    return [Message(
-        f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
-        f"with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} marginalised "
-        "(closed forms).", "cost of unknowns",
-    )]  # fmt: skip
-
-
-def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
-    """Return a sentence on what statistics are marginalised over and which unknowns are drawn, or none."""
-    if nuisances.none:
-        return []
-    texts = "; ".join(PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES)
-    drawn = f"; drawn: {texts}" if nuisances.usual else ""
-    return [f"Statistics are marginalised over {spoken(nuisances)}{drawn}."]
+    if shown:
+        faintest = min(shown, key=lambda cost: cost.known)
+        others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
+        lines.append(Message(
+            f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything "
+            f"known; with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} "
+            "marginalised (closed forms).", "cost of unknowns",
+        ))  # fmt: skip
+    return lines
 
 
 def spoken(choice: NuisanceChoice) -> str:
     """Return the unknowns as text, such as "the dark level (+-0.5 deg C) and the light level (free)"."""
     documented = DOCUMENTED_NUISANCES if choice.usual else ()
-    sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if row.prior is not None}
+    sd: dict[str, float | str] = {row.name: row.sd for row in documented if row.sd is not None}
     sd |= choice.spreads()
     sizes = [f"{NUISANCES[name].label} ({_size(value, NUISANCES[name].unit)})" for name, value in sd.items()]
     return join_names(sizes + [f"{name!r} ({_size(spectrum.sd, '')})" for name, spectrum in choice.own.items()])
@@ -217,7 +212,7 @@ def drawn(study: Study) -> DrawnStudies:
             change = rows[name].changes(at, float(value))
             changes |= change
             # The next mode is added to those before it.
-            at = at.model_copy(update=change) if isinstance(rows[name], ThroughputMode) else at
+            at = at if rows[name].mode is None else at.model_copy(update=change)
         try:
             nominal.with_(**changes)
         except InputError as error:
@@ -233,28 +228,26 @@ def throughput_cases(case: Case) -> list[Case]:
     the wavelengths are not known well enough for that.
     """
     moved, pixels = [], case.instrument.read_pixels
-    for mode in values_of(case.instrument).values():
-        if isinstance(mode, ThroughputMode):
-            signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
-            same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
-            if same is None:
-                why = "an error of the calibrated wavelengths changes the pixels of the output range"
-                raise InputError(f"{why}, which must end further from a pixel", key="observation.instrument")
-            moved.append(same)
+    for mode in (row for row in values_of(case.instrument).values() if row.mode is not None):
+        signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
+        same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
+        if same is None:
+            why = "an error of the calibrated wavelengths changes the pixels of the output range"
+            raise InputError(f"{why}, which must end further from a pixel", key="observation.instrument")
+        moved.append(same)
     return moved
 
 
-def average(intervals: Sequence[Interval]) -> Interval:
+def average(values: Float, low: Float, high: Float) -> tuple[Float, Float, Float]:
     """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
 
-    The interval assumes independent draws and is therefore conservative for a Latin hypercube.
+    The arguments have the shape (n_draw, ...). The interval assumes independent draws and is therefore conservative for
+    a Latin hypercube.
     """
-    values = np.array([p.value for p in intervals])
-    own = np.array([p.high - p.low for p in intervals]) / 2
-    spread = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
-    half = float(np.hypot(CONFIDENCE_SD * spread, np.sqrt(np.sum(own**2)) / values.size))
-    mean = float(values.mean())
-    return Interval(mean, max(mean - half, 0.0), min(mean + half, 1.0))
+    n, mean = len(values), values.mean(axis=0)
+    spread = values.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else 0.0
+    half = np.hypot(CONFIDENCE_SD * spread, np.sqrt(np.sum(((high - low) / 2) ** 2, axis=0)) / n)
+    return mean, np.maximum(mean - half, 0.0), np.minimum(mean + half, 1.0)
 
 
 def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:

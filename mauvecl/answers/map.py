@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf
-from mauvecl.answers.limit_search import SEARCH, LimitSearch
+from mauvecl.answers.limit import SEARCH, LimitSearch
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap
-from mauvecl.detection.distributions import Interval
 from mauvecl.device.engine import Engine
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, table_of
@@ -50,7 +49,7 @@ COLUMNS = (
     *interval_columns("{}", of="its 95 % interval, with the threshold's own"),
     Column("closed_form", description="the same for Gaussian noise"),
 )
-#: Arrays of the answer: chances, those with everything known, and both ends of the interval.
+#: Arrays of the answer: chances and both ends of their interval, those of the closed form, and with everything known.
 NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
 
 
@@ -76,19 +75,16 @@ class MapAnswer(Answer):
 
     study: Study
     star: str
-    # x, y: values of both axes.
-    x: tuple[float | str, ...]
-    y: tuple[float | str, ...]
+    x: tuple[float | str, ...]  # values of the horizontal axis
+    y: tuple[float | str, ...]  # values of the vertical axis
     statistics: tuple[str, ...]
     probability: NDArray[np.float64]  # detection probability
-    # low, high: its 95 % interval, with that of the threshold.
-    low: NDArray[np.float64]
+    low: NDArray[np.float64]  # lower end of its 95 % interval, with that of the threshold
     high: NDArray[np.float64]
     closed_form: NDArray[np.float64]  # probability for Gaussian noise
     ideal: NDArray[np.float64]  # the same if everything but the noise were known; NaN if it is
     messages: list[str]
-    # For maps averaged over unknowns, by statistic: the share of the variance of the mean probability that each unknown
-    # explains, largest first.
+    # For maps averaged over unknowns: shares of the variance of the mean probability by unknown, for each statistic.
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
     inputs: tuple[Expectation, ...] = ()  # the star without a flare in the first cell
 
@@ -160,10 +156,12 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     maps = [cells.map_of(draw) for draw in draws]
     values, parts = maps[0], {}
     if unknown is not None:
-        values = _averaged(maps)
+        # Means over the draws; NaN if a draw has none.
+        every = {name: np.array([one[name] for one in maps]) for name in NUMBERS}
+        ends = dict(zip(NUMBERS[:3], forms.average(*(every[name] for name in NUMBERS[:3])), strict=True))
+        values = {name: each.mean(axis=0) for name, each in every.items()} | ends
         for s, statistic in enumerate(study.run.statistics):
-            means = [float(np.nanmean(drawn_map["probability"][s])) for drawn_map in maps]
-            parts[statistic] = forms.shares(unknown, np.array(means))
+            parts[statistic] = forms.shares(unknown, np.nanmean(every["probability"][:, s], axis=(1, 2)))
     quiet, star, names = cells.quiet[0], study.star[0], {x.quantity, y.quantity}
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
@@ -204,9 +202,9 @@ def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
     middle = cells.x[len(cells.x) // 2], cells.y[len(cells.y) // 2]
     there, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
     at = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
-    name, comparison = f"the cell of {at}", study.run.comparison()
-    cost = forms.unknown_cost(name, there.quiet, there.flares[0], study.nuisances, comparison)
-    return [*messages, *forms.marginal_lines(study.nuisances), *forms.cost_lines([cost], study.nuisances)]
+    comparison = study.run.comparison()
+    cost = forms.unknown_cost(f"the cell of {at}", there.quiet, there.flares[0], study.nuisances, comparison)
+    return [*messages, *forms.unknown_lines([cost], study.nuisances)]
 
 
 def magnitudes_of(case: Case) -> Axis:
@@ -314,17 +312,6 @@ class Cells:
                     values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
                 if result.fall(statistic, k):
                     self.lowered.add((statistic, i, j))
-
-
-def _averaged(maps: list[Arrays]) -> Arrays:
-    """Return the mean over draws of the unknown, with its interval; NaN if a draw has none."""
-    values = {name: np.mean([cells[name] for cells in maps], axis=0) for name in NUMBERS}
-    values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
-    for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
-        of_draws = [tuple(float(cells[name][at]) for name in ("probability", "low", "high")) for cells in maps]
-        p = forms.average([Interval(*ends) for ends in of_draws])
-        values["low"][at], values["high"][at] = p.low, p.high
-    return values
 
 
 def _cell(case: Case, x: float | str, y: float | str) -> Case:

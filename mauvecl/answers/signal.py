@@ -139,17 +139,9 @@ def exposure(study: Study, engine: Engine | Pool | None = None, progress: Progre
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: Wavelength | None = None, *, per: Per | None = None
 ) -> ExposureAnswer:
-    """Compute `exposure` for another S/N or wavelength than the study's.
+    """Compute `exposure` for another S/N or wavelength (nm or Quantity) than those of the study's ``signal``.
 
-    Parameters
-    ----------
-    study : Study
-        Its exposure is not used.
-    snr : float, optional
-    wavelength_nm : Quantity, or float in nm, optional
-        In place of those of the study's ``signal``.
-    per : {"element", "pixel"}, optional
-        A resolution element of 10.5 nm, or one pixel.
+    `per` is "element", a resolution element of 10.5 nm, or "pixel".
     """
     study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
     return exposure(study)
@@ -266,14 +258,8 @@ def simulate(
 ) -> SimulateAnswer:  # fmt: skip
     """Simulate one observation of every star of a study, by component.
 
-    The NumPy reference implementation draws. Usual unknowns are left out: the question is about the noise.
-
-    Parameters
-    ----------
-    realisation : int
-        Number of the realisation.
-    flaring : bool
-        Whether the flares of the study are observed, too.
+    The NumPy reference draws the `realisation` of this number; if `flaring`, the flares of the study are observed, too.
+    Usual unknowns are left out: the question is about the noise.
     """
     study, observations = study.ideal(), []
     prepared = cases(study, swept=False)

@@ -193,11 +193,7 @@ class Tally:
         self.n = 0
 
     def add(self, histogram: NDArray[np.integer], sums: NDArray[np.generic], n: int) -> None:
-        """Add the counts of one or more tiles in fine bins.
-
-        `histogram` has the shape (n_grid, BINS). `sums`, shape (n_grid, 2), holds sums of fine steps and of their
-        squares. `n` is the number of realisations, including those counted by `add_far`.
-        """
+        """Add the counts of n realisations in fine bins, (n_grid, BINS), and sums of their steps, and squares."""
         grid, inner = np.nonzero(histogram[:, FIRST_BIN : LAST_BIN + 1])
         counts = histogram[grid, FIRST_BIN + inner].astype(np.int64)
         self.merge(grid * layout.BINS + FIRST_BIN + inner, counts, sums, n)

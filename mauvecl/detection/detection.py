@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.detection import NoThresholdError, Tails, check_atom, check_fap, countable
-from mauvecl.detection.chi2 import Chi2, Paper, Smoothing
+from mauvecl.detection.chi2 import Chi2, Paper
 from mauvecl.detection.counts import Distribution, TailSamples, Tally
 from mauvecl.detection.distributions import (
     CONFIDENCE_SD,
@@ -211,30 +211,6 @@ def _adc_moments(x: Expectation) -> list[tuple[Float, Float]]:
     return moments
 
 
-#: Chi-squared and reduced chi-squared by amplitude, for the G2V star, V = 7.4, 50 s (the paper, section "G2V star").
-PAPER_G2V = {0.24: (6159.88, 3.75), 0.081: (1078.36, 0.66)}
-
-WHY = (
-    "The paper's values are no calibrated chi-squared: with 1643 points a reduced value scatters by 0.035 about one, "
-    "so 0.66 lies ten standard deviations below. Divided by the smoothed flare spectrum in DN/s instead of the noise's "
-    "variance they are reproduced; what such a number means, only its simulated null can tell (`statistic='paper'`)."
-)
-
-
-def reconstruct(quiet: Expectation, flare: Expectation) -> Interval:
-    """Return the median and central 95 % of the reduced statistic `paper` with a flare, for Gaussian noise.
-
-    The paper does not define its chi-squared. Among the definitions that were tried, this one is nearest to its two G2V
-    values: both noisy spectra are smoothed with a Gaussian of 10.5 nm FWHM, as stated in its figure, and compared as in
-    `scipy.stats.chisquare`, with the flare's mean as expected values.
-    """
-    smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool), (flare,))
-    delta, variance = flare.recorded_light_dn - quiet.recorded_light_dn, flare.variance_dn2 + quiet.variance_dn2
-    form = smoothing.form(smoothing.scale(flare), delta, variance)
-    middle, low, high = (form.isf(p) / quiet.wavelength_nm.size for p in (0.5, 0.975, 0.025))
-    return Interval(middle, low, high)
-
-
 #: Rows of a curve's table.
 ROC_ROWS = 200
 #: Columns of a curve's table.
@@ -322,15 +298,9 @@ class Roc(Drawable):
 class Detection(Drawable, ContentEquality, Hypotheses):
     """Simulated null and flare distributions, as returned by `Engine.detect`.
 
-    Attributes are those of `Hypotheses` and the following.
-
-    Attributes
-    ----------
-    realisations : int
-    tails : {"counted", "sampled"}
-        Whether a threshold with too few realisations beyond it raises InputError, or is found by importance sampling.
-    seed : int
-        Seed of the draws.
+    Attributes are those of `Hypotheses`, the number of `realisations`, the `seed` of the draws, and `tails`: whether a
+    threshold with too few realisations beyond it raises InputError ("counted") or is found by importance sampling
+    ("sampled").
     """
 
     realisations: int
@@ -356,21 +326,14 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Add the distributions and tails of one batch."""
-        for index, (key, samples_of_key) in enumerate(zip(plan.keys, samples, strict=True)):
-            self._distributions[key] = tally.distribution(index)
-            if samples_of_key is not None:
-                self._samples[key] = samples_of_key
+        self._distributions |= {key: tally.distribution(index) for index, key in enumerate(plan.keys)}
+        self._samples |= {key: kept for key, kept in zip(plan.keys, samples, strict=True) if kept is not None}
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """Return the simulated distribution of a statistic.
 
-        Parameters
-        ----------
-        statistic : str
-        flare : int, optional
-            Index of the flare; None for the null distribution.
-        template : int
-            Index of the flare that shaped statistics use as template, for the null distribution.
+        `flare` is the index of the flare, None for the null distribution, in which shaped statistics use the flare with
+        the index `template`.
         """
         return self._at(self._key(statistic, flare, template))
 
@@ -403,12 +366,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         tails are sampled, it is the result of importance sampling. `template` is the index of the flare that shaped
         statistics use as template.
 
-        Raises
-        ------
-        InputError
-            If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
-        NoThresholdError
-            If no threshold has this probability, because one value of the statistic is more probable.
+        Raises InputError if fewer than 100 realisations lie beyond and tails are counted, since the tail is never
+        extrapolated, and NoThresholdError if one value of the statistic is more probable than `fap`.
         """
         sampled = self.tail(fap, statistic, template=template)
         if sampled is not None:
@@ -465,13 +424,13 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def without_threshold(self, fap: float) -> tuple[Message, ...]:
         """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
-        sentences = []
+        sentences = dict[Message, None]()
         for statistic, template in self._nulls():
             try:
                 self.threshold(fap, statistic, template=template)
             except NoThresholdError as error:
-                sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
-        return tuple(dict.fromkeys(sentences))
+                sentences[Message(f"NO THRESHOLD: {error}.", "no threshold")] = None
+        return tuple(sentences)
 
     def _threshold_if_any(self, fap: float, statistic: str, template: int) -> Interval:
         """Return `threshold`, or `UNDEFINED` if no threshold has the false-alarm probability."""
@@ -532,28 +491,15 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         limit = self.closed_form(statistic, template=flare).isf(fap)
         # A weighted sum has no reduced value.
         reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
-        of_flare = {
-            "expected": theory.mean,
-            "mean": d.mean,
-            "std": d.std,
-            "reduced": reduced,
-            "closed_form_probability": theory.sf(limit),
-        }
+        names = ("expected", "mean", "std", "reduced", "closed_form_probability")
+        of_flare = dict(zip(names, (theory.mean, d.mean, d.std, reduced, theory.sf(limit)), strict=True))
         if flare in self.blinding:
-            of_flare = dict.fromkeys(of_flare, np.nan)
-        return of_flare | {
-            "name": self.flares[flare].name,
-            "statistic": statistic,
-            "dof": dof,
-            "threshold": cut.value,
-            "threshold_low": cut.low,
-            "threshold_high": cut.high,
-            "probability": probability.value,
-            "low": probability.low,
-            "high": probability.high,
-            "closed_form_threshold": limit,
-            "fap_error": float(fap_error),
-        }
+            of_flare = dict.fromkeys(names, np.nan)
+        return of_flare | vars(probability) | {
+            "name": self.flares[flare].name, "statistic": statistic, "dof": dof, "probability": probability.value,
+            "threshold": cut.value, "threshold_low": cut.low, "threshold_high": cut.high,
+            "closed_form_threshold": limit, "fap_error": float(fap_error),
+        }  # fmt: skip
 
 
 #: Columns of the table of detections.

@@ -1,8 +1,7 @@
 """Requests to an engine as plain data: statistics by name, hypotheses, channels and shards.
 
-Every worker computes the same result from a request. A shard is a range of realisations of one part of a request. Its
-counts are integers, and its extreme values carry their realisations, so shards can be counted in any order, on any
-device, and more than once; `sums` adds them up.
+Every worker computes the same result from a request. The counts of a shard are integers, and its extreme values carry
+their realisations, so shards can be counted in any order, on any device, and more than once.
 """
 
 from __future__ import annotations
@@ -111,10 +110,7 @@ class Hypotheses:
         return self.flares[template] if self.statistic(statistic).shaped else None
 
     def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
-        """Return the weights per DN of a linear statistic, shape (n_pixel,); None for others.
-
-        Shaped statistics use the flare with the index `template`.
-        """
+        """Return the weights per DN of a linear statistic, shape (n_pixel,), with a flare as template; else None."""
         kind = self.statistic(statistic)
         if not isinstance(kind, LinearStatistic):
             return None
@@ -232,10 +228,9 @@ Rows = dict[tuple[str, int, int], NDArray[np.float64]]
 def _rows(
     hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]
 ) -> tuple[Rows, Rows, NDArray[np.uint32]]:
-    """Return the weights of sums, and the scales of the paper's statistic, in the kernel's order.
+    """Return the weights of sums, and the scales of the paper's statistic, in the kernel's order, and ends of rows.
 
-    The third result is the ends of linear rows, of those with weights per pixel, and of smoothed rows of each scenario,
-    shape (3, n_scenario).
+    The ends are those of linear rows, of those with weights per pixel, and of smoothed rows, shape (3, n_scenario).
     """
     weighted, smoothed, ends = Rows(), Rows(), []
     for scenario in range(1 + len(batch)):
@@ -401,12 +396,10 @@ class DetectRequest(Countable):
 
     @property
     def parts(self) -> int:
-        """Number of parts, whose launches differ."""
         return len(self.plans)
 
     @property
     def work(self) -> int:
-        """Work per realisation: pixels times scenarios."""
         return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
 
 
@@ -434,5 +427,4 @@ class SnrRequest(RealiseRequest):
 
     @property
     def work(self) -> int:
-        """Work per realisation: pixels."""
         return self.scene.n_pixel

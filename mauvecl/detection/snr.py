@@ -186,8 +186,7 @@ class SnrResult(Drawable, ContentEquality):
     def pixel(self) -> QTable:
         """S/N per pixel: wavelength, closed form, simulated mean, standard deviation, quantiles, clipped frames.
 
-        The expectation's `signal` defines the signal. The histogram counts whole DN, of which the S/N is a function, in
-        bins of at most 1/64 of a standard deviation.
+        The histogram counts whole DN, of which the S/N is a function, in bins of at most 1/64 of a standard deviation.
         """
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
         width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
@@ -246,14 +245,11 @@ Arrays = dict[str, NDArray[Any]]
 
 def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arrays:
     """Pack a shard of a detection as arrays."""
-    shard = _pack_counts("counts", tally.fine.keys, tally.fine.counts)
-    shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
-    shard["n"] = np.array(tally.n)
-    for number, far in enumerate(tally.far):
+    shard = _pack_counts("counts", tally.fine) | {"sums": tally.sums.astype(str), "n": np.array(tally.n)}
+    for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
         if far.n or far.undefined:
-            shard |= _pack_counts(f"far-{number}", far.keys, far.counts)
+            shard |= _pack_counts(f"far-{number}", far)
             shard[f"far-{number}-sums"] = np.array([str(x) for x in (far.first, far.second, far.undefined)])
-    for number, tail in enumerate(samples):
         if tail is not None:
             shard[f"values-{number}"], shard[f"realisations-{number}"] = tail.values, tail.realisations
     return shard
@@ -263,7 +259,7 @@ def pack_snr(counts: Counts) -> Arrays:
     """Pack a shard of an S/N as arrays."""
     shard = {"clipped": counts.clipped, "n": np.array(counts.n)}
     for kind, each in counts.bins.items():
-        shard |= _pack_counts(kind, each.keys, each.counts)
+        shard |= _pack_counts(kind, each)
     return shard
 
 
@@ -279,11 +275,10 @@ class DetectionSums:
         tally, samples = self._sums[part]
         sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
         tally.merge(*_unpack_counts("counts", shard), sums, int(shard["n"]))
-        for number, far in enumerate(tally.far):
+        for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
             if f"far-{number}" in shard:
                 far.add(*_unpack_counts(f"far-{number}", shard))
                 far.add_sums(*(int(value) for value in shard[f"far-{number}-sums"]))
-        for number, tail in enumerate(samples):
             if tail is not None:
                 tail.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])
 
@@ -316,10 +311,11 @@ class SnrSums:
         return SnrResult(x, scene, observers(x, scene), self._elements, self._counts)
 
 
-def _pack_counts(name: str, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> Arrays:
+def _pack_counts(name: str, counted: SparseCounts) -> Arrays:
     """Pack counts of ascending keys as differences of keys, in the smallest integer types."""
-    steps = np.diff(keys)
-    return {f"{name}-first": keys[:1], f"{name}-steps": _smallest_type(steps), name: _smallest_type(counts)}
+    parts = {f"{name}-steps": np.diff(counted.keys), name: counted.counts}
+    packed = {key: each.astype(np.min_scalar_type(int(each.max(initial=0)))) for key, each in parts.items()}
+    return {f"{name}-first": counted.keys[:1], **packed}
 
 
 def _unpack_counts(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -327,7 +323,3 @@ def _unpack_counts(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray
     first = shard[f"{name}-first"]
     keys = np.cumsum(np.concatenate([first, shard[f"{name}-steps"].astype(np.int64)]), dtype=np.int64)
     return keys, shard[name].astype(np.int64)
-
-
-def _smallest_type(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
-    return values.astype(np.min_scalar_type(int(values.max(initial=0))))

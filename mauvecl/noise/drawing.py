@@ -9,7 +9,7 @@ realistic number of draws reveals the difference.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from itertools import chain, product
 from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast
@@ -46,15 +46,12 @@ class Cumulants:
     """Cumulants of one draw of a scenario, DN; arrays have the shape (n_pixel,)."""
 
     mean: Float  # mean, including bias
-    #: Variance of the Gaussian part: read noise, rounding of a stack's frames, and Gaussian photon noise.
-    gaussian: Float
+    gaussian: Float  # variance of read noise, rounding of a stack's frames, and Gaussian photon noise
     photons: Float  # mean electrons of light
-    #: DN per Poisson count; the first is 0 for Gaussian photon noise.
-    photon_step: Float
+    photon_step: Float  # DN per Poisson count; 0 for Gaussian photon noise
     dark_step: Float
-    #: Means of dark and light.
-    dark_dn: Float
-    light_dn: Float
+    dark_dn: Float  # mean of the dark
+    light_dn: Float  # mean of the light
     light_variance: Float  # variance of the light, Gaussian or Poisson
 
     @staticmethod
@@ -240,12 +237,11 @@ class Drawing:
     # Whether to draw each frame, or their sum at once. "auto" draws frames only near zero or saturation, and if a frame
     # has too little noise to treat its rounding as noise.
     mode: Mode = "auto"
-    # Whether to draw all noise of a pixel from one normal, or Poisson counts separately. "auto" draws separately only
-    # if the joint draw is not exact.
+    # Whether to draw all noise of a pixel from one normal, or Poisson counts separately, as "auto" does only if the
+    # joint draw is not exact.
     recipe: Recipe = "auto"
     processes: Processes = NONE  # optional noise processes
-    # Number of the first frame. Frame k of an exposure is drawn with an expectation of one frame and ``first_frame=k``.
-    first_frame: int = 0
+    first_frame: int = 0  # frame k of an exposure is drawn with an expectation of one frame and ``first_frame=k``
 
     @property
     def options(self) -> DrawingOptions:
@@ -289,10 +285,8 @@ class Factors:
     #: then from the high end, divided by the factor at its median, minus one. In this form float32 resolves priors of
     #: any width and location.
     tables: NDArray[np.float32]
-    #: Factors at the priors' medians, to which the tables are relative, in the order of `SIGNAL_PARTS`.
-    medians: dict[SignalPart, float]
-    #: Smallest and largest factors of all priors together.
-    ends: dict[SignalPart, tuple[float, float]]
+    medians: dict[SignalPart, float]  # factors at the priors' medians, in the order of `SIGNAL_PARTS`
+    ends: dict[SignalPart, tuple[float, float]]  # smallest and largest factors of all priors together
 
     @classmethod
     def of(cls, processes: Processes, conditions: Conditions) -> Self:
@@ -315,14 +309,14 @@ class Factors:
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
         return cls(tables, centre, ends)
 
-    def median_on_light(self, share: Float) -> Float:
-        """Return `on_light` at the priors' medians."""
-        return self.on_light(self.medians["light"], self.medians["sky"], share)
+    def median_on_light(self, x: Expectation) -> Float:
+        """Return `factor_on_light` at the priors' medians."""
+        return factor_on_light(self.medians["light"], self.medians["sky"], x)
 
-    @staticmethod
-    def on_light(light: float, sky: float, share: Float) -> Float:
-        """Return the factor on each pixel's total light, of which the sky has this share, shape (n_pixel,)."""
-        return np.asarray(light * (1.0 + (sky - 1.0) * share))
+
+def factor_on_light(light: float, sky: float, x: Expectation) -> Float:
+    """Return the factor on each pixel's total light, which includes the sky's, shape (n_pixel,)."""
+    return np.asarray(light * (1.0 + (sky - 1.0) * sky_share(x)))
 
 
 #: Frames are drawn one by one if a pixel's mean is within this many standard deviations of a rail.
@@ -349,6 +343,7 @@ class DrawMethod:
     photons: bool
     each: int  # frames per draw
     cumulants: list[Cumulants]  # of one draw of each scenario
+    tables: list[layout.AliasTable] = field(default_factory=list)  # of the scene, filled as its arrays are
 
 
 def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMethod:
@@ -357,8 +352,13 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
     factors = Factors.of(drawing.processes, quiet.conditions)
     if quiet.wavelength_nm.size > MAX_PIXELS:
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
-    for other in scenarios[1:]:
-        _check_same_detector(quiet, other)
+    for other, name in product(scenarios[1:], OF_DETECTOR):
+        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
+            raise InputError(
+                f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "
+                f"that of {quiet.name}",
+                key=name,
+            )
     # A grid of factors on light, dark and sky that spans the priors in steps of at most 2.
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
     corners = [*product(*(grid.tolist() for grid in grids))]
@@ -389,7 +389,7 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     mean = x.mean_raw_dn
     ends = []
     for end_light, more_dark, sky in zip(*factors.ends.values(), strict=True):
-        more_light = factors.on_light(end_light, sky, sky_share(x))
+        more_light = factor_on_light(end_light, sky, x)
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
         ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
@@ -401,7 +401,7 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
 
 def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
     light, dark, sky = corner
-    return c.scaled(light if sky == 1.0 else Factors.on_light(light, sky, sky_share(x)), dark)
+    return c.scaled(light if sky == 1.0 else factor_on_light(light, sky, x), dark)
 
 
 def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
@@ -426,10 +426,9 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
 def _draw_frames(
     scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors, corners: Sequence[tuple[float, float, float]]
 ) -> bool:
-    mode = drawing.mode
-    if scenarios[0].n_frames == 1 or mode == "frames":
+    if scenarios[0].n_frames == 1 or drawing.mode == "frames":
         # For a single frame, both modes give the same draws.
-        return mode == "frames" and scenarios[0].n_frames > 1
+        return drawing.mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
         near = near_rail(x, factors, drawing.processes)
         # The approximation of rounding as noise is worst for the least light and dark.
@@ -438,22 +437,18 @@ def _draw_frames(
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
             (coarse, "treats rounding as noise, and a frame has too little noise for that"),
         ):
+            if pixels.any() and drawing.mode == "stacked":
+                where = f"in the pixel at {x.wavelength_nm[pixels][0]:.1f} nm of {x.name}"
+                raise InputError(f"mode must be 'frames' or 'auto': 'stacked' {why} {where}", key="mode")
             if pixels.any():
-                if mode == "stacked":
-                    where = float(x.wavelength_nm[pixels][0])
-                    raise InputError(
-                        f"mode must be 'frames' or 'auto': 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}",
-                        key="mode",
-                    )
                 return True
     return False
 
 
 def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
-    share, ends = sky_share(x), factors.ends
-    least, most = (factors.on_light(*both, share) for both in zip(ends["light"], ends["sky"], strict=True))
-    middle = factors.median_on_light(share)
+    ends, middle = factors.ends, factors.median_on_light(x)
+    least, most = (factor_on_light(*both, x) for both in zip(ends["light"], ends["sky"], strict=True))
     light = np.maximum(most - middle, middle - least)
     dark = max(ends["dark"][1] - factors.medians["dark"], factors.medians["dark"] - ends["dark"][0])
     variance = c.variance + most * c.light_variance + ends["dark"][1] * c.dark_variance
@@ -465,16 +460,6 @@ def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
             f"{reach[pixel]:.3g}: shorten the exposure or draw frame by frame",
             key="priors",
         )
-
-
-def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
-    for name in OF_DETECTOR:
-        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
-            raise InputError(
-                f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "
-                f"that of {quiet.name}",
-                key=name,
-            )
 
 
 def sky_share(x: Expectation) -> Float:

@@ -64,9 +64,8 @@ def words_at(
 ) -> Words:
     """Return the four words that four neighbouring pixels of a realisation and frame share in a stream.
 
-    The number of the stream, of which `layout.STREAMS` has the names, is the top byte of the counter's last word. The
-    group is the pixel index divided by four, and the exposure 0 for the observed one and `layout.REFERENCE` for the
-    reference.
+    The number of the stream is the top byte of the counter's last word. The group is the pixel index divided by four,
+    and the exposure 0 for the observed one and `layout.REFERENCE` for the reference.
     """
     index, half = np.asarray(realisation, dtype=np.uint64), np.uint64(32)
     last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
@@ -373,20 +372,16 @@ def pointing_losses(
 
     Frames start at `start_s` after the start of the stare.
     """
-    start, lasts, depth = pointing_drifts(process, numbers, float(start_s[-1]) + frame_s, seed)
-    # Light lost up to the start of each drift, in seconds.
-    before = np.cumsum(depth * lasts / 2, axis=1) - depth * lasts / 2
-    rows = zip(start, lasts, depth, before, strict=True)
-    lost = np.array([_lost_until(start_s + frame_s, *row) - _lost_until(start_s, *row) for row in rows])
+    drifts = pointing_drifts(process, numbers, float(start_s[-1]) + frame_s, seed)
+    ends, lost = np.array([start_s, start_s + frame_s]), np.empty((len(numbers), start_s.size))
+    for row, (start, lasts, depth) in enumerate(zip(*drifts, strict=True)):
+        # The integral of the lost share of the light up to both ends of each frame, s.
+        before = np.cumsum(depth * lasts / 2) - depth * lasts / 2
+        k = np.searchsorted(start, ends, side="right") - 1
+        since = np.clip(ends - start[k], 0.0, lasts[k])
+        until = before[k] + depth[k] * since * (since / np.maximum(lasts[k], 1e-300)) / 2
+        lost[row] = np.diff(np.where(k < 0, 0.0, until), axis=0)[0]
     return np.clip(lost / frame_s, 0.0, 1.0)
-
-
-def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float, before_s: Float) -> Float:
-    """Return the integral of the lost share of the light up to some times, s."""
-    k = np.searchsorted(start_s, times_s, side="right") - 1
-    since = np.clip(times_s - start_s[k], 0.0, duration_s[k])
-    until = before_s[k] + depth[k] * since * (since / np.maximum(duration_s[k], 1e-300)) / 2
-    return np.asarray(np.where(k < 0, 0.0, until))
 
 
 #: Frames that are drawn together.

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, get_args
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast, get_args
 
 from pydantic import create_model
 
@@ -55,19 +55,12 @@ COURSES: tuple[Course, ...] = get_args(Course)
 TILT_NM, MIDDLE_NM = 250.0, 450.0
 
 
-@dataclass(frozen=True)
-class Amplitude:
-    """Normal prior of zero mean for the amplitude of a known change; flat if the standard deviation is infinite."""
-
-    sd: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class Unknown:
     """Value that an observer does not know."""
 
     name: str  # its key in a section of studies
-    prior: Prior | Amplitude | None = None  # default prior; None if it is known by default
+    prior: Prior | None = None  # default prior; None if it is known by default
     label: str = ""  # description in messages and tables
 
 
@@ -77,7 +70,6 @@ class UnknownProcess(Unknown):
 
     of: SignalPart = "light"
     when: Literal["frame", "exposure"] = "exposure"
-    prior: Prior | None = None
     source: str = ""  # source of the default prior, or "assumption"
     stream: int  # its number in `layout.STREAMS`
     #: Range of allowed values.
@@ -103,7 +95,8 @@ class UnknownProcess(Unknown):
 class Nuisance(Unknown):
     """Unknown amplitude of a known spectrum, which statistics marginalise over."""
 
-    prior: Amplitude | None = None
+    #: Standard deviation of its normal prior of zero mean, infinite for a flat one; None if it is known by default.
+    sd: float | None = None
     #: Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
     spectrum: Callable[[Expectation], Float]
     #: Function that returns the relative change of a flare's light for unit amplitude; None if it does not change.
@@ -122,30 +115,21 @@ class Nuisance(Unknown):
 class InstrumentValue(Unknown):
     """Unknown but constant value of the instrument, over which answers are averaged."""
 
-    prior: Prior | None = None
     #: Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
     scales: str | None = None
     #: Whether it changes the throughput alone, so that modes of a calibrated throughput take its place.
     of_throughput: bool = False
-
-    def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
-        """Return the changes of an instrument that set a value."""
-        return {self.name: value} if self.scales is None else {self.scales: value * getattr(nominal, self.scales)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class ThroughputMode(InstrumentValue):
-    """Unknown amplitude of a mode of a calibration."""
-
-    number: int  # counted from 0
-    #: Changes of the logarithm of other values than the throughput for an amplitude of one, by name.
-    others: Mapping[str, float]
+    mode: int | None = None  # number of the mode of a calibration of which this is the amplitude, from 0
+    #: Changes of the logarithm of other values than the throughput for an amplitude of one of a mode, by name.
+    others: Mapping[str, float] = field(default_factory=dict)
 
     def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
         """Return the changes of an instrument that set a value, of which those of other modes are kept."""
-        set_before = nominal.throughput_amplitudes
-        amplitudes = [*set_before, *[0.0] * (self.number + 1 - len(set_before))]
-        value, amplitudes[self.number] = value - amplitudes[self.number], value
+        if self.mode is None:
+            return {self.name: value} if self.scales is None else {self.scales: value * getattr(nominal, self.scales)}
+        amplitudes = [*nominal.throughput_amplitudes]
+        amplitudes += [0.0] * (self.mode + 1 - len(amplitudes))
+        value, amplitudes[self.mode] = value - amplitudes[self.mode], value
         others = {name: getattr(nominal, name) * math.exp(step * value) for name, step in self.others.items()}
         return {"throughput_amplitudes": tuple(amplitudes)} | others
 
@@ -229,7 +213,7 @@ NUISANCES = _by_name(
         unit="deg C",
         spectrum=lambda quiet: quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"],
         process="detector_temperature",
-        prior=Amplitude(math.inf),
+        sd=math.inf,
         marginalised="free: the dark current follows the temperature by an exponential, which is no normal amplitude",
     ),
     Nuisance(
@@ -238,7 +222,7 @@ NUISANCES = _by_name(
         spectrum=lambda quiet: quiet.recorded_light_dn,
         of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
         process="jitter",
-        prior=Amplitude(math.inf),
+        sd=math.inf,
         marginalised="free: the mean loss is unknown too, and so is the star's own level",
     ),
     Nuisance(
@@ -246,7 +230,7 @@ NUISANCES = _by_name(
         label="the sky level",
         spectrum=lambda quiet: quiet.sky_dn,
         process="sky_level",
-        prior=Amplitude(PROCESSES["sky_level"].moments[1]),
+        sd=PROCESSES["sky_level"].moments[1],
         marginalised="10 %",
     ),
     Nuisance(
@@ -257,7 +241,7 @@ NUISANCES = _by_name(
     ),
 )
 #: Nuisance parameters of the documented set.
-DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.prior is not None)
+DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.sd is not None)
 
 
 if TYPE_CHECKING:
@@ -319,12 +303,11 @@ def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
     fitted = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")}
     measured = fitted.union(errors.values)
     values = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in measured}
-    modes = []
     for k in range(min(len(errors.modes), MAX_MODES)):
         others = {name: steps[k] for name, steps in errors.values.items() if k < len(steps) and steps[k]}
-        label = f"calibration, mode {k + 1}"
-        modes.append(ThroughputMode(name=f"throughput_{k + 1}", label=label, prior=MODE_PRIOR, number=k, others=others))
-    return values | _by_name(*modes)
+        name, label = f"throughput_{k + 1}", f"calibration, mode {k + 1}"
+        values[name] = InstrumentValue(name=name, label=label, prior=MODE_PRIOR, mode=k, others=others)
+    return values
 
 
 def default_processes(temperature_c: float) -> dict[str, Prior]:
@@ -356,10 +339,8 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
         Temperature in deg C, drawn per realisation; the dark current follows the instrument's law.
     light_loss, pointing_loss : Prior, optional
         Replacements of the instrument's values, drawn per realisation.
-    qe_scale : Prior, optional
-        Factor on the quantum efficiency, drawn per realisation.
-    sky_level : Prior, optional
-        Factor on the sky's light, drawn per realisation.
+    qe_scale, sky_level : Prior, optional
+        Factors on the quantum efficiency and on the sky's light, drawn per realisation.
     """
 
     @property
@@ -375,8 +356,7 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
     @property
     def additive_only(self) -> Self:
         """The processes without priors."""
-        copy: Self = self.model_copy(update=dict.fromkeys(PROCESSES))
-        return copy
+        return cast("Self", self.model_copy(update=dict.fromkeys(PROCESSES)))
 
     @property
     def particle_processes(self) -> list[AdditiveProcess]:
@@ -391,10 +371,12 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
         every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
-        caused = {name: process for name, process in every.items() if process.particles_per_cm2_s is not None}
-        update = {name: process.with_particles(rate_per_cm2_s) for name, process in caused.items()}
-        copy: Self = self.model_copy(update=update)
-        return copy
+        update = {
+            name: process.with_particles(rate_per_cm2_s)
+            for name, process in every.items()
+            if process.particles_per_cm2_s is not None
+        }
+        return cast("Self", self.model_copy(update=update))
 
 
 NONE = Processes()

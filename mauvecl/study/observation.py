@@ -275,9 +275,7 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
         documented = DOCUMENTED_NUISANCES if self.usual else ()
         # Parameters without effect, such as the brightness of no sky, are left out.
-        sd = {
-            row.name: row.prior.sd for row in documented if row.prior is not None and spectrum_of(row.name, quiet).any()
-        }
+        sd = {row.name: row.sd for row in documented if row.sd is not None and spectrum_of(row.name, quiet).any()}
         sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
         for name, nuisance in self.own.items():
