@@ -399,9 +399,5 @@ def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any
     with np.errstate(divide="ignore"):
         ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / days for x in (p, p - reach, p + reach)]
         asked = float(-np.log(none) / days)
-    return found | {
-        "simulated": Interval(*(float(x) for x in ends)),
-        "asked": asked,
-        "alarmed": int(np.sum(maxima >= threshold.value)),
-        "expected": float(n * -np.expm1(-choice.rate * days)),
-    }
+    expected, alarmed = float(n * -np.expm1(-choice.rate * days)), int(np.sum(maxima >= threshold.value))
+    return found | {"simulated": Interval(*map(float, ends)), "asked": asked, "alarmed": alarmed, "expected": expected}

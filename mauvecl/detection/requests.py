@@ -37,24 +37,6 @@ STATISTICS: dict[str, Statistic] = {
 }
 
 
-def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
-    """Return the requested statistics by name; raises InputError if one is unknown, not unique, or none is named."""
-    named: dict[str, Statistic] = {}
-    for statistic in asked:
-        if isinstance(statistic, str):
-            check_statistic(statistic)
-            named[statistic] = STATISTICS[statistic]
-        elif statistic.name in STATISTICS:
-            raise InputError(f"statistic {statistic.name!r} is mauvecl's own; use another name", key="statistics")
-        elif statistic.name in named:
-            raise InputError.of("statistics", statistic.name, "different names")
-        else:
-            named[statistic.name] = statistic
-    if not named:
-        raise InputError(f"no statistic is named; give some of {', '.join(STATISTICS)}", key="statistics")
-    return named
-
-
 def statistic_label(name: str) -> str:
     """Return the axis label of a statistic; that of a user-defined one is its name."""
     return STATISTICS[name].label if name in STATISTICS else name
@@ -76,18 +58,30 @@ class Hypotheses:
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._chosen = statistics_by_name(self.asked)
+        self._chosen = {}
+        for statistic in self.asked:
+            if isinstance(statistic, str):
+                check_statistic(statistic)
+                self._chosen[statistic] = STATISTICS[statistic]
+            elif statistic.name in STATISTICS:
+                raise InputError(f"statistic {statistic.name!r} is mauvecl's own; use another name", key="statistics")
+            elif statistic.name in self._chosen:
+                raise InputError.of("statistics", statistic.name, "different names")
+            else:
+                self._chosen[statistic.name] = statistic
+        if not self._chosen:
+            raise InputError(f"no statistic is named; give some of {', '.join(STATISTICS)}", key="statistics")
         self.statistics = tuple(self._chosen)
         scene = self.scene
         drawn = factor_distributions(scene.modulations, scene.priors, scene.medians, scene.n_frames)
         self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
-        shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
-        if shaped is not None and not self.flares:
-            raise InputError(f"the statistic {shaped!r} needs at least one flare, but none is given", key="flares")
+        shaped = [name for name, kind in self._chosen.items() if kind.shaped]
+        if shaped and not self.flares:
+            raise InputError(f"the statistic {shaped[0]!r} needs at least one flare, but none is given", key="flares")
         if not self.scene.used.any():
             raise entirely_saturated(self.quiet, "quiet")
-        for statistic in self._chosen.values():
-            statistic.check(self.setting)
+        for kind in self._chosen.values():
+            kind.check(self.setting)
         for k, flare in enumerate(self.flares if "matched" in self._chosen else ()):
             # `messages` report a flare that saturates every pixel.
             if k not in self.blinding:

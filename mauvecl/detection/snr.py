@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from mauvecl.host.exposure.expectation import Expectation
 
+Float = NDArray[np.float64]
+
 #: Bins per standard deviation of an element's S/N, which cover +-8 standard deviations.
 BINS_PER_SIGMA = 128.0
 #: Percentages of the reported quantiles: the median and one, two and three sigma.
@@ -191,7 +193,7 @@ class SnrResult(Drawable, ContentEquality):
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
         width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
 
-        def snr(which: int, place: NDArray[np.number]) -> NDArray[np.float64]:
+        def snr(which: int, place: NDArray[np.number]) -> Float:
             # A bin contains the whole DN from its lower edge up to the next.
             dn = width[which] * place - 0.5
             net = dn + seen["net_offset"].astype(float)[which]
@@ -208,7 +210,7 @@ class SnrResult(Drawable, ContentEquality):
         per_unit = self.elements["bins_per_unit"]
         step = np.divide(1.0, per_unit, out=np.zeros(len(per_unit)), where=per_unit > 0)
 
-        def snr(which: int, place: NDArray[np.number]) -> NDArray[np.float64]:
+        def snr(which: int, place: NDArray[np.number]) -> Float:
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
@@ -217,13 +219,9 @@ class SnrResult(Drawable, ContentEquality):
         return f"of {self.expectation.name!r}, {self.counts.n} realisations"
 
     def _table(
-        self,
-        kind: str,
-        wavelength_nm: NDArray[np.float64],
-        expected: NDArray[np.float64],
-        snr: Callable[[int, NDArray[np.number]], NDArray[np.float64]],
-        **clipped: NDArray[np.float64],
-    ) -> QTable:
+        self, kind: str, wavelength_nm: Float, expected: Float, snr: Callable[[int, NDArray[np.number]], Float],
+        **clipped: Float,
+    ) -> QTable:  # fmt: skip
         """Return the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
         rows = []
         for which in range(len(expected)):

@@ -153,14 +153,9 @@ class Statistic(ABC):
         return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
 
     def integrate_drawn(
-        self,
-        setting: Setting,
-        observed: Expectation,
-        seen: Differences,
-        flare: Expectation | None,
-        *,
+        self, setting: Setting, observed: Expectation, seen: Differences, flare: Expectation | None, *,
         priors: bool = True,
-    ) -> Form:
+    ) -> Form:  # fmt: skip
         """Return `form` integrated over those nuisance parameters that are drawn.
 
         Without `priors`, nuisance parameters that are not drawn do not scatter.

@@ -232,8 +232,7 @@ class Engine:
             case SnrRequest():
                 return pack_snr(self._snr(request, shard))
             case RealiseRequest():
-                x, seed = request.expectation, request.seed
-                how = request.drawing.options
+                x, seed, how = request.expectation, request.seed, vars(request.drawing)
                 rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
                 return {"rows": rows}
         # Exposures do not need the modules of stares.

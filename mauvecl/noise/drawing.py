@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from itertools import chain, product
-from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast
+from typing import TYPE_CHECKING, Literal, Self, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +63,10 @@ class Cumulants:
         # A stack of n rounded frames has a rounding variance of n/12; the rounding of the draw adds the last 1/12.
         other = each * x.read_noise_dn**2 + (each - 1) / 12
         return Cumulants(
-            mean=each * x.mean_raw_dn,
-            gaussian=other if poisson else other + gain**2 * photons,
-            photons=photons,
-            photon_step=gain if poisson else np.zeros_like(gain),
-            dark_step=x.dark_step_dn,
-            dark_dn=each * x.dark_dn,
-            light_dn=gain * photons,
-            light_variance=gain**2 * photons,
-        )
+            mean=each * x.mean_raw_dn, gaussian=other if poisson else other + gain**2 * photons, photons=photons,
+            photon_step=gain if poisson else np.zeros_like(gain), dark_step=x.dark_step_dn, dark_dn=each * x.dark_dn,
+            light_dn=gain * photons, light_variance=gain**2 * photons,
+        )  # fmt: skip
 
     def photon_cumulant(self, order: int) -> Float:
         """Return a cumulant of the photons, for orders of 3 and above."""
@@ -115,14 +110,10 @@ class Cumulants:
         """Return the cumulants with light and dark multiplied by factors."""
         gaussian_light = np.where(self.photon_step > 0, 0.0, self.light_variance)
         return replace(
-            self,
-            mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
-            gaussian=self.gaussian + (light - 1.0) * gaussian_light,
-            photons=light * self.photons,
-            dark_dn=dark * self.dark_dn,
-            light_dn=light * self.light_dn,
-            light_variance=light * self.light_variance,
-        )
+            self, mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
+            gaussian=self.gaussian + (light - 1.0) * gaussian_light, photons=light * self.photons,
+            dark_dn=dark * self.dark_dn, light_dn=light * self.light_dn, light_variance=light * self.light_variance,
+        )  # fmt: skip
 
 
 def is_noticeable(distance: Float, variance: Float) -> NDArray[np.bool_]:
@@ -242,11 +233,6 @@ class Drawing:
     recipe: Recipe = "auto"
     processes: Processes = NONE  # optional noise processes
     first_frame: int = 0  # frame k of an exposure is drawn with an expectation of one frame and ``first_frame=k``
-
-    @property
-    def options(self) -> DrawingOptions:
-        """Fields as keyword arguments."""
-        return cast(DrawingOptions, dict(vars(self)))
 
 
 #: Options that follow from the noise.

@@ -284,14 +284,9 @@ def digitise(v: Floats, edge: np.void | NDArray[np.void], *, clip: bool) -> Floa
 
 
 def observed(
-    scene: Scene,
-    realisation: NDArray[np.uint64],
-    seed: int,
-    *,
-    exposure: int = 0,
-    number: int = 0,
+    scene: Scene, realisation: NDArray[np.uint64], seed: int, *, exposure: int = 0, number: int = 0,
     scenarios: Sequence[int] | None = None,
-) -> NDArray[np.int64]:
+) -> NDArray[np.int64]:  # fmt: skip
     """Sum the DN above the base over the draws of exposure `number`, (n_scenario, n_padded, n_realisation)."""
     drawn_frames = range(number * scene.n_draws, (number + 1) * scene.n_draws)
     index, frames, changes = _all_frames(scene, realisation, drawn_frames, seed, exposure)

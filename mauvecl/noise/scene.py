@@ -301,14 +301,9 @@ class Scene:
 
 
 def prepare(
-    scenarios: Sequence[Expectation],
-    drawing: Drawing | None = None,
-    *,
-    references: Sequence[int] | None = None,
-    comparison: Comparison = NOISE_FREE,
-    first_group: int = 0,
-    **words: Unpack[DrawingOptions],
-) -> Scene:
+    scenarios: Sequence[Expectation], drawing: Drawing | None = None, *, references: Sequence[int] | None = None,
+    comparison: Comparison = NOISE_FREE, first_group: int = 0, **words: Unpack[DrawingOptions],
+) -> Scene:  # fmt: skip
     """Compute the arrays of scenarios for the device, from expectations that differ only in their light.
 
     Options of the draw can also be given as keywords. Each scenario is compared with one of the quiescent `references`,
@@ -327,23 +322,14 @@ def prepare(
     for k, x in enumerate(scenarios):
         _fill_draw(arrays, k, x, method, dark_dn)
         _fill_comparison(arrays, k, method.each, scenarios[compared[k]], comparison, used)
+    job = _job(scenarios, drawing, method, comparison, first_group)
+    tables = np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32)
     return Scene(
-        n_pixel=used.size,
-        n_frames=quiet.n_frames,
-        **{name: getattr(method, name) for name in ("frames", "joint", "quartic", "photons")},
-        clip=method.each == 1,
-        modulations=drawing.processes.modulations,
-        job=_job(scenarios, drawing, method, comparison, first_group),
-        pixels=detector_pixels(quiet, used),
-        dark_counts=darks,
-        tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32),
-        priors=method.factors.tables,
-        medians=tuple(method.factors.medians.values()),
-        references=compared,
-        comparison=comparison,
-        used=used,
-        **arrays,
-    )
+        used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons, clip=method.each == 1,
+        modulations=drawing.processes.modulations, job=job, pixels=detector_pixels(quiet, used), dark_counts=darks,
+        tables=tables, priors=method.factors.tables, medians=tuple(method.factors.medians.values()),
+        references=compared, comparison=comparison, used=used, **arrays,
+    )  # fmt: skip
 
 
 #: Arrays of a `Scene` with a row for each scenario, by the names of its fields.

@@ -163,25 +163,13 @@ STARE_PROCESSES: dict[str, type[PointingDrifts]] = {"pointing": PointingDrifts}
 #: Processes in the order of their tables in kernels: fields of `Processes`, keys of studies' ``processes``.
 PROCESSES = _by_name(
     UnknownProcess(
-        name="jitter",
-        when="frame",
-        stream=4,
-        low=0.0,
-        high=0.5,
-        change=lambda _, lost: -lost,
-        expected=0.0,
-        prior=Uniform(0.0, 0.05),
-        drawn="share of the light lost in each frame, uniform, 0-5 %",
+        name="jitter", when="frame", stream=4, low=0.0, high=0.5, change=lambda _, lost: -lost, expected=0.0,
+        prior=Uniform(0.0, 0.05), drawn="share of the light lost in each frame, uniform, 0-5 %",
         source="the paper: light lost by pointing errors stays below 5 %; uniform and anew in each frame: assumption",
     ),
     UnknownProcess(
-        name="detector_temperature",
-        of="dark",
-        stream=5,
-        low=range_of(DetectorTemperature).low,
-        high=range_of(DetectorTemperature).high,
-        change=_dark_follows,
-        expected="temperature_c",
+        name="detector_temperature", of="dark", stream=5, low=range_of(DetectorTemperature).low,
+        high=range_of(DetectorTemperature).high, change=_dark_follows, expected="temperature_c",
         # Relative to the nominal temperature; see `default_processes`.
         prior=Normal(0.0, 0.5, -2.5, 2.5),
         drawn="detector temperature, normal, +-0.5 deg C around the nominal one, cut at 2.5 deg C",
@@ -189,57 +177,37 @@ PROCESSES = _by_name(
     ),
     UnknownProcess(name="light_loss", stream=6, low=0.0, high=0.99, change=_lost("light_loss"), expected="light_loss"),
     UnknownProcess(
-        name="pointing_loss", stream=7, low=0.0, high=0.99, change=_lost("pointing_loss"), expected="pointing_loss"
+        name="pointing_loss", stream=7, low=0.0, high=0.99, change=_lost("pointing_loss"), expected="pointing_loss",
     ),
     UnknownProcess(name="qe_scale", stream=8, low=0.01, high=100.0, change=lambda _, scale: scale - 1.0),
     UnknownProcess(
-        name="sky_level",
-        of="sky",
-        stream=11,
-        low=0.01,
-        high=100.0,
-        change=lambda _, level: level - 1.0,
-        prior=Normal(1.0, 0.1, 0.5, 1.5),
-        drawn="factor on the sky's light, normal, 1 +- 0.1, cut at 0.5 and 1.5",
+        name="sky_level", of="sky", stream=11, low=0.01, high=100.0, change=lambda _, level: level - 1.0,
+        prior=Normal(1.0, 0.1, 0.5, 1.5), drawn="factor on the sky's light, normal, 1 +- 0.1, cut at 0.5 and 1.5",
         source="assumption: the scatter of the zodiacal light about its model",
     ),
-)
+)  # fmt: skip
 
 #: Nuisance parameters with built-in spectra; keys of studies' ``nuisances``.
 NUISANCES = _by_name(
     Nuisance(
-        name="dark",
-        label="the dark level",
-        unit="deg C",
+        name="dark", label="the dark level", unit="deg C", process="detector_temperature", sd=math.inf,
         spectrum=lambda quiet: quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"],
-        process="detector_temperature",
-        sd=math.inf,
         marginalised="free: the dark current follows the temperature by an exponential, which is no normal amplitude",
     ),
     Nuisance(
-        name="light",
-        label="the light level",
-        spectrum=lambda quiet: quiet.recorded_light_dn,
-        of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
-        process="jitter",
-        sd=math.inf,
+        name="light", label="the light level", process="jitter", sd=math.inf,
+        spectrum=lambda quiet: quiet.recorded_light_dn, of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
         marginalised="free: the mean loss is unknown too, and so is the star's own level",
     ),
     Nuisance(
-        name="sky",
-        label="the sky level",
-        spectrum=lambda quiet: quiet.sky_dn,
-        process="sky_level",
-        sd=PROCESSES["sky_level"].moments[1],
-        marginalised="10 %",
+        name="sky", label="the sky level", process="sky_level", sd=PROCESSES["sky_level"].moments[1],
+        spectrum=lambda quiet: quiet.sky_dn, marginalised="10 %",
     ),
     Nuisance(
-        name="tilt",
-        label="the response's colour",
-        spectrum=lambda quiet: quiet.recorded_light_dn * _tilt(quiet),
+        name="tilt", label="the response's colour", spectrum=lambda quiet: quiet.recorded_light_dn * _tilt(quiet),
         of_flare=_tilt,
     ),
-)
+)  # fmt: skip
 #: Nuisance parameters of the documented set.
 DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.sd is not None)
 
@@ -270,19 +238,13 @@ INSTRUMENT_VALUES = _by_name(
     InstrumentValue(name="temperature_c", label="detector temperature (C)", prior=Uniform(13.0, 21.0)),
     InstrumentValue(name="light_loss", label="light loss", prior=Normal(0.34, 0.10, 0.04, 0.64), of_throughput=True),
     InstrumentValue(name="pointing_loss", label="pointing loss", prior=Uniform(0.0, 0.05), of_throughput=True),
-    InstrumentValue(
-        name="qe_scale",
-        label="quantum efficiency, scale",
-        prior=Normal(1.0, 0.3, 0.3, 1.7),
-        # The collecting area has the same effect.
-        scales="collecting_area_cm2",
-        of_throughput=True,
-    ),
-    InstrumentValue(
-        name="conversion_uv_per_electron", label="charge conversion (uV per electron)", prior=Uniform(20.0, 25.0)
-    ),
+    # The collecting area has the same effect as the scale of the quantum efficiency.
+    InstrumentValue(name="qe_scale", label="quantum efficiency, scale", prior=Normal(1.0, 0.3, 0.3, 1.7),
+                    scales="collecting_area_cm2", of_throughput=True),
+    InstrumentValue(name="conversion_uv_per_electron", label="charge conversion (uV per electron)",
+                    prior=Uniform(20.0, 25.0)),
     InstrumentValue(name="read_noise_dn", label="read noise (DN)", prior=Normal(12.0, 1.0, 9.0, 15.0)),
-)
+)  # fmt: skip
 
 
 #: Largest number of modes of a calibration that are unknown: of the light in eight bands and seven other values.
