@@ -14,6 +14,9 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+#: Array of doubles.
+Float = NDArray[np.float64]
+
 P = ParamSpec("P")
 R = TypeVar("R")
 

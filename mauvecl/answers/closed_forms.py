@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from mauvecl.detection import MIN_IN_TAIL
-from mauvecl.detection.distributions import CONFIDENCE_SD, Gaussian
+from mauvecl.detection.distributions import CONFIDENCE_SD
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting
+from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, values_of
 from mauvecl.schema.columns import Column, First, chance_text, number
 from mauvecl.schema.errors import InputError, Message
@@ -112,9 +112,7 @@ IDEAL = Column("ideal", "", "", "detection probability if everything but the noi
                "ideal", number(".4f"))  # fmt: skip
 
 
-def ideal_chances(
-    case: Case, flares: Sequence[Expectation], statistics: Sequence[Statistic]
-) -> NDArray[np.float64] | None:
+def ideal_chances(case: Case, flares: Sequence[Expectation], statistics: Sequence[Statistic]) -> Float | None:
     """Return the closed-form chances of flares if everything but the noise is known, or None if it is.
 
     Their shape is (n_flare, n_statistic), and they are NaN where the star or the flare saturates every pixel.
@@ -168,8 +166,6 @@ def _chance(setting: Setting, statistic: Statistic, flare: Expectation, fap: flo
         return float("nan")
     return statistic.detection_forms(setting, flare, fap).probability
 
-
-Float = NDArray[np.float64]
 
 #: Name of the variance that no unknown explains linearly.
 REST = "the rest"
@@ -296,10 +292,6 @@ class InterpolatedForm:
 
     def __init__(self, form: Form) -> None:
         self.mean, self.std = form.mean, form.std
-        if isinstance(form, Gaussian):
-            self._probit: Any = lambda value: (form.mean - value) / form.std
-            self._inverse: Any = lambda probit: form.mean + form.std * probit
-            return
         at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
         beyond = np.array([form.sf(value) for value in at])
         # Probabilities that round to 0 or 1 have no finite probit.
@@ -307,10 +299,10 @@ class InterpolatedForm:
         self._probit = PchipInterpolator(at[inside], special.ndtri(beyond[inside]), extrapolate=True)
         self._inverse = PchipInterpolator(-special.ndtri(beyond[inside]), at[inside], extrapolate=True)
 
-    def sf(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sf(self, value: Float) -> Float:
         """Return the probabilities of exceeding values."""
         return np.asarray(special.ndtr(self._probit(value)))
 
-    def isf(self, probability: NDArray[np.float64]) -> NDArray[np.float64]:
+    def isf(self, probability: Float) -> Float:
         """Return the values that are exceeded with given probabilities."""
         return np.asarray(self._inverse(-special.ndtri(probability)))

@@ -9,7 +9,6 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
@@ -17,20 +16,13 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_in
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap, countable
 from mauvecl.detection.chi2 import Smoothing
-from mauvecl.detection.detection import (
-    AREA_COLUMNS,
-    COLUMNS,
-    DEPARTURE_COLUMNS,
-    ROC_COLUMNS,
-    ROC_ROWS,
-    Detection,
-    departure_table,
-)
+from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, DEPARTURE_COLUMNS, ROC_COLUMNS, ROC_ROWS, departure_table
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.nuisances import read_at_pixels
 from mauvecl.detection.statistics import Linear, Matched, Setting
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
+from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
 from mauvecl.schema.errors import InputError, Message
@@ -41,6 +33,7 @@ from mauvecl.study.study import PAPER_STARS, Study
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.detection.detection import Detection
     from mauvecl.detection.distributions import Interval
     from mauvecl.host.exposure.expectation import Expectation
 
@@ -55,7 +48,7 @@ class StarDetection(InCell):
     amplitudes: tuple[float, ...]
     detection: Detection
     #: Closed-form chances if everything but the noise were known, shape (n_flare, n_statistic); None if it is known.
-    ideal: NDArray[np.float64] | None = None
+    ideal: Float | None = None
 
 
 def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
@@ -450,6 +443,6 @@ def unknown_table(study: Study) -> UnknownAnswer:
     return UnknownAnswer(study, costs, collect_messages(quiet), quiet)
 
 
-def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:
+def power(snr: float | Float, fap: float) -> Float:
     """Return the detection probability of a normal statistic with some S/N, shape of the S/N."""
     return np.asarray(special.ndtr(snr + special.ndtri(fap)))

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_columns
 from mauvecl.answers.verbs import Progress, by_keywords
@@ -18,6 +17,7 @@ from mauvecl.detection.distributions import Interval
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.shapes import shape_of
+from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
     Reduced = Callable[[StaresRequest], Arrays]
 
-Float = NDArray[np.float64]
 #: Default range of injected sizes, in units of the size with a completeness of one half.
 DEFAULT_RANGE = (0.3, 3.0)
 

@@ -14,7 +14,6 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
@@ -25,6 +24,7 @@ from mauvecl.detection.distributions import Interval, smallest_integer
 from mauvecl.detection.requests import STATISTICS, check_shape, fall_between
 from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.device.engine import Engine
+from mauvecl.host.arrays import Float
 from mauvecl.noise.disturbances import Uniform
 from mauvecl.noise.unknowns import values_of
 from mauvecl.runs.pool import Pool, map_in_order
@@ -367,7 +367,7 @@ class UnknownEffect:
     """Effect of unknown instrument values on a limit."""
 
     draws: forms.DrawnStudies
-    limits: NDArray[np.float64]  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
+    limits: Float  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
     shares: dict[str, float]  # share of the limits' variance that each unknown explains, largest first
 
     @property

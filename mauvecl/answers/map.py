@@ -9,7 +9,6 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf
@@ -17,12 +16,12 @@ from mauvecl.answers.limit import SEARCH, LimitSearch
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
+from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
-    Case,
     assumptions_of,
     cases,
     collect_messages,
@@ -35,6 +34,7 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.cases import Case
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")
@@ -78,11 +78,11 @@ class MapAnswer(Answer):
     x: tuple[float | str, ...]  # values of the horizontal axis
     y: tuple[float | str, ...]  # values of the vertical axis
     statistics: tuple[str, ...]
-    probability: NDArray[np.float64]  # detection probability
-    low: NDArray[np.float64]  # lower end of its 95 % interval, with that of the threshold
-    high: NDArray[np.float64]
-    closed_form: NDArray[np.float64]  # probability for Gaussian noise
-    ideal: NDArray[np.float64]  # the same if everything but the noise were known; NaN if it is
+    probability: Float  # detection probability
+    low: Float  # lower end of its 95 % interval, with that of the threshold
+    high: Float
+    closed_form: Float  # probability for Gaussian noise
+    ideal: Float  # the same if everything but the noise were known; NaN if it is
     messages: list[str]
     # For maps averaged over unknowns: shares of the variance of the mean probability by unknown, for each statistic.
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -247,7 +247,7 @@ def _shown(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
-Arrays = dict[str, NDArray[np.float64]]
+Arrays = dict[str, Float]
 
 
 @dataclass(eq=False)

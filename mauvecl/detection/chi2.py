@@ -13,6 +13,7 @@ from scipy.linalg import orth, solve_triangular
 
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.statistics import Differences, Setting, Statistic, Tilt
+from mauvecl.host.arrays import Float
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -178,8 +179,6 @@ class Chi2Pair(Chi2):
     kernel_sum: ClassVar[str | None] = "chi2_pair"
     paired: ClassVar[bool] = True
 
-
-Float = NDArray[np.float64]
 
 #: FWHM of the paper's smoothing, nm.
 SMOOTHING_NM = 10.5

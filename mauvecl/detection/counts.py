@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import check_probability
 from mauvecl.detection.distributions import Interval, central_counts
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -97,7 +98,7 @@ def _ordered(image: NDArray[np.int32]) -> NDArray[np.int32]:
     return image ^ ((image >> 31) & np.int32(0x7FFFFFFF))
 
 
-def edges_of(keys: NDArray[np.int64]) -> NDArray[np.float64]:
+def edges_of(keys: NDArray[np.int64]) -> Float:
     """Return the lower edges of bins: the smallest value in each."""
     ordered = ((keys - np.where(is_above(keys), ABOVE, 0)) << DROPPED_BITS).astype(np.int32)
     edges = _ordered(ordered).view(np.float32).astype(np.float64)
@@ -142,7 +143,7 @@ class FarCounts(SparseCounts):
         """Number of finite values."""
         return int(self.counts.sum())
 
-    def edges(self, low: float, high: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def edges(self, low: float, high: float) -> tuple[Float, Float]:
         """Return the lower and upper edges of the bins, limited by the range `low` to `high` of the fine bins."""
         above = is_above(self.keys)
         lower = np.where(above, np.maximum(edges_of(self.keys), high), edges_of(self.keys))
@@ -282,14 +283,14 @@ class Distribution:
     def std(self) -> float:
         return math.sqrt(self._moments[1])
 
-    def edge(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
+    def edge(self, index: NDArray[np.intp]) -> Float:
         """Return the lower edges of fine bins."""
         steps = (index - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
         return np.asarray(self.centre + self.step * steps)
 
     # Computed when needed: a detection of hundreds of flares has thousands of distributions.
     @property
-    def bins(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def bins(self) -> tuple[Float, Float, NDArray[np.int64]]:
         """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
         self.refuse_undefined()
         ends = self.edge(np.array([FIRST_BIN, LAST_BIN + 1])) if math.isfinite(self.step) else np.full(2, np.inf)
@@ -323,7 +324,7 @@ class Distribution:
         at = int(np.searchsorted(upper, edge, side="right"))
         return int(counts[at:].sum()), int(counts[at - 1]) if at else 0
 
-    def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    def quantile(self, probability: float | Float) -> Float:
         """Return quantiles, interpolated linearly within bins."""
         lower, upper, counts = self.bins
         edges = np.column_stack([lower, upper]).ravel()
@@ -339,7 +340,7 @@ class Distribution:
         ends = float(lower[first]) if low else -np.inf, float(upper[last]) if high < self.n else np.inf
         return Interval(float(self.quantile(probability)), *ends)
 
-    def histogram(self, bins: int = 200) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def histogram(self, bins: int = 200) -> tuple[Float, NDArray[np.int64]]:
         """Return edges, shape (m + 1,), and counts, shape (m,), in at most `bins` equal bins, for plots."""
         lower, upper, _ = self.bins
         if self.far.n:

@@ -26,7 +26,7 @@ from mauvecl.detection.distributions import (
 from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
 from mauvecl.detection.statistics import Differences, LinearStatistic
 from mauvecl.detection.tails import Tail, tail
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.calls import validated
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
 
 #: Differences above this many standard errors are significant.
 SIGNIFICANT = 4.0
@@ -354,7 +352,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def histogram(
         self, statistic: str, flare: int | None = None, *, template: int = 0, bins: Annotated[int, Range(1)] = 200
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    ) -> tuple[Float, NDArray[np.int64]]:
         """Return edges and counts for plots; parameters as for `distribution`."""
         return self.distribution(statistic, flare, template=template).histogram(bins)
 

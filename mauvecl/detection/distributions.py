@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-Float = NDArray[np.float64]
+from mauvecl.host.arrays import Float
 
 
 def smallest_integer(reached: Callable[[int], bool], low: int, high: int) -> int:

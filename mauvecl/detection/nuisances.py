@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.host.tables.files import LARGEST, SMALLEST, read_text
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.calls import validated
@@ -22,8 +21,6 @@ from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
 
 
 @validated
@@ -68,9 +65,7 @@ class Nuisances(ContentEquality):
             object.__setattr__(self, name, values)
 
     @classmethod
-    def of(
-        cls, quiet: Expectation, sd: Mapping[str, float], own: Mapping[str, NDArray[np.float64]] | None = None
-    ) -> Nuisances:
+    def of(cls, quiet: Expectation, sd: Mapping[str, float], own: Mapping[str, Float] | None = None) -> Nuisances:
         """Compute the nuisance spectra of a quiescent exposure.
 
         `sd` holds prior standard deviations by name, of `NUISANCES` or `own`, infinite to project a parameter out;
@@ -228,9 +223,7 @@ def join_names(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def read_at_pixels(
-    kind: Literal["weights", "spectrum"], name: str, path: Path, wavelength_nm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def read_at_pixels(kind: Literal["weights", "spectrum"], name: str, path: Path, wavelength_nm: Float) -> Float:
     """Read weights per DN of a statistic, or the spectrum of an unknown in DN per exposure, and apply `at_pixels`."""
     from mauvecl.host.tables.text_tables import columns
 
@@ -239,9 +232,7 @@ def read_at_pixels(
     return at_pixels(what, values, rows, wavelength_nm)
 
 
-def at_pixels(
-    what: str, kind: str, rows: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def at_pixels(what: str, kind: str, rows: Float, wavelength_nm: Float) -> Float:
     """Interpolate rows of wavelength, nm, and value linearly to pixels, 0 outside their range.
 
     `what` and `kind` name the source and its values in messages.

@@ -21,6 +21,7 @@ from mauvecl.detection.counts import Grid, TailSamples
 from mauvecl.detection.distributions import Form
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
@@ -103,7 +104,7 @@ class Hypotheses:
         self._check(statistic, None, template)
         return self.flares[template] if self.statistic(statistic).shaped else None
 
-    def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
+    def weights(self, statistic: str, template: int = 0) -> Float | None:
         """Return the weights per DN of a linear statistic, shape (n_pixel,), with a flare as template; else None."""
         kind = self.statistic(statistic)
         if not isinstance(kind, LinearStatistic):
@@ -216,7 +217,7 @@ class ChannelPlan:
 
 
 #: Rows of weights by statistic, scenario and template, ordered by scenario.
-Rows = dict[tuple[str, int, int], NDArray[np.float64]]
+Rows = dict[tuple[str, int, int], Float]
 
 
 def _rows(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.detection.counts import SparseCounts, TailSamples, Tally, steps_of
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.noise import layout
 from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
 
 #: Bins per standard deviation of an element's S/N, which cover +-8 standard deviations.
 BINS_PER_SIGMA = 128.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.detection.nuisances import Nuisances, join_names
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.noise.scene import FactorDistribution, changes_of, factor_nodes
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison, SignalPart
 from mauvecl.schema.calls import validated
@@ -21,7 +21,6 @@ from mauvecl.schema.errors import InputError
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
 T = TypeVar("T")
 
 
@@ -333,7 +332,7 @@ class Linear(ContentEquality, LinearStatistic):
     """
 
     name: str
-    weights: NDArray[np.float64]
+    weights: Float
 
     definition: ClassVar[str] = "user-defined weighted sum"
     label: ClassVar[str] = ""

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.detection import check_atom, check_probability, least_countable
@@ -27,6 +26,7 @@ from mauvecl.detection.distributions import (
     clopper_pearson,
 )
 from mauvecl.detection.statistics import Differences
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.scene import factor_nodes, quantile_at_score
@@ -125,7 +125,7 @@ def count_tests(frames: int, stack: int, step: int) -> int:
     return (frames - stack) // step + 1
 
 
-def _maxima(stretch: int, stack: int, step: int, seed: int) -> NDArray[np.float64]:
+def _maxima(stretch: int, stack: int, step: int, seed: int) -> Float:
     """Draw the largest sum of normals over a stretch of overlapping stacks, shape (SIMULATIONS,)."""
     generator = np.random.default_rng(seed)
     size = (stretch - 1) * step + stack
@@ -137,8 +137,6 @@ def _maxima(stretch: int, stack: int, step: int, seed: int) -> NDArray[np.float6
         parts.append((sums[:, stack:] - sums[:, :-stack])[:, ::step].max(axis=1))
     return np.concatenate(parts)
 
-
-Float = NDArray[np.float64]
 
 #: Initial and largest number of realisations, which is doubled in each step.
 FIRST_REALISATIONS, MAX_REALISATIONS = 8_000, 512_000

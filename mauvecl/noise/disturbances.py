@@ -20,12 +20,8 @@ from mauvecl.schema.physical import Duration
 from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from mauvecl.host.arrays import Float
     from mauvecl.host.exposure.expectation import Expectation
-
-    Float = NDArray[np.float64]
 
 #: Events in a pixel and draw with a smaller probability are neglected.
 NEGLIGIBLE = 2.0**-40
@@ -233,7 +229,7 @@ class Uniform:
         if not self.low <= self.high:
             raise InputError.of("low", self.low, f"at most high = {self.high:g}")
 
-    def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
+    def quantile(self, below: Float, above: Float | None = None) -> Float:
         """Return the quantiles at probabilities `below`; see `Normal.quantile`."""
         import numpy as np
 
@@ -272,7 +268,7 @@ class Normal:
         """Return whether both cuts are at least this many standard deviations from the mean."""
         return min(self.mean - self.low, self.high - self.mean) >= least_sd * self.sd * (1.0 - 1e-12)
 
-    def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
+    def quantile(self, below: Float, above: Float | None = None) -> Float:
         """Return the quantiles at probabilities `below`; `above` is 1 - below, if subtraction would lose precision."""
         import numpy as np
         from scipy import special

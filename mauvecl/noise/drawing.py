@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal, Self, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import Prior
 from mauvecl.noise.unknowns import NONE, PROCESSES, SIGNAL_PARTS, Conditions, Processes, SignalPart
@@ -25,8 +26,6 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
 
 #: Gaussian noise with a standard deviation of this many Poisson steps reduces them to 2 exp(-2 pi^2 1.5^2) = 1e-19.
 SMOOTH_STEPS = 1.5

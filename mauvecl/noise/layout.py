@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.unknowns import CHANGING, PROCESSES, STARE_PROCESSES
 
@@ -215,7 +216,7 @@ def alias_table(mean: float) -> AliasTable:
     return alias_table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
 
 
-def alias_table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
+def alias_table_of(probability: Float, low: int = 0) -> AliasTable:
     """Compute the alias table of a distribution over the integers from `low` on.
 
     `probability` has up to 2**24 values, which need not sum to one.

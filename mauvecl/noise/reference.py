@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE, PointingDrifts
 from mauvecl.noise.drawing import DrawingOptions
@@ -330,8 +331,6 @@ def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
     return raw
 
 
-Float = NDArray[np.float64]
-
 #: Drifts that are drawn at a time, per stare.
 DRIFTS_AT_ONCE = 16
 
@@ -361,7 +360,7 @@ def pointing_drifts(
 
 
 def pointing_losses(
-    process: PointingDrifts, numbers: NDArray[np.uint64], start_s: NDArray[np.float64], frame_s: float, seed: int
+    process: PointingDrifts, numbers: NDArray[np.uint64], start_s: Float, frame_s: float, seed: int
 ) -> Float:
     """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
 

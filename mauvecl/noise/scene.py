@@ -12,28 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
-from mauvecl.noise.drawing import (
-    Cumulants,
-    Drawing,
-    DrawingOptions,
-    DrawMethod,
-    Factors,
-    check_reach,
-    choose_method,
-    nodes,
-    polynomial,
-    sky_share,
-)
+from mauvecl.noise.drawing import Drawing, Factors, check_reach, choose_method, nodes, polynomial, sky_share
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table, alias_table_of
 from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, SIGNAL_PARTS, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
+    from mauvecl.noise.drawing import Cumulants, DrawingOptions, DrawMethod
 
 #: Number of nodes of the trapezoidal rule over a prior's normal score, and its range. The rule converges exponentially
 #: for functions that are smooth over a step (Trefethen & Weideman 2014, doi 10.1137/130932132).

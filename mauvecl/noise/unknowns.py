@@ -14,16 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast, 
 
 from pydantic import create_model
 
-from mauvecl.noise.disturbances import (
-    ADDITIVE,
-    AdditiveProcess,
-    Normal,
-    ParticleRate,
-    PointingDrifts,
-    Prior,
-    PriorField,
-    Uniform,
-)
+from mauvecl.noise.disturbances import ADDITIVE, Normal, ParticleRate, PointingDrifts, PriorField, Uniform
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, range_of
@@ -31,13 +22,10 @@ from mauvecl.schema.physical import DetectorTemperature
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from mauvecl.host.arrays import Float
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
-
-    Float = NDArray[np.float64]
+    from mauvecl.noise.disturbances import AdditiveProcess, Prior
 
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]
