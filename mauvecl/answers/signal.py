@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
 from mauvecl.answers.verbs import Progress, by_keywords
+from mauvecl.detection.distributions import smallest_integer
 from mauvecl.detection.snr import COLUMNS
 from mauvecl.device.engine import Engine
 from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
@@ -165,11 +166,8 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
         )
         raise InputError(fault, key="signal.snr")
     # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.
-    frames = max(int(np.ceil((snr / single) ** 2)), 1)
-    while frames > 1 and after(frames - 1) >= snr:
-        frames -= 1
-    while after(frames) < snr:
-        frames += 1
+    near = int(np.ceil((snr / single) ** 2))
+    frames = smallest_integer(lambda n: after(n) >= snr, max(near - 2, 0), near + 1)
     x = replace(frame, n_frames=frames)
     here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
     reached, less = after(frames), after(frames - 1) if frames > 1 else 0.0

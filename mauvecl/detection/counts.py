@@ -223,10 +223,10 @@ class Tally:
     def distribution(self, index: int) -> Distribution:
         """Return the distribution of a grid."""
         packed, start = self.packed[index], index * layout.BINS
-        mine = slice(*np.searchsorted(self.fine.keys, (start, start + layout.BINS)))
+        mine, (first, second) = slice(*np.searchsorted(self.fine.keys, (start, start + layout.BINS))), self.sums[index]
         return Distribution(
             float(packed["centre"]), 1.0 / float(packed["steps_per_unit"]), self.fine.keys[mine] - start,
-            self.fine.counts[mine].copy(), *map(int, self.sums[index]), n=self.n, far=self.far[index],
+            self.fine.counts[mine].copy(), int(first), int(second), self.n, self.far[index],
         )  # fmt: skip
 
 
