@@ -252,11 +252,11 @@ def _messages(answer: DetectAnswer, prepared: Sequence[Case], campaigns: Sequenc
     messages += collect_messages([x for case in prepared for x in case.expectations], study.processes)
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
-        text = (
+        messages.append(Message(
             f"Thresholds at a false-alarm probability of {run.fap:g} come from importance sampling, right to "
-            f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than 100 beyond them."
-        )
-        messages.append(Message(text, "sampled"))
+            f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than 100 beyond them.",
+            "sampled",
+        ))  # fmt: skip
     messages += campaigns
     messages += _statistic_lines(prepared, answer.stars)
     # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.

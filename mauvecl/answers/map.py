@@ -180,23 +180,21 @@ def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
     missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
     for statistic, there in zip(run.statistics, missing, strict=True):
         if there.any():
-            text = (
+            messages.append(Message(
                 f"NO THRESHOLD: in {there.sum()} of {there.size} cells no threshold of {statistic} has a false-alarm "
                 f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
-                "number there; `mauvecl detect` names the probabilities that thresholds have."
-            )
-            messages.append(Message(text, "no threshold"))
+                "number there; `mauvecl detect` names the probabilities that thresholds have.", "no threshold",
+            ))  # fmt: skip
     for why, number in cells.failed.items():
         messages.append(Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer"))
     how = "" if study.nuisances.none else "marginalised over unknowns, "
     lowered = Counter(statistic for statistic, *_ in cells.lowered)
-    for statistic in run.statistics:
-        if lowered[statistic]:
-            text = (
-                f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} "
-                "cells, and only higher values are alarms: its detection probability says nothing of the flare there."
-            )
-            messages.append(Message(text, "wrong sign"))
+    for statistic in (name for name in run.statistics if lowered[name]):
+        messages.append(Message(
+            f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} cells, "
+            "and only higher values are alarms: its detection probability says nothing of the flare there.",
+            "wrong sign",
+        ))  # fmt: skip
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
     # What unknowns cost in the middle of the map.
     middle = cells.x[len(cells.x) // 2], cells.y[len(cells.y) // 2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -396,8 +397,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         """
         null = self.distribution(statistic, template=template)
         above, n = null.above(threshold), null.n
-        low, high = clopper_pearson(int(np.floor(above)), n).low, clopper_pearson(int(np.ceil(above)), n).high
-        return Interval(above / n, low, high)
+        return Interval(above / n, clopper_pearson(int(above), n).low, clopper_pearson(math.ceil(above), n).high)
 
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
         """Return the fraction of realisations at or above the threshold for each flare.
@@ -405,19 +405,16 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         The interval has 95 % coverage for the probability above the true threshold; see `detection_interval`. The
         values are NaN for `blinding` flares, and if no threshold has the false-alarm probability (`without_threshold`).
         """
-        probabilities = []
+        probabilities = [UNDEFINED] * len(self.flares)
         for flare in range(len(self.flares)):
             cut = UNDEFINED if flare in self.blinding else self._threshold_if_any(fap, statistic, flare)
-            if cut is UNDEFINED:
-                probabilities.append(UNDEFINED)
-                continue
-            counted = self._at((statistic, "flare_on_null_grid", flare))
-            above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
-            shared = 0.0
-            if countable(fap, self.realisations) and counted.std > 0:
-                # A flare only adds uncorrelated noise; tilted draws are independent of the flare's.
-                shared = min(self.distribution(statistic, template=flare).std / counted.std, 1.0)
-            probabilities.append(detection_interval(above, counted.n, fap, shared))
+            if cut is not UNDEFINED:
+                counted, shared = self._at((statistic, "flare_on_null_grid", flare)), 0.0
+                above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
+                if countable(fap, self.realisations) and counted.std > 0:
+                    # A flare only adds uncorrelated noise; tilted draws are independent of the flare's.
+                    shared = min(self.distribution(statistic, template=flare).std / counted.std, 1.0)
+                probabilities[flare] = detection_interval(above, counted.n, fap, shared)
         return probabilities
 
     def without_threshold(self, fap: float) -> tuple[Message, ...]:

@@ -359,17 +359,15 @@ class Gaussian:
     third: ClassVar[float] = 0.0
 
     def sf(self, value: float) -> float:
-        """Return the probability of exceeding `value`."""
         return float(special.ndtr((self.mean - value) / self.std))
 
     def isf(self, probability: float) -> float:
-        """Return the value that is exceeded with a probability in (0, 1)."""
         return float(self.mean - self.std * special.ndtri(probability))
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """A mixture of distributions, for statistics whose noise depends on drawn factors."""
+    """A mixture of distributions with the interface of `QuadraticForm`, for noise that depends on drawn factors."""
 
     parts: tuple[QuadraticForm | Gaussian, ...]
     weights: Float  # probability of each part, shape (n,)
@@ -384,13 +382,11 @@ class Mixture:
 
     @cached_property
     def third(self) -> float:
-        """Third central moment."""
         away = [part.mean - self.mean for part in self.parts]
         each = [part.third + 3.0 * d * part.std**2 + d**3 for part, d in zip(self.parts, away, strict=True)]
         return float(self.weights @ each)
 
     def sf(self, value: float) -> float:
-        """Return the probability of exceeding `value`."""
         if self._normal is not None:
             mean, std = self._normal
             return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
@@ -413,7 +409,6 @@ class Mixture:
         return np.array([(part.mean, part.std) for part in self.parts]).T
 
     def isf(self, probability: float) -> float:
-        """Return the value that is exceeded with a probability in (0, 1)."""
         from scipy.optimize import brentq
 
         @cache

@@ -54,7 +54,7 @@ class Nuisances(ContentEquality):
                 raise InputError(
                     f"the standard deviation of the unknown {name!r} must be above 0 or 'free', not {sd:g}", key="sd"
                 )
-        for name, expected in (("of_flare", np.shape(self.spectra)), ("mean", np.shape(self.sd))):
+        for name, expected in zip(("of_flare", "mean"), shapes, strict=True):
             given = getattr(self, name)
             values = np.asarray(given, np.float64) if np.size(given) else np.zeros(expected)
             if values.shape != expected or not np.isfinite(values).all():
