@@ -48,10 +48,7 @@ class Cost:
 def unknown_cost(
     of: str, quiet: Expectation, flare: Expectation, nuisances: NuisanceChoice, comparison: Comparison
 ) -> Cost:
-    """Return the S/N of a flare with and without unknowns, or with the documented ones if none are given.
-
-    `of` names star and flare.
-    """
+    """Return the S/N of a flare, named by `of`, with and without unknowns, or the documented ones if none are given."""
     chosen, used, matched = NuisanceChoice() if nuisances.none else nuisances, ~quiet.saturated, Matched()
     unknown = chosen.marginalised(quiet)
     plain = Setting(quiet, used, comparison)

@@ -101,10 +101,7 @@ class Sizes:
 
 
 def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> Float:
-    """Return the sizes of injected flares, ascending; by default around a completeness of one half.
-
-    `unit_snr` and `threshold` are those of the star's survey.
-    """
+    """Return the sizes of injected flares, ascending; by default around a completeness of one half in the survey."""
     asked = case.study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
     frames = widths / case.instrument.frame_s

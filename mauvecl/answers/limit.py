@@ -52,7 +52,6 @@ if TYPE_CHECKING:
 
     from mauvecl.host.exposure.expectation import Expectation
 
-
 #: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
 SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (0.0, 1e6)}
 #: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
@@ -128,10 +127,7 @@ class LimitSearch:
         return statistic.detection_forms(setting, flare, self.fap).probability
 
     def simulated(self, value: float, seed: int) -> Interval:
-        """Simulate the detection probability, report the number of simulations, and return it with its interval.
-
-        Each draw of unknown values has its own reference and threshold.
-        """
+        """Simulate the detection probability; each draw of unknown values has its own reference and threshold."""
         if self.draws:
             each = [draw.simulated(value, seed) for draw in self.draws]
             probability = Interval(*map(float, forms.average(*np.array([(p.value, p.low, p.high) for p in each]).T)))
@@ -230,10 +226,7 @@ class LimitSearch:
 
 
 def settle(question: LimitSearch, start: float) -> Interval:
-    """Return the value at which the simulation reaches the power, with its interval, searched from a start near it.
-
-    Raises InputError if the probability does not rise there, or the search does not settle.
-    """
+    """Return the value at which the simulation reaches the power, with its interval, searched from a start near it."""
     try:
         return (_settle_frames if question.of == "exposure" else _settle)(question, start)
     except InputError as error:
@@ -546,8 +539,7 @@ class LimitAnswer(Answer):
 def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None]) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
-    Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
-    crossed in the searched range, or too few realisations lie beyond the threshold. Calls `report` with the number of
+    Averages over draws of unknown instrument values if the study has some. Calls `report` with the number of
     simulations after each of them.
     """
     study = case.study

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
-from itertools import chain, product
+from itertools import product
 from typing import TYPE_CHECKING, Literal, Self, TypedDict
 
 import numpy as np
@@ -105,8 +105,9 @@ class Cumulants:
             bounds.append(of_light + of_dark)
         return bounds
 
-    def scaled(self, light: float | Float, dark: float) -> Cumulants:
-        """Return the cumulants with light and dark multiplied by factors."""
+    def scaled(self, x: Expectation, on_light: float, dark: float, sky: float) -> Cumulants:
+        """Return the cumulants with factors on all light, on the dark and on the sky of the scenario."""
+        light = on_light if sky == 1.0 else factor_on_light(on_light, sky, x)
         gaussian_light = np.where(self.photon_step > 0, 0.0, self.light_variance)
         return replace(
             self, mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
@@ -350,8 +351,8 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
     frames = _draw_frames(scenarios, drawing, factors, corners)
     each = 1 if frames else quiet.n_frames
     cumulants = [Cumulants.of(x, each) for x in scenarios]
-    varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
-    joint = _joint(scenarios, varied, drawing.recipe)
+    varied = [(x, c.scaled(x, *at)) for (x, c), at in product(zip(scenarios, cumulants, strict=True), corners)]
+    joint = _joint(varied, drawing.recipe)
     if modulations and not joint:
         raise InputError(
             f"the noise of {quiet.name} must be drawn jointly if {modulations[0][0]} varies within a run: it needs "
@@ -360,7 +361,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
         )
     quartic = joint and any(
         is_noticeable(truncation_distance(c.over_sd(), fourth_power=False, varying=bool(modulations)), c.variance).any()
-        for c in chain(*varied)
+        for _, c in varied
     )
     return DrawMethod(factors, frames, joint, quartic, not joint and quiet.photon_noise == "poisson", each, cumulants)
 
@@ -384,16 +385,11 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     return low | high
 
 
-def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
-    light, dark, sky = corner
-    return c.scaled(light if sky == 1.0 else factor_on_light(light, sky, x), dark)
-
-
-def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
+def _joint(varied: Sequence[tuple[Expectation, Cumulants]], recipe: Recipe) -> bool:
     """Return whether each pixel's noise can be drawn from one normal for all factors on light and dark."""
     if recipe == "apart":
         return False
-    for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
+    for x, c in varied:
         exact = joint_is_exact(c)
         if exact.all():
             continue
@@ -417,7 +413,7 @@ def _draw_frames(
     for x in scenarios:
         near = near_rail(x, factors, drawing.processes)
         # The approximation of rounding as noise is worst for the least light and dark.
-        coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
+        coarse = ~stack_is_exact(Cumulants.of(x, 1).scaled(x, *corners[0]), x)
         for pixels, why in (
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
             (coarse, "treats rounding as noise, and a frame has too little noise for that"),

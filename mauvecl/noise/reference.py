@@ -340,8 +340,7 @@ def pointing_drifts(
 ) -> tuple[Float, Float, Float]:
     """Draw start, duration and depth of the drifts of stares up to a time, shape (n_stare, n_drift) each.
 
-    Each stare depends only on the seed and its number. Drifts are in order of time, and the last one of each stare
-    begins at `end_s` or later.
+    Drifts are in order of time, and the last one of each stare begins at `end_s` or later.
     """
     parts: list[tuple[Float, Float, Float]] = []
     begin = np.zeros((len(numbers), 1))
