@@ -122,7 +122,9 @@ class Chi2(Statistic):
 
     def _per_pixel(self, setting: Setting, values: Float) -> Float:
         """Convert values per squared term to values per pixel."""
-        return values[..., np.unique(setting.quiet.element, return_inverse=True)[1]] if self.by_element else values
+        if not self.by_element:
+            return values
+        return np.asarray(values[..., np.unique(setting.quiet.element, return_inverse=True)[1]])
 
     def _spectra(self, setting: Setting) -> Float:
         """Return the nuisance spectra per squared term."""

@@ -329,8 +329,8 @@ def _block(
         # The variances that an observer estimates of both exposures.
         known = scene.estimates[0, : scene.n_pixel]
         nets = (one - scene.fraction[0, : scene.n_pixel] + known["net_offset"] for one in (excess, mean))
-        observed, reference = (np.maximum(net, 0.0) * known["gain"] + known["variance"] for net in nets)
-        variance = observed + added * reference
+        own, other = (np.maximum(net, 0.0) * known["gain"] + known["variance"] for net in nets)
+        variance = own + added * other
     shape = hypotheses.shape(statistic, template)
     return kind.values(hypotheses.setting, excess - mean, variance, shape), logs
 
