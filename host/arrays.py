@@ -15,6 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+#: Arrays of doubles and of truth values.
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 

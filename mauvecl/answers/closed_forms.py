@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.detection.distributions import CONFIDENCE_SD, Gaussian, Interval
-from mauvecl.detection.names import MIN_IN_TAIL
+from mauvecl.detection import MIN_IN_TAIL
+from mauvecl.detection.distributions import CONFIDENCE_SD
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, ThroughputMode, values_of
+from mauvecl.host.arrays import Float
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, values_of
 from mauvecl.schema.columns import Column, First, chance_text, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
@@ -48,10 +48,7 @@ class Cost:
 def unknown_cost(
     of: str, quiet: Expectation, flare: Expectation, nuisances: NuisanceChoice, comparison: Comparison
 ) -> Cost:
-    """Return the S/N of a flare with and without unknowns, or with the documented ones if none are given.
-
-    `of` names star and flare.
-    """
+    """Return the S/N of a flare, named by `of`, with and without unknowns, or the documented ones if none are given."""
     chosen, used, matched = NuisanceChoice() if nuisances.none else nuisances, ~quiet.saturated, Matched()
     unknown = chosen.marginalised(quiet)
     plain = Setting(quiet, used, comparison)
@@ -73,34 +70,29 @@ def unknown_cost(
     return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
 
 
-def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
-    """Return a sentence on the faintest flare, or none if no flare has a signal."""
+def unknown_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
+    """Return sentences on what is marginalised over, if anything, and on the faintest flare, if any has a signal."""
+    lines, which = list[str](), f"the usual unknowns ({spoken(NuisanceChoice())})"
+    if not nuisances.none:
+        which = spoken(nuisances)
+        texts = "; ".join(PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES)
+        lines.append(f"Statistics are marginalised over {which}{f'; drawn: {texts}' if nuisances.usual else ''}.")
     shown = [cost for cost in costs if cost.known > 0]
-    if not shown:
-        return []
-    faintest = min(shown, key=lambda cost: cost.known)
-    which = spoken(nuisances) if not nuisances.none else f"the usual unknowns ({spoken(NuisanceChoice())})"
-    others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
-    return [Message(
-        f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
-        f"with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} marginalised "
-        "(closed forms).", "cost of unknowns",
-    )]  # fmt: skip
-
-
-def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
-    """Return a sentence on what statistics are marginalised over and which unknowns are drawn, or none."""
-    if nuisances.none:
-        return []
-    texts = "; ".join(PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES)
-    drawn = f"; drawn: {texts}" if nuisances.usual else ""
-    return [f"Statistics are marginalised over {spoken(nuisances)}{drawn}."]
+    if shown:
+        faintest = min(shown, key=lambda cost: cost.known)
+        others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
+        lines.append(Message(
+            f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything "
+            f"known; with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} "
+            "marginalised (closed forms).", "cost of unknowns",
+        ))  # fmt: skip
+    return lines
 
 
 def spoken(choice: NuisanceChoice) -> str:
     """Return the unknowns as text, such as "the dark level (+-0.5 deg C) and the light level (free)"."""
     documented = DOCUMENTED_NUISANCES if choice.usual else ()
-    sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if row.prior is not None}
+    sd: dict[str, float | str] = {row.name: row.sd for row in documented if row.sd is not None}
     sd |= choice.spreads()
     sizes = [f"{NUISANCES[name].label} ({_size(value, NUISANCES[name].unit)})" for name, value in sd.items()]
     return join_names(sizes + [f"{name!r} ({_size(spectrum.sd, '')})" for name, spectrum in choice.own.items()])
@@ -117,9 +109,7 @@ IDEAL = Column("ideal", "", "", "detection probability if everything but the noi
                "ideal", number(".4f"))  # fmt: skip
 
 
-def ideal_chances(
-    case: Case, flares: Sequence[Expectation], statistics: Sequence[Statistic]
-) -> NDArray[np.float64] | None:
+def ideal_chances(case: Case, flares: Sequence[Expectation], statistics: Sequence[Statistic]) -> Float | None:
     """Return the closed-form chances of flares if everything but the noise is known, or None if it is.
 
     Their shape is (n_flare, n_statistic), and they are NaN where the star or the flare saturates every pixel.
@@ -174,8 +164,6 @@ def _chance(setting: Setting, statistic: Statistic, flare: Expectation, fap: flo
     return statistic.detection_forms(setting, flare, fap).probability
 
 
-Float = NDArray[np.float64]
-
 #: Name of the variance that no unknown explains linearly.
 REST = "the rest"
 
@@ -217,7 +205,7 @@ def drawn(study: Study) -> DrawnStudies:
             change = rows[name].changes(at, float(value))
             changes |= change
             # The next mode is added to those before it.
-            at = at.model_copy(update=change) if isinstance(rows[name], ThroughputMode) else at
+            at = at if rows[name].mode is None else at.model_copy(update=change)
         try:
             nominal.with_(**changes)
         except InputError as error:
@@ -233,28 +221,26 @@ def throughput_cases(case: Case) -> list[Case]:
     the wavelengths are not known well enough for that.
     """
     moved, pixels = [], case.instrument.read_pixels
-    for mode in values_of(case.instrument).values():
-        if isinstance(mode, ThroughputMode):
-            signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
-            same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
-            if same is None:
-                why = "an error of the calibrated wavelengths changes the pixels of the output range"
-                raise InputError(f"{why}, which must end further from a pixel", key="observation.instrument")
-            moved.append(same)
+    for mode in (row for row in values_of(case.instrument).values() if row.mode is not None):
+        signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
+        same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
+        if same is None:
+            why = "an error of the calibrated wavelengths changes the pixels of the output range"
+            raise InputError(f"{why}, which must end further from a pixel", key="observation.instrument")
+        moved.append(same)
     return moved
 
 
-def average(intervals: Sequence[Interval]) -> Interval:
+def average(values: Float, low: Float, high: Float) -> tuple[Float, Float, Float]:
     """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
 
-    The interval assumes independent draws and is therefore conservative for a Latin hypercube.
+    The arguments have the shape (n_draw, ...). The interval assumes independent draws and is therefore conservative for
+    a Latin hypercube.
     """
-    values = np.array([p.value for p in intervals])
-    own = np.array([p.high - p.low for p in intervals]) / 2
-    spread = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
-    half = float(np.hypot(CONFIDENCE_SD * spread, np.sqrt(np.sum(own**2)) / values.size))
-    mean = float(values.mean())
-    return Interval(mean, max(mean - half, 0.0), min(mean + half, 1.0))
+    n, mean = len(values), values.mean(axis=0)
+    spread = values.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else 0.0
+    half = np.hypot(CONFIDENCE_SD * spread, np.sqrt(np.sum(((high - low) / 2) ** 2, axis=0)) / n)
+    return mean, np.maximum(mean - half, 0.0), np.minimum(mean + half, 1.0)
 
 
 def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
@@ -303,10 +289,6 @@ class InterpolatedForm:
 
     def __init__(self, form: Form) -> None:
         self.mean, self.std = form.mean, form.std
-        if isinstance(form, Gaussian):
-            self._probit: Any = lambda value: (form.mean - value) / form.std
-            self._inverse: Any = lambda probit: form.mean + form.std * probit
-            return
         at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
         beyond = np.array([form.sf(value) for value in at])
         # Probabilities that round to 0 or 1 have no finite probit.
@@ -314,10 +296,10 @@ class InterpolatedForm:
         self._probit = PchipInterpolator(at[inside], special.ndtri(beyond[inside]), extrapolate=True)
         self._inverse = PchipInterpolator(-special.ndtri(beyond[inside]), at[inside], extrapolate=True)
 
-    def sf(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sf(self, value: Float) -> Float:
         """Return the probabilities of exceeding values."""
         return np.asarray(special.ndtr(self._probit(value)))
 
-    def isf(self, probability: NDArray[np.float64]) -> NDArray[np.float64]:
+    def isf(self, probability: Float) -> Float:
         """Return the values that are exceeded with given probabilities."""
         return np.asarray(self._inverse(-special.ndtri(probability)))

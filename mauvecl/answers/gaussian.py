@@ -12,7 +12,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.answers.answer import Answer, TableOf
@@ -21,6 +20,7 @@ from mauvecl.answers.signal import SnrAnswer, snr
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.counts import steps_of
 from mauvecl.device.engine import Engine
+from mauvecl.host.arrays import Float
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.columns import Column, number, table_of
 from mauvecl.study.observation import Observation
@@ -72,7 +72,7 @@ WORST_COLUMNS = (
 )  # fmt: skip
 
 
-def coverage(result: SnrResult) -> NDArray[np.float64]:
+def coverage(result: SnrResult) -> Float:
     """Return the coverage of intervals of one estimated standard deviation about the observed signal, for each pixel.
 
     The standard deviation is estimated from the observed photons and the known dark and read noise. Values are
@@ -96,7 +96,7 @@ def coverage(result: SnrResult) -> NDArray[np.float64]:
     return shares
 
 
-def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
+def beyond(x: Expectation, sigmas: float) -> Float:
     """Return the probability that a pixel is more than `sigmas` standard deviations above or (negative) below its mean.
 
     By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
@@ -106,7 +106,7 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
     photons = np.where(c.photon_step > 0, c.photons, 0.0)
     parts = ((c.photon_step, photons), (c.dark_step, c.dark_dn / c.dark_step))
 
-    def cumulants(u: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    def cumulants(u: Float) -> tuple[Float, ...]:
         """Return the cumulant generating function of the deviation and its first two derivatives at u."""
         value, first, second = c.gaussian * u**2 / 2, c.gaussian * u, c.gaussian.copy()
         for step, mean in parts:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_columns
 from mauvecl.answers.verbs import Progress, by_keywords
@@ -18,6 +17,7 @@ from mauvecl.detection.distributions import Interval
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.shapes import shape_of
+from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
     Reduced = Callable[[StaresRequest], Arrays]
 
-Float = NDArray[np.float64]
 #: Default range of injected sizes, in units of the size with a completeness of one half.
 DEFAULT_RANGE = (0.3, 3.0)
 
@@ -102,10 +101,7 @@ class Sizes:
 
 
 def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> Float:
-    """Return the sizes of injected flares, ascending; by default around a completeness of one half.
-
-    `unit_snr` and `threshold` are those of the star's survey.
-    """
+    """Return the sizes of injected flares, ascending; by default around a completeness of one half in the survey."""
     asked = case.study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
     frames = widths / case.instrument.frame_s
@@ -399,9 +395,5 @@ def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any
     with np.errstate(divide="ignore"):
         ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / days for x in (p, p - reach, p + reach)]
         asked = float(-np.log(none) / days)
-    return found | {
-        "simulated": Interval(*(float(x) for x in ends)),
-        "asked": asked,
-        "alarmed": int(np.sum(maxima >= threshold.value)),
-        "expected": float(n * -np.expm1(-choice.rate * days)),
-    }
+    expected, alarmed = float(n * -np.expm1(-choice.rate * days)), int(np.sum(maxima >= threshold.value))
+    return found | {"simulated": Interval(*map(float, ends)), "asked": asked, "alarmed": alarmed, "expected": expected}

@@ -1,37 +1,44 @@
-"""Limits: smallest amplitudes, faintest stars and shortest exposures, and what moves them."""
+"""Limits: smallest amplitudes, faintest stars and shortest exposures, and what moves them.
+
+A limit is the value at which a detection probability crosses a power: the root of the closed form, then simulations.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from itertools import product
+from functools import cache, cached_property
+from itertools import pairwise, product
 from operator import itemgetter
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy import special
 
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_columns
-from mauvecl.answers.limit_search import LimitSearch, Point, settle
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.detection.distributions import Interval
-from mauvecl.detection.names import RECOMMENDED, check_fap
+from mauvecl.detection import RECOMMENDED, check_fap
+from mauvecl.detection.distributions import Interval, smallest_integer
+from mauvecl.detection.requests import STATISTICS, check_shape, fall_between
+from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.device.engine import Engine
+from mauvecl.host.arrays import Float
 from mauvecl.noise.disturbances import Uniform
 from mauvecl.noise.unknowns import values_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, table_of
-from mauvecl.schema.errors import InputError, Message, of_kind
+from mauvecl.schema.errors import InputError, Message, of_kind, reworded
+from mauvecl.schema.physical import DAY_S
 from mauvecl.study.cases import (
     SATURATED,
     Case,
     amplitude_column,
     cases,
     collect_messages,
+    off_centre,
     star_column,
     star_label,
     worst_first,
@@ -44,6 +51,238 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.exposure.expectation import Expectation
+
+#: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
+SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (0.0, 1e6)}
+#: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
+MOST_EVALUATIONS = 8
+
+
+@dataclass(frozen=True)
+class Point:
+    """A simulated detection probability."""
+
+    value: float
+    probability: Interval
+    seed: int
+
+
+class LimitSearch:
+    """Detection probability of a case's first flare by one statistic, as a function of the limit's quantity.
+
+    It is the mean over other searches if there are any: those of draws of unknown instrument values.
+    """
+
+    def __init__(
+        self, case: Case, statistic: str, engine: Engine | Pool | None = None,
+        report: Callable[[int], None] = lambda count: None, draws: Sequence[LimitSearch] = (),
+    ) -> None:  # fmt: skip
+        # `report` is called with the number of simulations after each of them.
+        self.case, self.statistic, self.engine = case.with_value("amplitude", case.amplitudes[0]), statistic, engine
+        self.draws, self.frame_s = draws, case.instrument.frame_s
+        self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
+        self.points: list[Point] = []
+        self._report = report
+        self._base: tuple[float, Expectation, Expectation] | None = None
+
+    def easier(self, value: float, magnitudes: float) -> float:
+        """Return a value at which detection is easier, by some magnitudes or by the factor that they are."""
+        return value - magnitudes if self.of == "magnitude" else value * float(10 ** (0.4 * magnitudes))
+
+    def pair(self, value: float) -> tuple[Expectation, Expectation]:
+        """Return the expectations without and with the flare."""
+        if self.of == "exposure" and value > DAY_S:
+            # The sum of several exposures.
+            return self.scaled(value)
+        quiet, flare = self.case.with_value(self.of, value).expectations
+        return quiet, flare
+
+    def scaled(self, value: float) -> tuple[Expectation, Expectation]:
+        """Return `pair` by scaling one pair, since expectations are linear in light."""
+        if self._base is None:
+            at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
+            self._base = at, *self.pair(at)
+        at, quiet, flare = self._base
+        if self.of == "exposure":
+            frames = max(round(value / self.frame_s), 1)
+            return replace(quiet, n_frames=frames), replace(flare, n_frames=frames)
+        if self.of == "amplitude":
+            more = value / at * (flare.source_electrons - quiet.source_electrons)
+            return quiet, replace(flare, source_electrons=quiet.source_electrons + more)
+        fainter = 10 ** (-0.4 * (value - at))
+        quiet, flare = (replace(x, source_electrons=fainter * x.source_electrons) for x in (quiet, flare))
+        return quiet, flare
+
+    def theory(self, value: float) -> float:
+        """Return the detection probability for Gaussian noise; 0 if every pixel saturates."""
+        if self.draws:
+            return float(np.mean([draw.theory(value) for draw in self.draws]))
+        quiet, flare = self.scaled(value)
+        setting, statistic = self.case.setting(quiet, flare), STATISTICS[self.statistic]
+        if not setting.used.any():
+            return 0.0
+        statistic.check(setting)
+        if statistic.shaped and not flare.saturated[setting.used].all():
+            check_shape(quiet, flare, setting.used)
+        return statistic.detection_forms(setting, flare, self.fap).probability
+
+    def simulated(self, value: float, seed: int) -> Interval:
+        """Simulate the detection probability; each draw of unknown values has its own reference and threshold."""
+        if self.draws:
+            each = [draw.simulated(value, seed) for draw in self.draws]
+            probability = Interval(*map(float, forms.average(*np.array([(p.value, p.low, p.high) for p in each]).T)))
+        else:
+            assert self.engine is not None
+            quiet, flare = self.pair(value)
+            options = self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
+            detection = self.engine.detect(quiet, [flare], seed=seed, **options)
+            for message in detection.messages:
+                fault = f"{message.rstrip('.')}; some pixel must not be saturated at a limit"
+                raise InputError(f"at a {self.of} of {value:g}: {fault}", key="limit.of")
+            # Raises InputError where no threshold has the false-alarm probability.
+            detection.threshold(self.fap, self.statistic)
+            (probability,) = detection.detection_probability(self.fap, self.statistic)
+        self.points.append(Point(value, probability, seed))
+        self._report(len(self.points))
+        return probability
+
+    def curve(self, value: float) -> tuple[tuple[float, float], ...]:
+        """Return the closed form around a value; exposures are whole frames."""
+        values = [self.easier(value, step) for step in np.linspace(-0.75, 0.75, 25).tolist()]
+        if self.of == "exposure":
+            values = sorted({max(round(v / self.frame_s), 1) * self.frame_s for v in values})
+        return tuple((v, self.theory(v)) for v in values)
+
+    def root(self, near: float | None = None) -> float:
+        """Return the first value at which the closed form reaches the power, from the hardest or near one."""
+        from scipy.optimize import brentq
+
+        def crossing(*ends: float, **tolerance: Any) -> float:
+            return float(brentq(lambda v: self.theory(v) - self.power, min(ends), max(ends), **tolerance))
+
+        if near is not None and self.of != "exposure":
+            ends = [self.easier(near, step) for step in (-1.0, 1.0)]
+            if self.theory(ends[0]) < self.power <= self.theory(ends[1]):
+                return crossing(*ends, rtol=1e-5)
+        hardest, easiest = SEARCH[self.of]
+        first = hardest or self.frame_s
+        if self.of == "magnitude":
+            values = np.arange(first, easiest - 0.1, -0.5).tolist()
+        else:
+            values = (first * 2.0 ** np.arange(np.ceil(np.log2(easiest / first)) + 1)).tolist()
+        exceeds = self.theory(first) >= self.power
+        if exceeds and self.of == "exposure":
+            return first
+        if exceeds:
+            raise self._beyond(first, "already exceeds")
+        for before, value in pairwise(values):
+            if self.theory(value) < self.power:
+                continue
+            if self.of == "exposure":
+                # Whole frames: the closed form is a staircase.
+                few, many = (round(end / self.frame_s) for end in (before, value))
+                return self.frame_s * smallest_integer(lambda n: self.theory(n * self.frame_s) >= self.power, few, many)
+            return crossing(before, value, xtol=1e-6 * abs(value - before))
+        raise self._beyond(easiest, "does not reach")
+
+    def root_or_nan(self, near: float) -> float:
+        """Return the root near a value, or NaN if there is none."""
+        try:
+            return self.root(near=near)
+        except InputError:
+            return float("nan")
+
+    def _beyond(self, value: float, verb: str) -> InputError:
+        star, (low, high) = self.case.star, sorted(SEARCH[self.of])
+        name = str(star.library or star.file)
+        if self.of != "magnitude" and star.magnitude is not None:
+            name += f" {star.band} = {star.magnitude:g}"
+        flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.case.amplitudes[0]:.3g} %"
+        fault = (
+            f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at "
+            f"{self.of} = {value:g}; a limit must lie between {low:g} and {high:g}{self.clauses(value)}"
+        )
+        return InputError(fault, key="limit.of")
+
+    def clauses(self, value: float) -> str:
+        """Return the clauses of an error message on saturation, and on a weighted sum that the flare lowers."""
+        quiet, flare = self.scaled(value)
+        text = quiet.saturation_clause or flare.saturation_clause.replace(" saturate ", " saturate with the flare ")
+        setting, statistic = self.case.setting(quiet, flare), STATISTICS[self.statistic]
+        if not isinstance(statistic, LinearStatistic) or not setting.used.any() or flare.saturated[setting.used].all():
+            return text
+        shape = flare if statistic.shaped else None
+        falls = fall_between(*(statistic.closed_form(setting, x, shape) for x in (quiet, flare)))
+        if not falls:
+            return text
+        wrong = f"WRONG SIGN: there {self.statistic} falls by {falls:.3g} standard deviations with the flare"
+        return f"{text}; {wrong}, and only higher values are alarms"
+
+    def slope(self, value: float) -> float:
+        """Return the slope of the closed form's probit, per magnitude towards easier detection."""
+        chances = (self.theory(self.easier(value, step)) for step in (-0.02, 0.02))
+        below, above = (special.ndtri(np.clip(chance, 1e-9, 1 - 1e-9)) for chance in chances)
+        return float((above - below) / 0.04)
+
+
+def settle(question: LimitSearch, start: float) -> Interval:
+    """Return the value at which the simulation reaches the power, with its interval, searched from a start near it."""
+    try:
+        return (_settle_frames if question.of == "exposure" else _settle)(question, start)
+    except InputError as error:
+        outside = off_centre([question.pair(start)[0]], question.case.processes)
+        if outside:
+            raise reworded(error, "; ".join([str(error), *outside])) from error
+        raise
+
+
+def _settle(question: LimitSearch, start: float) -> Interval:
+    """Find the limit by Newton's steps in the probit, and its interval, with the slope of the closed form."""
+    of, seed = question.of, question.case.study.run.seed
+    slope, goal = question.slope(start), float(special.ndtri(question.power))
+    if not slope > 0:
+        fault = f"the detection probability must rise towards an easier {of}, but does not at {start:g}"
+        raise InputError(f"{fault}{question.clauses(start)}", key="limit.of")
+    at, n = start, question.case.study.run.realisations
+    for _ in range(MOST_EVALUATIONS):
+        p = question.simulated(at, seed)
+        clipped = (min(max(q, 0.5 / n), 1 - 0.5 / n) for q in (p.value, p.low, p.high))
+        here, low, high = (float(special.ndtri(q)) for q in clipped)
+        move = (goal - here) / slope
+        # Half the interval's width away the slope's own error no longer counts.
+        if abs(goal - here) <= max(0.5 * (high - low), 0.02):
+            ends = [question.easier(at, (goal - q) / slope) for q in (low, high)]
+            return Interval(question.easier(at, move), min(ends), max(ends))
+        at = question.easier(at, float(np.clip(move, -0.75, 0.75)))
+    fault = f"the limit of {of} must settle within {MOST_EVALUATIONS} simulations, but did not near {at:g}"
+    raise InputError(f"{fault}{question.clauses(at)}", key="limit.of")
+
+
+def _settle_frames(question: LimitSearch, start: float) -> Interval:
+    """Find the fewest frames that reach the power, by the probability and by either end of its interval."""
+    seed, frame_s = question.case.study.run.seed, question.frame_s
+
+    @cache
+    def at(frames: int) -> Interval:
+        return question.simulated(frames * frame_s, seed)
+
+    def fewest(which: str) -> int:
+        """Return the fewest frames that reach the power, by doubling steps and then bisection."""
+
+        def reaches(frames: int) -> bool:
+            return frames > 0 and getattr(at(frames), which) >= question.power
+
+        many = max(round(start / frame_s), 1)
+        few, step = many - 1, 1
+        while not reaches(many):
+            few, many, step = many, many + step, 2 * step
+        step = 1
+        while reaches(few):
+            few, many, step = max(few - step, 0), few, 2 * step
+        return smallest_integer(reaches, few, many)
+
+    value, low, high = (fewest(which) * frame_s for which in ("value", "high", "low"))
+    return Interval(value, low, high)
 
 
 @validated
@@ -121,7 +360,7 @@ class UnknownEffect:
     """Effect of unknown instrument values on a limit."""
 
     draws: forms.DrawnStudies
-    limits: NDArray[np.float64]  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
+    limits: Float  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
     shares: dict[str, float]  # share of the limits' variance that each unknown explains, largest first
 
     @property
@@ -294,15 +533,13 @@ class LimitAnswer(Answer):
         stars = worst_first([*at_limits, *collect_messages(self.inputs, self.study.processes)])
         costs = [limit.cost for limit in self.limits]
         failed = [Message(f"NO LIMIT: {text}.", "no limit") for text in self.failed]
-        unknown = [*forms.marginal_lines(self.study.nuisances), *forms.cost_lines(costs, self.study.nuisances)]
-        return [*failed, *stars, *unknown]
+        return [*failed, *stars, *forms.unknown_lines(costs, self.study.nuisances)]
 
 
 def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None]) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
-    Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
-    crossed in the searched range, or too few realisations lie beyond the threshold. Calls `report` with the number of
+    Averages over draws of unknown instrument values if the study has some. Calls `report` with the number of
     simulations after each of them.
     """
     study = case.study
@@ -356,15 +593,14 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
                 progress(sum(steps), STEPS * len(asked))
 
     def solved(number: int) -> Limit | InputError:
-        outcome: Limit | InputError
         try:
             # At least one more simulation follows each, until the limit is found.
-            outcome = solve(*asked[number], engine, lambda count: report(number, STEPS * count // (count + 1)))
+            return solve(*asked[number], engine, lambda count: report(number, STEPS * count // (count + 1)))
         except InputError as error:
             # The limits of other stars are still computed.
-            outcome = error
-        report(number, STEPS)
-        return outcome
+            return error
+        finally:
+            report(number, STEPS)
 
     outcomes = list(map_in_order(engine, solved, range(len(asked))))
     errors = [outcome for outcome in outcomes if isinstance(outcome, InputError)]

@@ -9,21 +9,19 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf
-from mauvecl.answers.limit_search import SEARCH, LimitSearch
+from mauvecl.answers.limit import SEARCH, LimitSearch
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.detection.distributions import Interval
-from mauvecl.detection.names import RECOMMENDED, check_fap
+from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
+from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
-    Case,
     assumptions_of,
     cases,
     collect_messages,
@@ -36,6 +34,7 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.cases import Case
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")
@@ -50,7 +49,7 @@ COLUMNS = (
     *interval_columns("{}", of="its 95 % interval, with the threshold's own"),
     Column("closed_form", description="the same for Gaussian noise"),
 )
-#: Arrays of the answer: chances, those with everything known, and both ends of the interval.
+#: Arrays of the answer: chances and both ends of their interval, those of the closed form, and with everything known.
 NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
 
 
@@ -76,19 +75,16 @@ class MapAnswer(Answer):
 
     study: Study
     star: str
-    # x, y: values of both axes.
-    x: tuple[float | str, ...]
-    y: tuple[float | str, ...]
+    x: tuple[float | str, ...]  # values of the horizontal axis
+    y: tuple[float | str, ...]  # values of the vertical axis
     statistics: tuple[str, ...]
-    probability: NDArray[np.float64]  # detection probability
-    # low, high: its 95 % interval, with that of the threshold.
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    closed_form: NDArray[np.float64]  # probability for Gaussian noise
-    ideal: NDArray[np.float64]  # the same if everything but the noise were known; NaN if it is
+    probability: Float  # detection probability
+    low: Float  # lower end of its 95 % interval, with that of the threshold
+    high: Float
+    closed_form: Float  # probability for Gaussian noise
+    ideal: Float  # the same if everything but the noise were known; NaN if it is
     messages: list[str]
-    # For maps averaged over unknowns, by statistic: the share of the variance of the mean probability that each unknown
-    # explains, largest first.
+    # For maps averaged over unknowns: shares of the variance of the mean probability by unknown, for each statistic.
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
     inputs: tuple[Expectation, ...] = ()  # the star without a flare in the first cell
 
@@ -160,10 +156,12 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     maps = [cells.map_of(draw) for draw in draws]
     values, parts = maps[0], {}
     if unknown is not None:
-        values = _averaged(maps)
+        # Means over the draws; NaN if a draw has none.
+        every = {name: np.array([one[name] for one in maps]) for name in NUMBERS}
+        ends = dict(zip(NUMBERS[:3], forms.average(*(every[name] for name in NUMBERS[:3])), strict=True))
+        values = {name: each.mean(axis=0) for name, each in every.items()} | ends
         for s, statistic in enumerate(study.run.statistics):
-            means = [float(np.nanmean(drawn_map["probability"][s])) for drawn_map in maps]
-            parts[statistic] = forms.shares(unknown, np.array(means))
+            parts[statistic] = forms.shares(unknown, np.nanmean(every["probability"][:, s], axis=(1, 2)))
     quiet, star, names = cells.quiet[0], study.star[0], {x.quantity, y.quantity}
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
@@ -182,31 +180,29 @@ def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
     missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
     for statistic, there in zip(run.statistics, missing, strict=True):
         if there.any():
-            text = (
+            messages.append(Message(
                 f"NO THRESHOLD: in {there.sum()} of {there.size} cells no threshold of {statistic} has a false-alarm "
                 f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
-                "number there; `mauvecl detect` names the probabilities that thresholds have."
-            )
-            messages.append(Message(text, "no threshold"))
+                "number there; `mauvecl detect` names the probabilities that thresholds have.", "no threshold",
+            ))  # fmt: skip
     for why, number in cells.failed.items():
         messages.append(Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer"))
     how = "" if study.nuisances.none else "marginalised over unknowns, "
     lowered = Counter(statistic for statistic, *_ in cells.lowered)
-    for statistic in run.statistics:
-        if lowered[statistic]:
-            text = (
-                f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} "
-                "cells, and only higher values are alarms: its detection probability says nothing of the flare there."
-            )
-            messages.append(Message(text, "wrong sign"))
+    for statistic in (name for name in run.statistics if lowered[name]):
+        messages.append(Message(
+            f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} cells, "
+            "and only higher values are alarms: its detection probability says nothing of the flare there.",
+            "wrong sign",
+        ))  # fmt: skip
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
     # What unknowns cost in the middle of the map.
     middle = cells.x[len(cells.x) // 2], cells.y[len(cells.y) // 2]
     there, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
     at = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
-    name, comparison = f"the cell of {at}", study.run.comparison()
-    cost = forms.unknown_cost(name, there.quiet, there.flares[0], study.nuisances, comparison)
-    return [*messages, *forms.marginal_lines(study.nuisances), *forms.cost_lines([cost], study.nuisances)]
+    comparison = study.run.comparison()
+    cost = forms.unknown_cost(f"the cell of {at}", there.quiet, there.flares[0], study.nuisances, comparison)
+    return [*messages, *forms.unknown_lines([cost], study.nuisances)]
 
 
 def magnitudes_of(case: Case) -> Axis:
@@ -249,7 +245,7 @@ def _shown(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
-Arrays = dict[str, NDArray[np.float64]]
+Arrays = dict[str, Float]
 
 
 @dataclass(eq=False)
@@ -314,17 +310,6 @@ class Cells:
                     values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
                 if result.fall(statistic, k):
                     self.lowered.add((statistic, i, j))
-
-
-def _averaged(maps: list[Arrays]) -> Arrays:
-    """Return the mean over draws of the unknown, with its interval; NaN if a draw has none."""
-    values = {name: np.mean([cells[name] for cells in maps], axis=0) for name in NUMBERS}
-    values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
-    for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
-        of_draws = [tuple(float(cells[name][at]) for name in ("probability", "low", "high")) for cells in maps]
-        p = forms.average([Interval(*ends) for ends in of_draws])
-        values["low"][at], values["high"][at] = p.low, p.high
-    return values
 
 
 def _cell(case: Case, x: float | str, y: float | str) -> Case:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
 from mauvecl.answers.verbs import Progress, by_keywords
+from mauvecl.detection.distributions import smallest_integer
 from mauvecl.detection.snr import COLUMNS
 from mauvecl.device.engine import Engine
 from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
@@ -139,17 +140,9 @@ def exposure(study: Study, engine: Engine | Pool | None = None, progress: Progre
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: Wavelength | None = None, *, per: Per | None = None
 ) -> ExposureAnswer:
-    """Compute `exposure` for another S/N or wavelength than the study's.
+    """Compute `exposure` for another S/N or wavelength (nm or Quantity) than those of the study's ``signal``.
 
-    Parameters
-    ----------
-    study : Study
-        Its exposure is not used.
-    snr : float, optional
-    wavelength_nm : Quantity, or float in nm, optional
-        In place of those of the study's ``signal``.
-    per : {"element", "pixel"}, optional
-        A resolution element of 10.5 nm, or one pixel.
+    `per` is "element", a resolution element of 10.5 nm, or "pixel".
     """
     study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
     return exposure(study)
@@ -173,11 +166,8 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
         )
         raise InputError(fault, key="signal.snr")
     # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.
-    frames = max(int(np.ceil((snr / single) ** 2)), 1)
-    while frames > 1 and after(frames - 1) >= snr:
-        frames -= 1
-    while after(frames) < snr:
-        frames += 1
+    near = int(np.ceil((snr / single) ** 2))
+    frames = smallest_integer(lambda n: after(n) >= snr, max(near - 2, 0), near + 1)
     x = replace(frame, n_frames=frames)
     here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
     reached, less = after(frames), after(frames - 1) if frames > 1 else 0.0
@@ -266,14 +256,8 @@ def simulate(
 ) -> SimulateAnswer:  # fmt: skip
     """Simulate one observation of every star of a study, by component.
 
-    The NumPy reference implementation draws. Usual unknowns are left out: the question is about the noise.
-
-    Parameters
-    ----------
-    realisation : int
-        Number of the realisation.
-    flaring : bool
-        Whether the flares of the study are observed, too.
+    The NumPy reference draws the `realisation` of this number; if `flaring`, the flares of the study are observed, too.
+    Usual unknowns are left out: the question is about the noise.
     """
     study, observations = study.ideal(), []
     prepared = cases(study, swept=False)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Dots, Line, Panel, Picture, Rule, Series
 from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
-from mauvecl.detection.names import NoThresholdError
+from mauvecl.detection import NoThresholdError
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.schema.columns import First, note_of, part_note

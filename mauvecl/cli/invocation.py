@@ -36,7 +36,7 @@ MOST_REALISATIONS = 2**63 - 1
 
 def question_values(study: Study, *, detects: bool) -> None:
     """Raise InputError for values that a later step would reject; a verb that `detects` needs flares and thresholds."""
-    from mauvecl.detection.names import check_fap, check_statistic
+    from mauvecl.detection import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, named_star
     from mauvecl.host.tables.files import read_bytes, without_columns

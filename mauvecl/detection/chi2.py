@@ -13,6 +13,7 @@ from scipy.linalg import orth, solve_triangular
 
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.statistics import Differences, Setting, Statistic, Tilt
+from mauvecl.host.arrays import Float
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -43,24 +44,17 @@ class Chi2(Statistic):
         if setting.nuisances:
             if scatter is not None:
                 scatter = self._grouped(setting, scatter * setting.used)[:, counts]
-            return self._marginal_form(setting, counts, delta, model, true, scatter)
+            return self._marginal_form(setting, counts, (delta, model, true), scatter)
         return QuadraticForm(true / model, delta / np.sqrt(true))
 
     def _marginal_form(
-        self,
-        setting: Setting,
-        counts: NDArray[np.bool_],
-        delta: Float,
-        model: Float,
-        true: Float,
-        scatter: Float | None,
+        self, setting: Setting, counts: NDArray[np.bool_], moments: tuple[Float, Float, Float], scatter: Float | None
     ) -> QuadraticForm:
-        """Return the distribution of x^T C^-1 x for normal x of mean `delta`, true variance and nuisance scatter."""
-        nuisances = setting.nuisances
+        """Return the distribution of x^T C^-1 x for normal x with some mean, model's and true variance, and scatter."""
+        nuisances, (delta, model, true) = setting.nuisances, moments
         assert nuisances is not None
         if scatter is None and not delta.any() and np.array_equal(model, true):
-            size = delta.size - nuisances.free
-            return QuadraticForm(np.ones(size), np.zeros(size))
+            return QuadraticForm(np.ones(delta.size - nuisances.free), np.zeros(delta.size - nuisances.free))
         scale = np.sqrt(model)
 
         def projection() -> tuple[Float, Float]:
@@ -121,11 +115,16 @@ class Chi2(Statistic):
 
     def _grouped(self, setting: Setting, values: Float) -> Float:
         """Convert values per pixel, along the last axis, to values per squared term."""
-        return values
+        if not self.by_element:
+            return values
+        starts = np.flatnonzero(np.append(True, np.diff(setting.quiet.element) > 0))
+        return np.asarray(np.add.reduceat(values, starts, axis=-1))
 
     def _per_pixel(self, setting: Setting, values: Float) -> Float:
         """Convert values per squared term to values per pixel."""
-        return values
+        if not self.by_element:
+            return values
+        return np.asarray(values[..., np.unique(setting.quiet.element, return_inverse=True)[1]])
 
     def _spectra(self, setting: Setting) -> Float:
         """Return the nuisance spectra per squared term."""
@@ -172,13 +171,6 @@ class Chi2Element(Chi2):
         directions = member * np.sqrt(self.variance(setting)) * setting.used
         return Tilt(directions / np.linalg.norm(directions, axis=1)[:, None], np.ones(len(directions)))
 
-    def _grouped(self, setting: Setting, values: Float) -> Float:
-        starts = np.flatnonzero(np.append(True, np.diff(setting.quiet.element) > 0))
-        return np.asarray(np.add.reduceat(values, starts, axis=-1))
-
-    def _per_pixel(self, setting: Setting, values: Float) -> Float:
-        return np.asarray(values[..., np.unique(setting.quiet.element, return_inverse=True)[1]])
-
 
 class Chi2Pair(Chi2):
     """Chi-squared over pixels of the difference between two exposures."""
@@ -189,8 +181,6 @@ class Chi2Pair(Chi2):
     kernel_sum: ClassVar[str | None] = "chi2_pair"
     paired: ClassVar[bool] = True
 
-
-Float = NDArray[np.float64]
 
 #: FWHM of the paper's smoothing, nm.
 SMOOTHING_NM = 10.5
@@ -252,16 +242,11 @@ class Smoothing:
 
     def form(self, scale: Float, delta: Float, variance: Float) -> QuadraticForm:
         """Return the distribution of the sum for Gaussian noise with a mean and variance per pixel."""
-        weight, vectors = self._eigenmodes(scale, variance)
+        weight, vectors = self.modes(scale, variance)
         return QuadraticForm(weight, (np.sqrt(scale) * (self.weights @ delta)) @ vectors / np.sqrt(weight))
 
     def modes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
-        """Return the variances of the sum's independent modes, shape (n_mode,), and their weights per pixel."""
-        weight, vectors = self._eigenmodes(scale, variance)
-        return weight, vectors.T @ (np.sqrt(scale)[:, None] * self.rows)
-
-    def _eigenmodes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
-        """Return the variances of the modes, and their weights per centre, shape (n_centre, n_mode)."""
+        """Return the variances of the sum's independent modes, and their weights per centre, (n_centre, n_mode)."""
         # The covariance of the smoothed values times the roots of their factors.
         half = self.weights * np.sqrt(scale)[:, None]
         values, vectors = np.linalg.eigh(((half * variance) @ half.T).toarray())
@@ -352,10 +337,10 @@ class Paper(Statistic):
         return np.asarray((x @ self.smoothing(setting).rows.T) ** 2 @ self.scale(setting, flare))
 
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
-        sd = np.sqrt(self.variance(setting)) * setting.used
-        square, modes = self.smoothing(setting).modes(self.scale(setting, flare), sd**2)
+        sd, scale = np.sqrt(self.variance(setting)) * setting.used, self.scale(setting, flare)
+        square, vectors = self.smoothing(setting).modes(scale, sd**2)
+        modes = vectors.T @ (np.sqrt(scale)[:, None] * self.smoothing(setting).rows)
         return Tilt(modes * sd / np.sqrt(square)[:, None], square)
 
     def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        """Return the coefficients as `Chi2.square_weights` does."""
         return np.asarray(self.scale(setting, flare) @ self.smoothing(setting).rows ** 2)

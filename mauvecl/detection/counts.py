@@ -16,8 +16,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection import check_probability
 from mauvecl.detection.distributions import Interval, central_counts
-from mauvecl.detection.names import check_probability
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -64,7 +65,15 @@ class SparseCounts:
 
     def count(self, keys: NDArray[np.int64]) -> None:
         """Add one for each key, in any order."""
-        self.add(*unique_counts(keys))
+        if not keys.size:
+            return
+        low = int(keys.min())
+        if int(keys.max()) - low < MAX_DENSE_KEYS:
+            counts = np.bincount(keys - low)
+            where = np.flatnonzero(counts)
+            self.add(where + low, counts[where])
+        else:
+            self.add(*np.unique_counts(keys))
 
     def _merge(self) -> None:
         if not self._waiting:
@@ -74,18 +83,6 @@ class SparseCounts:
         self._counts = np.zeros(self._keys.size, np.int64)
         np.add.at(self._counts, place, counts)
         self._waiting, self._waits = [], 0
-
-
-def unique_counts(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the distinct keys, ascending, and their counts."""
-    if not keys.size:
-        return keys, keys
-    low = int(keys.min())
-    if int(keys.max()) - low < MAX_DENSE_KEYS:
-        counts = np.bincount(keys - low)
-        where = np.flatnonzero(counts)
-        return where + low, counts[where]
-    return np.unique_counts(keys)
 
 
 def keys_of(values: NDArray[np.float32], *, above: bool) -> NDArray[np.int64]:
@@ -101,7 +98,7 @@ def _ordered(image: NDArray[np.int32]) -> NDArray[np.int32]:
     return image ^ ((image >> 31) & np.int32(0x7FFFFFFF))
 
 
-def edges_of(keys: NDArray[np.int64]) -> NDArray[np.float64]:
+def edges_of(keys: NDArray[np.int64]) -> Float:
     """Return the lower edges of bins: the smallest value in each."""
     ordered = ((keys - np.where(is_above(keys), ABOVE, 0)) << DROPPED_BITS).astype(np.int32)
     edges = _ordered(ordered).view(np.float32).astype(np.float64)
@@ -146,7 +143,7 @@ class FarCounts(SparseCounts):
         """Number of finite values."""
         return int(self.counts.sum())
 
-    def edges(self, low: float, high: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def edges(self, low: float, high: float) -> tuple[Float, Float]:
         """Return the lower and upper edges of the bins, limited by the range `low` to `high` of the fine bins."""
         above = is_above(self.keys)
         lower = np.where(above, np.maximum(edges_of(self.keys), high), edges_of(self.keys))
@@ -197,11 +194,7 @@ class Tally:
         self.n = 0
 
     def add(self, histogram: NDArray[np.integer], sums: NDArray[np.generic], n: int) -> None:
-        """Add the counts of one or more tiles in fine bins.
-
-        `histogram` has the shape (n_grid, BINS). `sums`, shape (n_grid, 2), holds sums of fine steps and of their
-        squares. `n` is the number of realisations, including those counted by `add_far`.
-        """
+        """Add the counts of n realisations in fine bins, (n_grid, BINS), and sums of their steps, and squares."""
         grid, inner = np.nonzero(histogram[:, FIRST_BIN : LAST_BIN + 1])
         counts = histogram[grid, FIRST_BIN + inner].astype(np.int64)
         self.merge(grid * layout.BINS + FIRST_BIN + inner, counts, sums, n)
@@ -229,19 +222,12 @@ class Tally:
 
     def distribution(self, index: int) -> Distribution:
         """Return the distribution of a grid."""
-        packed = self.packed[index]
-        first, second = (int(value) for value in self.sums[index])
-        mine = slice(*np.searchsorted(self.fine.keys, (index * layout.BINS, (index + 1) * layout.BINS)))
+        packed, start = self.packed[index], index * layout.BINS
+        mine, (first, second) = slice(*np.searchsorted(self.fine.keys, (start, start + layout.BINS))), self.sums[index]
         return Distribution(
-            centre=float(packed["centre"]),
-            step=1.0 / float(packed["steps_per_unit"]),
-            filled=self.fine.keys[mine] - index * layout.BINS,
-            filled_counts=self.fine.counts[mine].copy(),
-            first=first,
-            second=second,
-            n=self.n,
-            far=self.far[index],
-        )
+            float(packed["centre"]), 1.0 / float(packed["steps_per_unit"]), self.fine.keys[mine] - start,
+            self.fine.counts[mine].copy(), int(first), int(second), self.n, self.far[index],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,22 +277,20 @@ class Distribution:
 
     @property
     def mean(self) -> float:
-        """Mean of the statistic."""
         return float(self._moments[0])
 
     @property
     def std(self) -> float:
-        """Standard deviation of the statistic."""
         return math.sqrt(self._moments[1])
 
-    def edge(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
+    def edge(self, index: NDArray[np.intp]) -> Float:
         """Return the lower edges of fine bins."""
         steps = (index - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
         return np.asarray(self.centre + self.step * steps)
 
     # Computed when needed: a detection of hundreds of flares has thousands of distributions.
     @property
-    def bins(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def bins(self) -> tuple[Float, Float, NDArray[np.int64]]:
         """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
         self.refuse_undefined()
         ends = self.edge(np.array([FIRST_BIN, LAST_BIN + 1])) if math.isfinite(self.step) else np.full(2, np.inf)
@@ -340,7 +324,7 @@ class Distribution:
         at = int(np.searchsorted(upper, edge, side="right"))
         return int(counts[at:].sum()), int(counts[at - 1]) if at else 0
 
-    def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    def quantile(self, probability: float | Float) -> Float:
         """Return quantiles, interpolated linearly within bins."""
         lower, upper, counts = self.bins
         edges = np.column_stack([lower, upper]).ravel()
@@ -356,7 +340,7 @@ class Distribution:
         ends = float(lower[first]) if low else -np.inf, float(upper[last]) if high < self.n else np.inf
         return Interval(float(self.quantile(probability)), *ends)
 
-    def histogram(self, bins: int = 200) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def histogram(self, bins: int = 200) -> tuple[Float, NDArray[np.int64]]:
         """Return edges, shape (m + 1,), and counts, shape (m,), in at most `bins` equal bins, for plots."""
         lower, upper, _ = self.bins
         if self.far.n:

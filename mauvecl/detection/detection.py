@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.detection.chi2 import Chi2, Paper, Smoothing
+from mauvecl.detection import NoThresholdError, Tails, check_atom, check_fap, countable
+from mauvecl.detection.chi2 import Chi2, Paper
 from mauvecl.detection.counts import Distribution, TailSamples, Tally
 from mauvecl.detection.distributions import (
     CONFIDENCE_SD,
@@ -22,11 +24,10 @@ from mauvecl.detection.distributions import (
     clopper_pearson_ends,
     detection_interval,
 )
-from mauvecl.detection.names import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
 from mauvecl.detection.statistics import Differences, LinearStatistic
 from mauvecl.detection.tails import Tail, tail
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.calls import validated
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
 
 #: Differences above this many standard errors are significant.
 SIGNIFICANT = 4.0
@@ -161,8 +160,8 @@ DEPARTURE_COLUMNS = (
 def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
     """Return the false-alarm probability at a threshold with the noise's third and fourth cumulants."""
     scene, quiet = detection.scene, detection.quiet
-    each = 1 if scene.frames else quiet.n_frames
-    c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
+    draws = scene.n_draws
+    c = Cumulants.of(quiet, quiet.n_frames // draws)
     kind, flare = detection.statistic(statistic), detection.shape(statistic, template)
     # Cumulants of the difference between an exposure and the mean of reference exposures.
     added = kind.added_variance(detection.setting)
@@ -209,30 +208,6 @@ def _adc_moments(x: Expectation) -> list[tuple[Float, Float]]:
         variance = np.sum(chance * (seen - centre[:, None]) ** 2, axis=1)
         moments.append((x.n_frames * (centre - recorded), x.n_frames * variance))
     return moments
-
-
-#: Chi-squared and reduced chi-squared by amplitude, for the G2V star, V = 7.4, 50 s (the paper, section "G2V star").
-PAPER_G2V = {0.24: (6159.88, 3.75), 0.081: (1078.36, 0.66)}
-
-WHY = (
-    "The paper's values are no calibrated chi-squared: with 1643 points a reduced value scatters by 0.035 about one, "
-    "so 0.66 lies ten standard deviations below. Divided by the smoothed flare spectrum in DN/s instead of the noise's "
-    "variance they are reproduced; what such a number means, only its simulated null can tell (`statistic='paper'`)."
-)
-
-
-def reconstruct(quiet: Expectation, flare: Expectation) -> Interval:
-    """Return the median and central 95 % of the reduced statistic `paper` with a flare, for Gaussian noise.
-
-    The paper does not define its chi-squared. Among the definitions that were tried, this one is nearest to its two G2V
-    values: both noisy spectra are smoothed with a Gaussian of 10.5 nm FWHM, as stated in its figure, and compared as in
-    `scipy.stats.chisquare`, with the flare's mean as expected values.
-    """
-    smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool), (flare,))
-    delta, variance = flare.recorded_light_dn - quiet.recorded_light_dn, flare.variance_dn2 + quiet.variance_dn2
-    form = smoothing.form(smoothing.scale(flare), delta, variance)
-    middle, low, high = (form.isf(p) / quiet.wavelength_nm.size for p in (0.5, 0.975, 0.025))
-    return Interval(middle, low, high)
 
 
 #: Rows of a curve's table.
@@ -322,15 +297,9 @@ class Roc(Drawable):
 class Detection(Drawable, ContentEquality, Hypotheses):
     """Simulated null and flare distributions, as returned by `Engine.detect`.
 
-    Attributes are those of `Hypotheses` and the following.
-
-    Attributes
-    ----------
-    realisations : int
-    tails : {"counted", "sampled"}
-        Whether a threshold with too few realisations beyond it raises InputError, or is found by importance sampling.
-    seed : int
-        Seed of the draws.
+    Attributes are those of `Hypotheses`, the number of `realisations`, the `seed` of the draws, and `tails`: whether a
+    threshold with too few realisations beyond it raises InputError ("counted") or is found by importance sampling
+    ("sampled").
     """
 
     realisations: int
@@ -356,21 +325,14 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Add the distributions and tails of one batch."""
-        for index, (key, samples_of_key) in enumerate(zip(plan.keys, samples, strict=True)):
-            self._distributions[key] = tally.distribution(index)
-            if samples_of_key is not None:
-                self._samples[key] = samples_of_key
+        self._distributions |= {key: tally.distribution(index) for index, key in enumerate(plan.keys)}
+        self._samples |= {key: kept for key, kept in zip(plan.keys, samples, strict=True) if kept is not None}
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """Return the simulated distribution of a statistic.
 
-        Parameters
-        ----------
-        statistic : str
-        flare : int, optional
-            Index of the flare; None for the null distribution.
-        template : int
-            Index of the flare that shaped statistics use as template, for the null distribution.
+        `flare` is the index of the flare, None for the null distribution, in which shaped statistics use the flare with
+        the index `template`.
         """
         return self._at(self._key(statistic, flare, template))
 
@@ -391,7 +353,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def histogram(
         self, statistic: str, flare: int | None = None, *, template: int = 0, bins: Annotated[int, Range(1)] = 200
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    ) -> tuple[Float, NDArray[np.int64]]:
         """Return edges and counts for plots; parameters as for `distribution`."""
         return self.distribution(statistic, flare, template=template).histogram(bins)
 
@@ -403,12 +365,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         tails are sampled, it is the result of importance sampling. `template` is the index of the flare that shaped
         statistics use as template.
 
-        Raises
-        ------
-        InputError
-            If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
-        NoThresholdError
-            If no threshold has this probability, because one value of the statistic is more probable.
+        Raises InputError if fewer than 100 realisations lie beyond and tails are counted, since the tail is never
+        extrapolated, and NoThresholdError if one value of the statistic is more probable than `fap`.
         """
         sampled = self.tail(fap, statistic, template=template)
         if sampled is not None:
@@ -439,8 +397,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         """
         null = self.distribution(statistic, template=template)
         above, n = null.above(threshold), null.n
-        low, high = clopper_pearson(int(np.floor(above)), n).low, clopper_pearson(int(np.ceil(above)), n).high
-        return Interval(above / n, low, high)
+        return Interval(above / n, clopper_pearson(int(above), n).low, clopper_pearson(math.ceil(above), n).high)
 
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
         """Return the fraction of realisations at or above the threshold for each flare.
@@ -448,30 +405,27 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         The interval has 95 % coverage for the probability above the true threshold; see `detection_interval`. The
         values are NaN for `blinding` flares, and if no threshold has the false-alarm probability (`without_threshold`).
         """
-        probabilities = []
+        probabilities = [UNDEFINED] * len(self.flares)
         for flare in range(len(self.flares)):
             cut = UNDEFINED if flare in self.blinding else self._threshold_if_any(fap, statistic, flare)
-            if cut is UNDEFINED:
-                probabilities.append(UNDEFINED)
-                continue
-            counted = self._at((statistic, "flare_on_null_grid", flare))
-            above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
-            shared = 0.0
-            if countable(fap, self.realisations) and counted.std > 0:
-                # A flare only adds uncorrelated noise; tilted draws are independent of the flare's.
-                shared = min(self.distribution(statistic, template=flare).std / counted.std, 1.0)
-            probabilities.append(detection_interval(above, counted.n, fap, shared))
+            if cut is not UNDEFINED:
+                counted, shared = self._at((statistic, "flare_on_null_grid", flare)), 0.0
+                above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
+                if countable(fap, self.realisations) and counted.std > 0:
+                    # A flare only adds uncorrelated noise; tilted draws are independent of the flare's.
+                    shared = min(self.distribution(statistic, template=flare).std / counted.std, 1.0)
+                probabilities[flare] = detection_interval(above, counted.n, fap, shared)
         return probabilities
 
     def without_threshold(self, fap: float) -> tuple[Message, ...]:
         """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
-        sentences = []
+        sentences = dict[Message, None]()
         for statistic, template in self._nulls():
             try:
                 self.threshold(fap, statistic, template=template)
             except NoThresholdError as error:
-                sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
-        return tuple(dict.fromkeys(sentences))
+                sentences[Message(f"NO THRESHOLD: {error}.", "no threshold")] = None
+        return tuple(sentences)
 
     def _threshold_if_any(self, fap: float, statistic: str, template: int) -> Interval:
         """Return `threshold`, or `UNDEFINED` if no threshold has the false-alarm probability."""
@@ -532,28 +486,15 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         limit = self.closed_form(statistic, template=flare).isf(fap)
         # A weighted sum has no reduced value.
         reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
-        of_flare = {
-            "expected": theory.mean,
-            "mean": d.mean,
-            "std": d.std,
-            "reduced": reduced,
-            "closed_form_probability": theory.sf(limit),
-        }
+        names = ("expected", "mean", "std", "reduced", "closed_form_probability")
+        of_flare = dict(zip(names, (theory.mean, d.mean, d.std, reduced, theory.sf(limit)), strict=True))
         if flare in self.blinding:
-            of_flare = dict.fromkeys(of_flare, np.nan)
-        return of_flare | {
-            "name": self.flares[flare].name,
-            "statistic": statistic,
-            "dof": dof,
-            "threshold": cut.value,
-            "threshold_low": cut.low,
-            "threshold_high": cut.high,
-            "probability": probability.value,
-            "low": probability.low,
-            "high": probability.high,
-            "closed_form_threshold": limit,
-            "fap_error": float(fap_error),
-        }
+            of_flare = dict.fromkeys(names, np.nan)
+        return of_flare | vars(probability) | {
+            "name": self.flares[flare].name, "statistic": statistic, "dof": dof, "probability": probability.value,
+            "threshold": cut.value, "threshold_low": cut.low, "threshold_high": cut.high,
+            "closed_form_threshold": limit, "fap_error": float(fap_error),
+        }  # fmt: skip
 
 
 #: Columns of the table of detections.

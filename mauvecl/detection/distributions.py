@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.arrays import Float
+
 
 def smallest_integer(reached: Callable[[int], bool], low: int, high: int) -> int:
     """Return the smallest whole number for which a monotone predicate holds: not for `low`, but for `high`."""
@@ -46,13 +48,10 @@ def clopper_pearson(successes: int, trials: int) -> Interval:
 
     The coverage is at least `CONFIDENCE` for every true fraction.
     """
-    value, low, high = clopper_pearson_ends(np.array([successes]), trials)
-    return Interval(float(value[0]), float(low[0]), float(high[0]))
+    return Interval(*(float(end[0]) for end in clopper_pearson_ends(np.array([successes]), trials)))
 
 
-def clopper_pearson_ends(
-    successes: NDArray[np.int64], trials: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def clopper_pearson_ends(successes: NDArray[np.int64], trials: int) -> tuple[Float, Float, Float]:
     """Return fractions and the lower and upper ends of their intervals; see `clopper_pearson`."""
     tail = (1.0 - CONFIDENCE) / 2.0
     with np.errstate(all="ignore"):
@@ -128,8 +127,6 @@ def _orthant(h: float, k: float, correlation: float) -> float:
     return float(special.ndtr(-h) * special.ndtr(-k) + angle * np.sum(WEIGHTS * density))
 
 
-Float = NDArray[np.float64]
-
 #: Relative change of the integral at which refinement stops.
 TOLERANCE = 1e-11
 #: First step and largest number of halvings; sinh(t) distributes the points over all scales of an uneven sum.
@@ -144,127 +141,6 @@ BLOCK, MAX_T = 32, 80.0
 MAX_STEPS, STEP_TOLERANCE = 200, 1e-10
 
 
-@dataclass(frozen=True, eq=False)
-class Squares:
-    """Weighted sum of squared normals, sum_i weight_i (z_i + shift_i)^2, with equal weights grouped."""
-
-    weight: Float  # distinct, positive, the largest is 1; shape (n,)
-    count: Float  # number of squares of each weight
-    push: Float  # sum of their squared shifts
-    unit: float  # unit of the weights and of the arguments `value`
-
-    def tail(self, value: float, *, upper: bool) -> tuple[float, float]:
-        """Return the natural logarithm of the probability above or below a positive value, and density / probability.
-
-        The result has full precision in the tail that does not contain the mean.
-        """
-        gap = self._saddle(value, upper)
-        left = self._factors(np.array(gap))
-        bend = self._derivative(left, 3) / (6.0 * self._derivative(left, 2))
-        scale = 1.0 / np.sqrt(self._derivative(left, 2) + 1.0 / (0.5 - gap) ** 2)
-        top = float(self._exponent(np.array([gap + 0j]), value, upper)[0].real)
-        while np.isnan(mass := self._integral(value, upper, (gap, bend, scale), top))[0]:
-            bend = bend / 4 if bend * scale > 1e-6 else 0.0
-        probability, density = mass.tolist()
-        return top + float(np.log(probability / np.pi)), density / probability
-
-    def quantile(self, probability: float, *, upper: bool) -> float:
-        """Return the quantile of an upper or lower tail probability, by bracketed Newton steps in logarithms."""
-        goal = float(np.log(probability))
-        # Start from a gamma distribution of the same mean and variance.
-        mean = float(self.weight @ (self.count + self.push))
-        variance = float(self.weight**2 @ (2.0 * self.count + 4.0 * self.push))
-        shape = mean**2 / variance
-        start = (special.gammainccinv if upper else special.gammaincinv)(shape, probability) * variance / mean
-        at = float(np.log(max(start, 1e-300)))
-        low, high = -700.0, 700.0
-        for _ in range(MAX_STEPS):
-            mass, ratio = self.tail(float(np.exp(at)), upper=upper)
-            off = mass - goal
-            if (off > 0) == upper:
-                low = at
-            else:
-                high = at
-            # Derivative of the logarithm of the tail with respect to that of the value.
-            slope = ratio * float(np.exp(at)) * (-1.0 if upper else 1.0)
-            step = -off / slope if slope else np.inf
-            if abs(step) <= STEP_TOLERANCE:
-                return float(np.exp(at + step))
-            after = at + float(np.clip(step, -3.0, 3.0))
-            at = after if low < after < high else (max(low, at - 3.0) + min(high, at + 3.0)) / 2
-        raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
-
-    def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> Float:
-        """Integrate probability and density divided by exp(top); NaN if the integrand grows on the contour."""
-        gap, bend, scale = path
-
-        def summed(first: float, step: float) -> Float:
-            """Sum both integrands over points first, first + step, ... until they are negligible."""
-            total = np.zeros(2)
-            while True:
-                t = first + step * np.arange(BLOCK)
-                y = scale * np.sinh(t)
-                s_gap = gap - bend * y**2 - 1j * y
-                exponent = self._exponent(s_gap, value, upper) - top
-                if exponent.real.max() > GROWTH:
-                    return np.full(2, np.nan)
-                size = np.exp(exponent) * (1.0 - 2j * bend * y) * scale * np.cosh(t)
-                size[t == 0.0] /= 2
-                total += np.sum(size.real), np.sum((size * (0.5 - s_gap if upper else s_gap - 0.5)).real)
-                if exponent[-1].real + 2 * t[-1] < -NEGLIGIBLE or t[-1] > MAX_T:
-                    return total
-                first = t[-1] + step
-
-        step, total, before = STEP, summed(0.0, STEP), 0.0
-        for _ in range(HALVINGS):
-            mass = float(total[0]) * step
-            if np.isnan(mass) or abs(mass - before) <= TOLERANCE * before:
-                break
-            before, total, step = mass, total + summed(step / 2, step), step / 2
-        return step * total
-
-    def _factors(self, gap: NDArray[Any]) -> NDArray[Any]:
-        """Return 1 - 2 weight s for s = 1/2 - gap, without cancellation near the branch point."""
-        return np.asarray((1.0 - self.weight) + 2.0 * np.multiply.outer(gap, self.weight))
-
-    def _exponent(self, gap: NDArray[np.complex128], value: float, upper: bool) -> NDArray[np.complex128]:
-        """Return K(s) - s x - log(+-s)."""
-        left, s = self._factors(gap), 0.5 - gap
-        # Real logarithms and angles are several times faster than complex ones.
-        square = left.real**2 + left.imag**2
-        log = 0.5 * (np.log(square) @ self.count) + 1j * (np.arctan2(left.imag, left.real) @ self.count)
-        turn = (left.real / square) @ self.push - self.push.sum() - 1j * ((left.imag / square) @ self.push)
-        return np.asarray(-0.5 * log + 0.5 * turn - s * value - np.log(s if upper else -s))
-
-    def _derivative(self, left: Float, order: int) -> float:
-        """Return a derivative of K of order 1 to 3."""
-        factor = (0.0, 1.0, 2.0, 8.0)[order]
-        return factor * float(((self.weight / left) ** order * (self.count + order * self.push / left)).sum())
-
-    def _saddle(self, value: float, upper: bool) -> float:
-        """Return 1/2 - s at the minimum of K(s) - s x - log(+-s) on the real axis.
-
-        The minimum lies between 0 and the branch point for the upper tail, and below 0 for the lower tail.
-        """
-        from scipy.optimize import brentq
-
-        # The parameter v is logarithmic in the distance from 0 and in that from the branch point.
-        def gap(v: float) -> float:
-            return 0.5 * float(special.expit(-v)) if upper else 0.5 + float(np.exp(v))
-
-        def slope(v: float) -> float:
-            s = 0.5 * float(special.expit(v)) if upper else -float(np.exp(v))
-            return self._derivative(self._factors(np.array(gap(v))), 1) - value - 1.0 / s
-
-        sign = 1.0 if upper else -1.0
-        low, high = -1.0, 1.0
-        while sign * slope(low) > 0:
-            low *= 2
-        while sign * slope(high) < 0:
-            high *= 2
-        return gap(float(brentq(slope, low, high, rtol=1e-10)))
-
-
 #: Limits of the precomputed transform: distance from the mean in standard deviations, least number of effective terms,
 #: least probability.
 NEAR, MANY, RARE = 40.0, 30.0, 1e-9
@@ -274,8 +150,8 @@ NEAR, MANY, RARE = 40.0, 30.0, 1e-9
 class QuadraticForm:
     """Generalised chi-squared variable: sum_i weight_i (z_i + shift_i)^2 with independent standard normals z_i."""
 
-    weight: NDArray[np.float64]  # positive, shape (n,)
-    shift: NDArray[np.float64]  # means in standard deviations, shape (n,)
+    weight: Float  # positive, shape (n,)
+    shift: Float  # means in standard deviations, shape (n,)
 
     @cached_property
     def mean(self) -> float:
@@ -311,27 +187,50 @@ class QuadraticForm:
         if self.effective_terms >= MANY:
             above = float(value < self.mean)
             if abs(value - self.mean) <= NEAR * self.std:
-                u, size, phase = self._near
+                u, size, phase = self._transform
                 above = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
             if above >= RARE or not relative:
                 return min(max(above, 0.0), 1.0)
         upper = value > self.mean
-        tail = float(np.exp(self._squares.tail(value / self._squares.unit, upper=upper)[0]))
+        tail = float(np.exp(self._tail(value / self._unit, upper=upper)[0]))
         return tail if upper else 1.0 - tail
 
-    @cached_property
-    def _squares(self) -> Squares:
-        unit = float(self.weight.max())
-        values, member = np.unique(self.weight / unit, return_inverse=True)
-        count = np.bincount(member, minlength=values.size).astype(np.float64)
-        return Squares(values, count, np.bincount(member, self.shift**2, values.size).astype(np.float64), unit)
+    def isf(self, probability: float) -> float:
+        """Return the value that is exceeded with a probability in (0, 1)."""
+        if self._chi_squared:
+            return float(special.chdtri(self.weight.size, probability))
+        if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
+            from scipy.optimize import brentq
+
+            low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
+            return float(brentq(lambda x: self.sf(x) - probability, low, high, xtol=1e-9 * self.std))
+        upper = probability <= 0.5
+        return self._unit * self._quantile(probability if upper else 1.0 - probability, upper=upper)
 
     @cached_property
-    def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _chi_squared(self) -> bool:
+        """True for a central chi-squared variable with as many degrees of freedom as terms."""
+        return bool(np.all(self.weight == 1.0)) and not self.shift.any()
+
+    @cached_property
+    def _unit(self) -> float:
+        """Largest weight, the unit of the distinct weights and of arguments of the contour integral."""
+        return float(self.weight.max())
+
+    @cached_property
+    def _distinct(self) -> tuple[Float, Float, Float]:
+        """Distinct weights, the largest of which is 1, the number of squares of each, and the sum of their shifts^2."""
+        values, member = np.unique(self.weight / self._unit, return_inverse=True)
+        count, push = (np.bincount(member, of, values.size).astype(np.float64) for of in (None, self.shift**2))
+        return values, count, push
+
+    @cached_property
+    def _transform(self) -> tuple[Float, Float, Float]:
         """Frequencies, and modulus and phase of the characteristic function, for values near the mean."""
         spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
-        weight, count = self._squares.unit * self._squares.weight, self._squares.count
-        pull = weight * self._squares.push
+        weight, count, push = self._distinct
+        weight = self._unit * weight
+        pull = weight * push
         parts = []
         k = 0.5 + np.arange(256)
         while True:
@@ -346,23 +245,109 @@ class QuadraticForm:
                 us, sizes, phases = zip(*parts, strict=True)
                 return np.concatenate(us), np.concatenate(sizes), np.concatenate(phases)
 
-    def isf(self, probability: float) -> float:
-        """Return the value that is exceeded with a probability in (0, 1)."""
-        if self._chi_squared:
-            return float(special.chdtri(self.weight.size, probability))
-        if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
-            from scipy.optimize import brentq
+    def _tail(self, value: float, *, upper: bool) -> tuple[float, float]:
+        """Return the natural logarithm of the probability above or below a positive value, and density / probability.
 
-            low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
-            return float(brentq(lambda x: self.sf(x) - probability, low, high, xtol=1e-9 * self.std))
-        upper = probability <= 0.5
-        wanted = probability if upper else 1.0 - probability
-        return self._squares.unit * self._squares.quantile(wanted, upper=upper)
+        The result has full precision in the tail that does not contain the mean.
+        """
+        gap = self._saddle(value, upper)
+        left = self._factors(np.array(gap))
+        bend = self._derivative(left, 3) / (6.0 * self._derivative(left, 2))
+        scale = 1.0 / np.sqrt(self._derivative(left, 2) + 1.0 / (0.5 - gap) ** 2)
+        top = float(self._exponent(np.array([gap + 0j]), value, upper)[0].real)
+        while np.isnan(mass := self._integral(value, upper, (gap, bend, scale), top))[0]:
+            bend = bend / 4 if bend * scale > 1e-6 else 0.0
+        probability, density = mass.tolist()
+        return top + float(np.log(probability / np.pi)), density / probability
 
-    @cached_property
-    def _chi_squared(self) -> bool:
-        """True for a central chi-squared variable with as many degrees of freedom as terms."""
-        return bool(np.all(self.weight == 1.0)) and not self.shift.any()
+    def _quantile(self, probability: float, *, upper: bool) -> float:
+        """Return the quantile of an upper or lower tail probability, by Newton steps in logarithms.
+
+        The logarithm of the tail is concave in that of the value, so the steps converge.
+        """
+        # Start from a gamma distribution of the same mean and variance.
+        mean, variance = self.mean / self._unit, (self.std / self._unit) ** 2
+        start = (special.gammainccinv if upper else special.gammaincinv)(mean**2 / variance, probability)
+        at = float(np.log(max(start * variance / mean, 1e-300)))
+        for _ in range(MAX_STEPS):
+            mass, ratio = self._tail(float(np.exp(at)), upper=upper)
+            # The derivative of the logarithm of the tail with respect to that of the value is -+ ratio * value.
+            step = (mass - float(np.log(probability))) / (ratio * float(np.exp(at))) * (1.0 if upper else -1.0)
+            if abs(step) <= STEP_TOLERANCE:
+                return float(np.exp(at + step))
+            at += float(np.clip(step, -3.0, 3.0))
+        raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
+
+    def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> Float:
+        """Integrate probability and density divided by exp(top); NaN if the integrand grows on the contour."""
+        gap, bend, scale = path
+
+        def summed(first: float, step: float) -> Float:
+            """Sum both integrands over points first, first + step, ... until they are negligible."""
+            total = np.zeros(2)
+            while True:
+                t = first + step * np.arange(BLOCK)
+                y = scale * np.sinh(t)
+                s_gap = gap - bend * y**2 - 1j * y
+                exponent = self._exponent(s_gap, value, upper) - top
+                if exponent.real.max() > GROWTH:
+                    return np.full(2, np.nan)
+                size = np.exp(exponent) * (1.0 - 2j * bend * y) * scale * np.cosh(t)
+                size[t == 0.0] /= 2
+                total += np.sum(size.real), np.sum((size * (0.5 - s_gap if upper else s_gap - 0.5)).real)
+                if exponent[-1].real + 2 * t[-1] < -NEGLIGIBLE or t[-1] > MAX_T:
+                    return total
+                first = t[-1] + step
+
+        step, total, before = STEP, summed(0.0, STEP), 0.0
+        for _ in range(HALVINGS):
+            mass = float(total[0]) * step
+            if np.isnan(mass) or abs(mass - before) <= TOLERANCE * before:
+                break
+            before, total, step = mass, total + summed(step / 2, step), step / 2
+        return step * total
+
+    def _factors(self, gap: NDArray[Any]) -> NDArray[Any]:
+        """Return 1 - 2 weight s for s = 1/2 - gap, without cancellation near the branch point."""
+        weight = self._distinct[0]
+        return np.asarray((1.0 - weight) + 2.0 * np.multiply.outer(gap, weight))
+
+    def _exponent(self, gap: NDArray[np.complex128], value: float, upper: bool) -> NDArray[np.complex128]:
+        """Return K(s) - s x - log(+-s)."""
+        (_, count, push), left, s = self._distinct, self._factors(gap), 0.5 - gap
+        # Real logarithms and angles are several times faster than complex ones.
+        square = left.real**2 + left.imag**2
+        log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(left.imag, left.real) @ count)
+        turn = (left.real / square) @ push - push.sum() - 1j * ((left.imag / square) @ push)
+        return np.asarray(-0.5 * log + 0.5 * turn - s * value - np.log(s if upper else -s))
+
+    def _derivative(self, left: Float, order: int) -> float:
+        """Return a derivative of K of order 1 to 3."""
+        weight, count, push = self._distinct
+        return (0.0, 1.0, 2.0, 8.0)[order] * float(((weight / left) ** order * (count + order * push / left)).sum())
+
+    def _saddle(self, value: float, upper: bool) -> float:
+        """Return 1/2 - s at the minimum of K(s) - s x - log(+-s) on the real axis.
+
+        The minimum lies between 0 and the branch point for the upper tail, and below 0 for the lower tail.
+        """
+        from scipy.optimize import brentq
+
+        # The parameter v is logarithmic in the distance from 0 and in that from the branch point.
+        def gap(v: float) -> float:
+            return 0.5 * float(special.expit(-v)) if upper else 0.5 + float(np.exp(v))
+
+        def slope(v: float) -> float:
+            s = 0.5 * float(special.expit(v)) if upper else -float(np.exp(v))
+            return self._derivative(self._factors(np.array(gap(v))), 1) - value - 1.0 / s
+
+        sign = 1.0 if upper else -1.0
+        low, high = -1.0, 1.0
+        while sign * slope(low) > 0:
+            low *= 2
+        while sign * slope(high) < 0:
+            high *= 2
+        return gap(float(brentq(slope, low, high, rtol=1e-10)))
 
 
 @dataclass(frozen=True)
@@ -374,20 +359,18 @@ class Gaussian:
     third: ClassVar[float] = 0.0
 
     def sf(self, value: float) -> float:
-        """Return the probability of exceeding `value`."""
         return float(special.ndtr((self.mean - value) / self.std))
 
     def isf(self, probability: float) -> float:
-        """Return the value that is exceeded with a probability in (0, 1)."""
         return float(self.mean - self.std * special.ndtri(probability))
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """A mixture of distributions, for statistics whose noise depends on drawn factors."""
+    """A mixture of distributions with the interface of `QuadraticForm`, for noise that depends on drawn factors."""
 
     parts: tuple[QuadraticForm | Gaussian, ...]
-    weights: NDArray[np.float64]  # probability of each part, shape (n,)
+    weights: Float  # probability of each part, shape (n,)
 
     @cached_property
     def mean(self) -> float:
@@ -399,13 +382,11 @@ class Mixture:
 
     @cached_property
     def third(self) -> float:
-        """Third central moment."""
         away = [part.mean - self.mean for part in self.parts]
         each = [part.third + 3.0 * d * part.std**2 + d**3 for part, d in zip(self.parts, away, strict=True)]
         return float(self.weights @ each)
 
     def sf(self, value: float) -> float:
-        """Return the probability of exceeding `value`."""
         if self._normal is not None:
             mean, std = self._normal
             return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
@@ -421,14 +402,13 @@ class Mixture:
         return min(above, 1.0)
 
     @cached_property
-    def _normal(self) -> NDArray[np.float64] | None:
+    def _normal(self) -> Float | None:
         """Means and standard deviations if all parts are normal, shape (2, n)."""
         if not all(isinstance(part, Gaussian) for part in self.parts):
             return None
         return np.array([(part.mean, part.std) for part in self.parts]).T
 
     def isf(self, probability: float) -> float:
-        """Return the value that is exceeded with a probability in (0, 1)."""
         from scipy.optimize import brentq
 
         @cache

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.host.tables.files import LARGEST, SMALLEST, read_text
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.calls import validated
@@ -23,36 +22,21 @@ from mauvecl.schema.errors import InputError, shortened
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
-
 
 @validated
 @dataclass(frozen=True, eq=False)
 class Nuisances(ContentEquality):
-    """Unknown amplitudes of known spectra.
-
-    Attributes
-    ----------
-    names : tuple of str
-    spectra : ndarray, shape (k, n_pixel)
-        DN of the exposure for unit amplitude.
-    sd : ndarray, shape (k,)
-        Prior standard deviations of the amplitudes; infinite for a flat prior.
-    of_flare : ndarray, shape (k, n_pixel), optional
-        Relative change of the light of a flare for unit amplitude: 1 for a factor on all light, 0 by default. Fits of
-        flares use it; statistics test for a flare, and use the spectra without one.
-    mean : ndarray, shape (k,), optional
-        Prior means of the amplitudes in fits of flares, 0 by default.
-    factor_prior : ndarray, shape (2, n), optional
-        Values of the factor on all light, in standard deviations from its mean, and their probabilities, if its prior
-        is not normal; fits of flares use it.
-    """
+    """Unknown amplitudes of known spectra."""
 
     names: tuple[str, ...]
-    spectra: Float
-    sd: Float
+    spectra: Float  # DN of the exposure for unit amplitude, shape (k, n_pixel)
+    sd: Float  # prior standard deviations of the amplitudes, infinite for a flat prior, shape (k,)
+    # Relative change of the light of a flare for unit amplitude: 1 for a factor on all light, 0 by default; shape
+    # (k, n_pixel). Fits of flares use it; statistics test for a flare, and use the spectra without one.
     of_flare: Float = field(default_factory=lambda: np.zeros((0, 0)))
-    mean: Float = field(default_factory=lambda: np.zeros(0))
+    mean: Float = field(default_factory=lambda: np.zeros(0))  # prior means in fits of flares, 0 by default, shape (k,)
+    # Values of the factor on all light, in standard deviations from its mean, and their probabilities, if its prior is
+    # not normal, shape (2, n); fits of flares use it.
     factor_prior: Float = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:
@@ -70,7 +54,7 @@ class Nuisances(ContentEquality):
                 raise InputError(
                     f"the standard deviation of the unknown {name!r} must be above 0 or 'free', not {sd:g}", key="sd"
                 )
-        for name, expected in (("of_flare", np.shape(self.spectra)), ("mean", np.shape(self.sd))):
+        for name, expected in zip(("of_flare", "mean"), shapes, strict=True):
             given = getattr(self, name)
             values = np.asarray(given, np.float64) if np.size(given) else np.zeros(expected)
             if values.shape != expected or not np.isfinite(values).all():
@@ -81,21 +65,18 @@ class Nuisances(ContentEquality):
             object.__setattr__(self, name, values)
 
     @classmethod
-    def of(
-        cls, quiet: Expectation, sd: Mapping[str, float], own: Mapping[str, NDArray[np.float64]] | None = None
-    ) -> Nuisances:
+    def of(cls, quiet: Expectation, sd: Mapping[str, float], own: Mapping[str, Float] | None = None) -> Nuisances:
         """Compute the nuisance spectra of a quiescent exposure.
 
         `sd` holds prior standard deviations by name, of `NUISANCES` or `own`, infinite to project a parameter out;
-        `own` holds user-defined spectra, DN of the exposure for unit amplitude, shape (n_pixel,). Raises InputError if
-        a name has no spectrum, or a spectrum is zero everywhere.
+        `own` holds user-defined spectra, DN of the exposure for unit amplitude, shape (n_pixel,).
         """
         own, shape = own or {}, quiet.wavelength_nm.shape
-        spectra, of_flare = [], []
-        for name in sd:
-            row = None if name in own else NUISANCES.get(name)
-            of_flare.append(np.zeros(shape) if row is None or row.of_flare is None else row.of_flare(quiet))
+        spectra, of_flare = (np.zeros((len(sd), *shape)) for _ in range(2))
+        for k, name in enumerate(sd):
             spectrum = np.asarray(own[name], np.float64) if name in own else spectrum_of(name, quiet)
+            if name not in own and (change := NUISANCES[name].of_flare) is not None:
+                of_flare[k] = change(quiet)
             if spectrum.shape != shape:
                 raise InputError(
                     f"the spectrum of the unknown {name!r} must have one value for each of the {shape[0]} pixels, but "
@@ -103,12 +84,10 @@ class Nuisances(ContentEquality):
                     key="own",
                 )
             if not spectrum.any():
-                raise InputError(
-                    f"the unknown {name!r} must change pixels of {quiet.name}, but changes none", key="own"
-                )
-            spectra.append(spectrum)
-        rows, light = (np.reshape(each, (len(sd), *shape)) for each in (spectra, of_flare))
-        return cls(tuple(sd), rows, np.array(list(sd.values()), np.float64), light)
+                fault = f"the unknown {name!r} must change pixels of {quiet.name}, but changes none"
+                raise InputError(fault, key="own")
+            spectra[k] = spectrum
+        return cls(tuple(sd), spectra, np.array(list(sd.values()), np.float64), of_flare)
 
     def _line(self) -> str:
         priors = zip(self.names, self.sd, strict=True)
@@ -126,32 +105,28 @@ class Nuisances(ContentEquality):
         """Return all parameters but those named."""
         return self._rows([i for i, name in enumerate(self.names) if name not in names])
 
-    def _rows(self, rows: Sequence[int]) -> Nuisances:
-        rows = list(rows)
+    def _rows(self, rows: list[int]) -> Nuisances:
         spectra, sd, of_flare, mean = (values[rows] for values in (self.spectra, self.sd, self.of_flare, self.mean))
         return Nuisances(tuple(self.names[i] for i in rows), spectra, sd, of_flare, mean, self.factor_prior)
 
     def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
         """Return the parameters with another one that leaves the light of a flare as it is."""
-        self._check_pixels("spectrum", spectrum)
+        self._check_pixels(spectrum=spectrum)
         return self.joined(Nuisances((name,), spectrum[None], np.array([sd])))
 
-    def _check_pixels(self, key: str, values: Float) -> None:
-        """Raise InputError unless there is a value for each pixel."""
+    def _check_pixels(self, **arrays: Float) -> None:
+        """Raise InputError unless arrays have a value for each pixel."""
         expected = (self.spectra.shape[1],)
-        if values.shape != expected:
-            raise InputError.of(key, values.shape, f"the shape {expected}, one value for each pixel")
+        for key, values in arrays.items():
+            if values.shape != expected:
+                raise InputError.of(key, values.shape, f"the shape {expected}, one value for each pixel")
 
     def joined(self, other: Nuisances) -> Nuisances:
         """Return these parameters and others."""
-        return Nuisances(
-            (*self.names, *other.names),
-            np.vstack([self.spectra, other.spectra]),
-            np.append(self.sd, other.sd),
-            np.vstack([self.of_flare, other.of_flare]),
-            np.append(self.mean, other.mean),
-            np.hstack([self.factor_prior, other.factor_prior]),
-        )
+        spectra, of_flare = np.vstack([self.spectra, other.spectra]), np.vstack([self.of_flare, other.of_flare])
+        sd, mean = np.append(self.sd, other.sd), np.append(self.mean, other.mean)
+        prior = np.hstack([self.factor_prior, other.factor_prior])
+        return Nuisances((*self.names, *other.names), spectra, sd, of_flare, mean, prior)
 
     def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:
         """Return the parameters with another prior of one amplitude."""
@@ -169,11 +144,11 @@ class Nuisances(ContentEquality):
         The factor on all light is the last one, and its spectrum is that without a flare: fits find the flare as it is
         recorded. The spectra of the others include the flare.
         """
-        self._check_pixels("flare_dn", flare_dn)
-        order, factors = np.arange(len(self.names)), np.flatnonzero((self.of_flare == 1.0).all(axis=1))
+        self._check_pixels(flare_dn=flare_dn)
+        order, factors = [*range(len(self.names))], np.flatnonzero((self.of_flare == 1.0).all(axis=1))
         if factors.size:
-            order = np.append(np.delete(order, factors[0]), factors[0])
-        spread = self._rows(order.tolist())
+            order.append(order.pop(int(factors[0])))
+        spread = self._rows(order)
         spectra = spread.spectra + spread.of_flare * flare_dn
         if factors.size:
             spectra[-1] = spread.spectra[-1]
@@ -190,12 +165,11 @@ class Nuisances(ContentEquality):
         return np.asarray(self.mean @ self.spectra)
 
     def fitted_dn(self, counts: Float, variance: Float, flare_dn: Float) -> Float:
-        """Return the light of the unknowns, fitted together with a flare to counts less the star's.
+        """Return the light of the unknowns, fitted together with a flare to counts less the star's, all (n_pixel,).
 
-        All arrays have the shape (n_pixel,). The variance is infinite for pixels that are left out.
+        The variance is infinite for pixels that are left out.
         """
-        for key, values in (("counts", counts), ("variance", variance), ("flare_dn", flare_dn)):
-            self._check_pixels(key, values)
+        self._check_pixels(counts=counts, variance=variance, flare_dn=flare_dn)
         # The amplitude of the flare has a flat prior.
         sd = np.append(self.sd, np.inf)
         amplitudes = fitted_amplitudes(np.vstack([self.spectra, flare_dn]), sd, counts, variance)
@@ -249,13 +223,8 @@ def join_names(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def read_at_pixels(
-    kind: Literal["weights", "spectrum"], name: str, path: Path, wavelength_nm: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Read weights per DN of a statistic, or the spectrum of an unknown in DN per exposure, as values of pixels.
-
-    The file's columns are wavelengths, nm, and values, which are interpolated by `at_pixels`.
-    """
+def read_at_pixels(kind: Literal["weights", "spectrum"], name: str, path: Path, wavelength_nm: Float) -> Float:
+    """Read weights per DN of a statistic, or the spectrum of an unknown in DN per exposure, and apply `at_pixels`."""
     from mauvecl.host.tables.text_tables import columns
 
     what, values = f"{kind} {shortened(path.name)} of {shortened(name)}", "DN" if kind == "spectrum" else kind
@@ -263,9 +232,7 @@ def read_at_pixels(
     return at_pixels(what, values, rows, wavelength_nm)
 
 
-def at_pixels(
-    what: str, kind: str, rows: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def at_pixels(what: str, kind: str, rows: Float, wavelength_nm: Float) -> Float:
     """Interpolate rows of wavelength, nm, and value linearly to pixels, 0 outside their range.
 
     `what` and `kind` name the source and its values in messages.

@@ -1,8 +1,7 @@
 """Requests to an engine as plain data: statistics by name, hypotheses, channels and shards.
 
-Every worker computes the same result from a request. A shard is a range of realisations of one part of a request. Its
-counts are integers, and its extreme values carry their realisations, so shards can be counted in any order, on any
-device, and more than once; `sums` adds them up.
+Every worker computes the same result from a request. The counts of a shard are integers, and its extreme values carry
+their realisations, so shards can be counted in any order, on any device, and more than once.
 """
 
 from __future__ import annotations
@@ -16,12 +15,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
 from mauvecl.detection.counts import Grid, TailSamples
 from mauvecl.detection.distributions import Form
-from mauvecl.detection.names import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
@@ -38,37 +38,9 @@ STATISTICS: dict[str, Statistic] = {
 }
 
 
-def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
-    """Return the requested statistics by name.
-
-    `asked` holds names of `STATISTICS` and user-defined statistics. Raises InputError if it is empty, or a name is
-    unknown or not unique.
-    """
-    named: dict[str, Statistic] = {}
-    own: set[str] = set()
-    for statistic in asked:
-        if isinstance(statistic, str):
-            check_statistic(statistic)
-            named.setdefault(statistic, STATISTICS[statistic])
-            continue
-        if statistic.name in STATISTICS:
-            raise InputError(f"statistic {statistic.name!r} is mauvecl's own; use another name", key="statistics")
-        if statistic.name in own:
-            raise InputError.of("statistics", statistic.name, "different names")
-        own.add(statistic.name)
-        named[statistic.name] = statistic
-    if not named:
-        raise InputError(f"no statistic is named; give some of {', '.join(STATISTICS)}", key="statistics")
-    return named
-
-
 def statistic_label(name: str) -> str:
     """Return the axis label of a statistic; that of a user-defined one is its name."""
     return STATISTICS[name].label if name in STATISTICS else name
-
-
-#: Standard deviations by which a flare lowers a weighted sum before it is reported; less is rounding.
-LEAST_SHIFT = 1e-3
 
 
 @validated
@@ -87,18 +59,30 @@ class Hypotheses:
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._chosen = statistics_by_name(self.asked)
+        self._chosen = {}
+        for statistic in self.asked:
+            if isinstance(statistic, str):
+                check_statistic(statistic)
+                self._chosen[statistic] = STATISTICS[statistic]
+            elif statistic.name in STATISTICS:
+                raise InputError(f"statistic {statistic.name!r} is mauvecl's own; use another name", key="statistics")
+            elif statistic.name in self._chosen:
+                raise InputError.of("statistics", statistic.name, "different names")
+            else:
+                self._chosen[statistic.name] = statistic
+        if not self._chosen:
+            raise InputError(f"no statistic is named; give some of {', '.join(STATISTICS)}", key="statistics")
         self.statistics = tuple(self._chosen)
         scene = self.scene
         drawn = factor_distributions(scene.modulations, scene.priors, scene.medians, scene.n_frames)
         self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
-        shaped = next((name for name, statistic in self._chosen.items() if statistic.shaped), None)
-        if shaped is not None and not self.flares:
-            raise InputError(f"the statistic {shaped!r} needs at least one flare, but none is given", key="flares")
+        shaped = [name for name, kind in self._chosen.items() if kind.shaped]
+        if shaped and not self.flares:
+            raise InputError(f"the statistic {shaped[0]!r} needs at least one flare, but none is given", key="flares")
         if not self.scene.used.any():
             raise entirely_saturated(self.quiet, "quiet")
-        for statistic in self._chosen.values():
-            statistic.check(self.setting)
+        for kind in self._chosen.values():
+            kind.check(self.setting)
         for k, flare in enumerate(self.flares if "matched" in self._chosen else ()):
             # `messages` report a flare that saturates every pixel.
             if k not in self.blinding:
@@ -120,11 +104,8 @@ class Hypotheses:
         self._check(statistic, None, template)
         return self.flares[template] if self.statistic(statistic).shaped else None
 
-    def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
-        """Return the weights per DN of a linear statistic, shape (n_pixel,); None for others.
-
-        Shaped statistics use the flare with the index `template`.
-        """
+    def weights(self, statistic: str, template: int = 0) -> Float | None:
+        """Return the weights per DN of a linear statistic, shape (n_pixel,), with a flare as template; else None."""
         kind = self.statistic(statistic)
         if not isinstance(kind, LinearStatistic):
             return None
@@ -139,30 +120,24 @@ class Hypotheses:
     @property
     def messages(self) -> tuple[Message, ...]:
         """Remarks on saturating flares."""
-        return tuple(
-            Message(
-                f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
-                "longer depends on the flare, and no number is given.",
-                "saturated",
-            )
-            for k in self.blinding
+        text = (
+            f"saturates every pixel of {self.quiet.name} that counts: what is recorded no longer depends on the flare, "
+            "and no number is given."
         )
+        return tuple(Message(f"SATURATED: flare {k + 1} {text}", "saturated") for k in self.blinding)
 
     @cached_property
     def lowered(self) -> tuple[Message, ...]:
         """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
-        sentences = []
+        sentences, how = [], "marginalised over unknowns, " if self.nuisances else ""
         for name, (k, flare) in product(self.statistics, enumerate(self.flares)):
-            falls = self.fall(name, k)
-            if falls:
+            if falls := self.fall(name, k):
                 matched = Matched().closed_form(self.setting, flare, flare)
-                how = "marginalised over unknowns, " if self.nuisances else ""
-                text = (
+                sentences.append(Message(
                     f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
                     f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing of "
-                    f"the flare, which matched has at {matched.mean / matched.std:.3g}."
-                )
-                sentences.append(Message(text, "wrong sign"))
+                    f"the flare, which matched has at {matched.mean / matched.std:.3g}.", "wrong sign",
+                ))  # fmt: skip
         return tuple(sentences)
 
     def fall(self, statistic: str, flare: int) -> float:
@@ -194,7 +169,8 @@ class Hypotheses:
 def fall_between(null: Form, flare: Form) -> float:
     """Return the standard deviations by which a flare lowers the mean of a statistic, or 0 if it does not."""
     shift = (flare.mean - null.mean) / null.std
-    return -shift if shift < -LEAST_SHIFT else 0.0
+    # Less than a thousandth is rounding.
+    return -shift if shift < -1e-3 else 0.0
 
 
 def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], number: int = 0) -> None:
@@ -230,8 +206,9 @@ class ChannelPlan:
 
     def tails(self) -> list[TailSamples | None]:
         """Return accumulators of each grid's extremes: the largest values of a null, the smallest of a flare."""
-        roles = [role for _, role, _ in self.keys]
-        return [None if role == "flare_on_null_grid" else TailSamples(largest=role == "null") for role in roles]
+        return [
+            None if role == "flare_on_null_grid" else TailSamples(largest=role == "null") for _, role, _ in self.keys
+        ]
 
     @property
     def n_rows(self) -> int:
@@ -240,16 +217,15 @@ class ChannelPlan:
 
 
 #: Rows of weights by statistic, scenario and template, ordered by scenario.
-Rows = dict[tuple[str, int, int], NDArray[np.float64]]
+Rows = dict[tuple[str, int, int], Float]
 
 
 def _rows(
     hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]
 ) -> tuple[Rows, Rows, NDArray[np.uint32]]:
-    """Return the weights of sums, and the scales of the paper's statistic, in the kernel's order.
+    """Return the weights of sums, and the scales of the paper's statistic, in the kernel's order, and ends of rows.
 
-    The third result is the ends of linear rows, of those with weights per pixel, and of smoothed rows of each scenario,
-    shape (3, n_scenario).
+    The ends are those of linear rows, of those with weights per pixel, and of smoothed rows, shape (3, n_scenario).
     """
     weighted, smoothed, ends = Rows(), Rows(), []
     for scenario in range(1 + len(batch)):
@@ -287,12 +263,12 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
             return fixed * scenario + FIXED_STATISTICS.index(statistic.kernel_sum)
         return channels[statistic.name, scenario, flare if statistic.shaped else 0]
 
-    subtractions = []
-    n_subtracted = len(hypotheses.nuisances.names) if hypotheses.nuisances else 0
-    sums = [statistic for statistic in asked if isinstance(statistic, Chi2)] if n_subtracted else []
-    for chi2, scenario in product(sums, range(n_scenario)):
-        begin = channels[chi2.name, scenario, 0]
-        subtractions.append((channel_of(chi2, scenario, 0), begin, begin + n_subtracted))
+    subtractions: list[tuple[int, int, int]] = []
+    if hypotheses.nuisances:
+        sums = [statistic for statistic in asked if isinstance(statistic, Chi2)]
+        for chi2, scenario in product(sums, range(n_scenario)):
+            begin = channels[chi2.name, scenario, 0]
+            subtractions.append((channel_of(chi2, scenario, 0), begin, begin + len(hypotheses.nuisances.names)))
     counted: list[tuple[Key, int, Form]] = []
     for statistic in asked:
         name = statistic.name
@@ -305,14 +281,16 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
             channel = channel_of(statistic, i + 1, flare)
             counted.append(((name, "flare_on_null_grid", flare), channel, null))
             counted.append(((name, "flare", flare), channel, hypotheses.closed_form(name, flare)))
-    grids = [Grid(channel, form.mean, form.std) for _, channel, form in counted]
     scene = hypotheses.scene
     weights = np.zeros((len(weighted), len(scene.pixels)), np.float32)
     weights[:, : scene.n_pixel] = np.reshape([*weighted.values()], (len(weighted), scene.n_pixel))
     scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
-    taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
-    keys = [key for key, _, _ in counted]
-    return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)
+    return ChannelPlan(
+        weights, linear_end, pixels_end, scales, scale_end,
+        grids=[Grid(channel, form.mean, form.std) for _, channel, form in counted],
+        keys=[key for key, _, _ in counted],
+        subtractions=np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -407,18 +385,16 @@ class DetectRequest(Countable):
         size = BATCH[scene.frames] - 1
         batches = [range(i, min(i + size, count)) for i in range(0, count, size)] or [range(0)]
         return [
-            (plan_channels(self.hypotheses, batch, first=number == 0), scene.part([0, *(k + 1 for k in batch)]))
-            for number, batch in enumerate(batches)
+            (plan_channels(self.hypotheses, batch, first=batch is batches[0]), scene.part([0, *(k + 1 for k in batch)]))
+            for batch in batches
         ]
 
     @property
     def parts(self) -> int:
-        """Number of parts, whose launches differ."""
         return len(self.plans)
 
     @property
     def work(self) -> int:
-        """Work per realisation: pixels times scenarios."""
         return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
 
 
@@ -446,5 +422,4 @@ class SnrRequest(RealiseRequest):
 
     @property
     def work(self) -> int:
-        """Work per realisation: pixels."""
         return self.scene.n_pixel

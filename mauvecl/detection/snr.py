@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.detection.counts import SparseCounts, TailSamples, Tally, steps_of
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.noise import layout
 from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
@@ -186,13 +186,12 @@ class SnrResult(Drawable, ContentEquality):
     def pixel(self) -> QTable:
         """S/N per pixel: wavelength, closed form, simulated mean, standard deviation, quantiles, clipped frames.
 
-        The expectation's `signal` defines the signal. The histogram counts whole DN, of which the S/N is a function, in
-        bins of at most 1/64 of a standard deviation.
+        The histogram counts whole DN, of which the S/N is a function, in bins of at most 1/64 of a standard deviation.
         """
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
         width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
 
-        def snr(which: int, place: NDArray[np.number]) -> NDArray[np.float64]:
+        def snr(which: int, place: NDArray[np.number]) -> Float:
             # A bin contains the whole DN from its lower edge up to the next.
             dn = width[which] * place - 0.5
             net = dn + seen["net_offset"].astype(float)[which]
@@ -209,7 +208,7 @@ class SnrResult(Drawable, ContentEquality):
         per_unit = self.elements["bins_per_unit"]
         step = np.divide(1.0, per_unit, out=np.zeros(len(per_unit)), where=per_unit > 0)
 
-        def snr(which: int, place: NDArray[np.number]) -> NDArray[np.float64]:
+        def snr(which: int, place: NDArray[np.number]) -> Float:
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
@@ -218,13 +217,9 @@ class SnrResult(Drawable, ContentEquality):
         return f"of {self.expectation.name!r}, {self.counts.n} realisations"
 
     def _table(
-        self,
-        kind: str,
-        wavelength_nm: NDArray[np.float64],
-        expected: NDArray[np.float64],
-        snr: Callable[[int, NDArray[np.number]], NDArray[np.float64]],
-        **clipped: NDArray[np.float64],
-    ) -> QTable:
+        self, kind: str, wavelength_nm: Float, expected: Float, snr: Callable[[int, NDArray[np.number]], Float],
+        **clipped: Float,
+    ) -> QTable:  # fmt: skip
         """Return the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
         rows = []
         for which in range(len(expected)):
@@ -246,14 +241,11 @@ Arrays = dict[str, NDArray[Any]]
 
 def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arrays:
     """Pack a shard of a detection as arrays."""
-    shard = _pack_counts("counts", tally.fine.keys, tally.fine.counts)
-    shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
-    shard["n"] = np.array(tally.n)
-    for number, far in enumerate(tally.far):
+    shard = _pack_counts("counts", tally.fine) | {"sums": tally.sums.astype(str), "n": np.array(tally.n)}
+    for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
         if far.n or far.undefined:
-            shard |= _pack_counts(f"far-{number}", far.keys, far.counts)
+            shard |= _pack_counts(f"far-{number}", far)
             shard[f"far-{number}-sums"] = np.array([str(x) for x in (far.first, far.second, far.undefined)])
-    for number, tail in enumerate(samples):
         if tail is not None:
             shard[f"values-{number}"], shard[f"realisations-{number}"] = tail.values, tail.realisations
     return shard
@@ -263,7 +255,7 @@ def pack_snr(counts: Counts) -> Arrays:
     """Pack a shard of an S/N as arrays."""
     shard = {"clipped": counts.clipped, "n": np.array(counts.n)}
     for kind, each in counts.bins.items():
-        shard |= _pack_counts(kind, each.keys, each.counts)
+        shard |= _pack_counts(kind, each)
     return shard
 
 
@@ -279,11 +271,10 @@ class DetectionSums:
         tally, samples = self._sums[part]
         sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
         tally.merge(*_unpack_counts("counts", shard), sums, int(shard["n"]))
-        for number, far in enumerate(tally.far):
+        for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
             if f"far-{number}" in shard:
                 far.add(*_unpack_counts(f"far-{number}", shard))
                 far.add_sums(*(int(value) for value in shard[f"far-{number}-sums"]))
-        for number, tail in enumerate(samples):
             if tail is not None:
                 tail.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])
 
@@ -316,10 +307,11 @@ class SnrSums:
         return SnrResult(x, scene, observers(x, scene), self._elements, self._counts)
 
 
-def _pack_counts(name: str, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> Arrays:
+def _pack_counts(name: str, counted: SparseCounts) -> Arrays:
     """Pack counts of ascending keys as differences of keys, in the smallest integer types."""
-    steps = np.diff(keys)
-    return {f"{name}-first": keys[:1], f"{name}-steps": _smallest_type(steps), name: _smallest_type(counts)}
+    parts = {f"{name}-steps": np.diff(counted.keys), name: counted.counts}
+    packed = {key: each.astype(np.min_scalar_type(int(each.max(initial=0)))) for key, each in parts.items()}
+    return {f"{name}-first": counted.keys[:1], **packed}
 
 
 def _unpack_counts(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -327,7 +319,3 @@ def _unpack_counts(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray
     first = shard[f"{name}-first"]
     keys = np.cumsum(np.concatenate([first, shard[f"{name}-steps"].astype(np.int64)]), dtype=np.int64)
     return keys, shard[name].astype(np.int64)
-
-
-def _smallest_type(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
-    return values.astype(np.min_scalar_type(int(values.max(initial=0))))

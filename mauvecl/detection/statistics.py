@@ -5,14 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.detection.nuisances import Nuisances, join_names
-from mauvecl.host.arrays import ContentEquality
+from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.noise.scene import FactorDistribution, changes_of, factor_nodes
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison, SignalPart
 from mauvecl.schema.calls import validated
@@ -21,7 +21,6 @@ from mauvecl.schema.errors import InputError
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
 T = TypeVar("T")
 
 
@@ -71,8 +70,7 @@ class Tilt:
     per_sigma: float = 1.0  # change of a linear statistic for one standard deviation along its direction
 
 
-@dataclass(frozen=True, eq=False)
-class DetectionForms:
+class DetectionForms(NamedTuple):
     """Distributions of a statistic without and with a flare for Gaussian noise, and its threshold."""
 
     null: Form
@@ -81,7 +79,6 @@ class DetectionForms:
 
     @property
     def probability(self) -> float:
-        """Detection probability."""
         return self.flaring.sf(self.threshold)
 
 
@@ -149,22 +146,15 @@ class Statistic(ABC):
 
     def detection_forms(self, setting: Setting, flare: Expectation, fap: float) -> DetectionForms:
         """Return the closed forms without and with a flare, and the threshold at a false-alarm probability."""
-        template = flare if self.shaped else None
-
-        quiet = setting.quiet
+        template, quiet = flare if self.shaped else None, setting.quiet
         null = setting.cached(f"null of {self.name}", lambda: self.closed_form(setting, quiet, template), template)
         threshold = setting.cached(f"threshold of {self.name} at {fap!r}", lambda: null.isf(fap), template)
         return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
 
     def integrate_drawn(
-        self,
-        setting: Setting,
-        observed: Expectation,
-        seen: Differences,
-        flare: Expectation | None,
-        *,
+        self, setting: Setting, observed: Expectation, seen: Differences, flare: Expectation | None, *,
         priors: bool = True,
-    ) -> Form:
+    ) -> Form:  # fmt: skip
         """Return `form` integrated over those nuisance parameters that are drawn.
 
         Without `priors`, nuisance parameters that are not drawn do not scatter.
@@ -184,14 +174,9 @@ class Statistic(ABC):
         return parts[0] if len(parts) == 1 else Mixture(tuple(parts), nodes.probability)
 
     def moved_forms(
-        self,
-        setting: Setting,
-        seen: Differences,
-        amounts: Float,
-        means: Float,
-        variances: Float,
+        self, setting: Setting, seen: Differences, amounts: Float, means: Float, variances: Float,
         flare: Expectation | None,
-    ) -> Sequence[QuadraticForm | Gaussian]:
+    ) -> Sequence[QuadraticForm | Gaussian]:  # fmt: skip
         """Return `form` for several amounts of changes of the means and variances.
 
         `amounts` has the shape (n, k), `means` and `variances` the shape (k, n_pixel).
@@ -209,11 +194,7 @@ class Statistic(ABC):
 
     @abstractmethod
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
-        """Compute the statistic of differences on the host, shape (n,).
-
-        `x` and `variance` are the differences, DN, and the variances by which they are divided, DN^2, both of shape
-        (n, n_pixel).
-        """
+        """Compute the statistic of differences, DN, divided by variances, DN^2, both (n, n_pixel), shape (n,)."""
 
     @abstractmethod
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
@@ -263,18 +244,12 @@ class LinearStatistic(Statistic):
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> Gaussian:
         none = np.zeros((0, seen.mean.size))
-        (form,) = self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)
-        return form
+        return self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)[0]
 
     def moved_forms(
-        self,
-        setting: Setting,
-        seen: Differences,
-        amounts: Float,
-        means: Float,
-        variances: Float,
+        self, setting: Setting, seen: Differences, amounts: Float, means: Float, variances: Float,
         flare: Expectation | None,
-    ) -> Sequence[Gaussian]:
+    ) -> Sequence[Gaussian]:  # fmt: skip
         # The sums over pixels are linear in the amounts.
         weights, scatter = self.weights_per_dn(setting, flare), seen.scatter
         mean = weights @ seen.mean + amounts @ (means @ weights)
@@ -353,15 +328,11 @@ class UvExcess(LinearStatistic):
 class Linear(ContentEquality, LinearStatistic):
     """A user-defined statistic: the sum over pixels of weight times (observed - reference), DN of the exposure.
 
-    Attributes
-    ----------
-    name : str
-    weights : ndarray, shape (n_pixel,)
-        Weights per DN; pixels that saturate in the reference are not used.
+    Its `weights` per DN have the shape (n_pixel,); pixels that saturate in the reference are not used.
     """
 
     name: str
-    weights: NDArray[np.float64]
+    weights: Float
 
     definition: ClassVar[str] = "user-defined weighted sum"
     label: ClassVar[str] = ""
@@ -370,8 +341,8 @@ class Linear(ContentEquality, LinearStatistic):
     def __post_init__(self) -> None:
         weights = np.array(self.weights, np.float64)
         object.__setattr__(self, "weights", weights)
-        if weights.ndim != 1 or not np.isfinite(weights).all() or not weights.any():
-            bad = int((~np.isfinite(weights)).sum())
+        bad = int((~np.isfinite(weights)).sum())
+        if weights.ndim != 1 or bad or not weights.any():
             raise InputError(
                 f"statistic {self.name!r} must have one finite weight per pixel, not all zero, but has weights of the "
                 f"shape {weights.shape}, {bad} of them not finite",

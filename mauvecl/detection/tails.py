@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.detection import check_atom, check_probability, least_countable
 from mauvecl.detection.distributions import (
     CONFIDENCE_SD,
     Interval,
@@ -25,8 +25,8 @@ from mauvecl.detection.distributions import (
     central_counts,
     clopper_pearson,
 )
-from mauvecl.detection.names import check_atom, check_probability, least_countable
 from mauvecl.detection.statistics import Differences
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.scene import factor_nodes, quantile_at_score
@@ -125,7 +125,7 @@ def count_tests(frames: int, stack: int, step: int) -> int:
     return (frames - stack) // step + 1
 
 
-def _maxima(stretch: int, stack: int, step: int, seed: int) -> NDArray[np.float64]:
+def _maxima(stretch: int, stack: int, step: int, seed: int) -> Float:
     """Draw the largest sum of normals over a stretch of overlapping stacks, shape (SIMULATIONS,)."""
     generator = np.random.default_rng(seed)
     size = (stretch - 1) * step + stack
@@ -137,8 +137,6 @@ def _maxima(stretch: int, stack: int, step: int, seed: int) -> NDArray[np.float6
         parts.append((sums[:, stack:] - sums[:, :-stack])[:, ::step].max(axis=1))
     return np.concatenate(parts)
 
-
-Float = NDArray[np.float64]
 
 #: Initial and largest number of realisations, which is doubled in each step.
 FIRST_REALISATIONS, MAX_REALISATIONS = 8_000, 512_000
@@ -221,20 +219,19 @@ def _check(hypotheses: Hypotheses, fap: float) -> None:
 
 def _threshold(values: Float, weights: Float, fap: float) -> tuple[Interval, float]:
     """Return the value with a weighted fraction `fap` at or above, and the fraction's relative error."""
-    order = np.argsort(-values, kind="stable")
+    order, n = np.argsort(-values, kind="stable"), values.size
     ordered, weight = values[order], weights[order]
-    above = np.cumsum(weight) / values.size
-    # Variance of the mean weight of the draws that exceed each value.
-    variance = np.maximum(np.cumsum(weight**2) / values.size - above**2, 0.0) / values.size
-    error = np.sqrt(variance)
+    above = np.cumsum(weight) / n
     if above[-1] < fap:
         return Interval(math.nan, math.nan, math.nan), math.inf
     at = int(np.searchsorted(above, fap))
-    relative = float(error[at] / above[at])
+    # Relative standard error of the mean weight of the draws that exceed the value.
+    variance = np.maximum(np.cumsum(weight**2)[at] / n - above[at] ** 2, 0.0) / n
+    relative = float(np.sqrt(variance) / above[at])
     # The fraction at the ends differs by its error at the threshold.
     reach = CONFIDENCE_SD * relative
     ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
-    low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
+    low, high = (float(ordered[min(int(end), n - 1)]) for end in ends)
     return Interval(float(ordered[at]), low, high), relative
 
 
@@ -329,16 +326,13 @@ def _block(
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
     variance = np.broadcast_to(kind.variance(hypotheses.setting), excess.shape)
     if scene.comparison.estimated:
-        variance = _estimated(scene, excess) + added * _estimated(scene, mean)
+        # The variances that an observer estimates of both exposures.
+        known = scene.estimates[0, : scene.n_pixel]
+        nets = (one - scene.fraction[0, : scene.n_pixel] + known["net_offset"] for one in (excess, mean))
+        own, other = (np.maximum(net, 0.0) * known["gain"] + known["variance"] for net in nets)
+        variance = own + added * other
     shape = hypotheses.shape(statistic, template)
     return kind.values(hypotheses.setting, excess - mean, variance, shape), logs
-
-
-def _estimated(scene: Scene, excess: Float) -> Float:
-    """Return the variances that an observer estimates, DN^2, shape (n, n_pixel)."""
-    estimate = scene.estimates[0, : scene.n_pixel]
-    net = excess - scene.fraction[0, : scene.n_pixel] + estimate["net_offset"]
-    return np.asarray(np.maximum(net, 0.0) * estimate["gain"] + estimate["variance"])
 
 
 def _normals(n_pixel: int, seed: int, block: int, exposure: int, purpose: int = 0) -> Float:
@@ -357,8 +351,6 @@ def _factors(
 ) -> tuple[dict[str, Float], Float]:
     """Draw factors on light, dark and sky, each minus one, shape (BLOCK,), and the logarithms of their weights."""
     factors = {str(name): np.ones(BLOCK) for name in SIGNAL_PARTS}
-    if not scene.modulations:
-        return {name: values - 1.0 for name, values in factors.items()}, np.zeros(BLOCK)
     kinds = [factor for _, factor in scene.modulations]
     # The scores of every second realisation are moved, which limits weights to two.
     moved = np.arange(BLOCK)[:, None] % 2 == 1

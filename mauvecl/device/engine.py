@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection import requests, snr
+from mauvecl.detection import DEFAULT_STATISTICS, Tails, requests, snr
 from mauvecl.detection.counts import TailSamples, Tally
 from mauvecl.detection.detection import Detection
-from mauvecl.detection.names import DEFAULT_STATISTICS, Tails
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.snr import Arrays, SnrResult
 from mauvecl.detection.statistics import Linear
@@ -219,8 +218,9 @@ class Engine:
                     launches.flush_counts(counts)
                 return snr.pack_snr(counts)
             case requests.RealiseRequest():
-                how: Any = {"start": shard.start, "count": shard.count, "seed": request.seed, "out": out}
-                return {"rows": self.realise(request.expectation, **how, **request.drawing.options)}
+                x, seed, how = request.expectation, request.seed, vars(request.drawing)
+                rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
+                return {"rows": rows}
         # Exposures do not need the modules of stares.
         from mauvecl.device.stares import Stares
         from mauvecl.flares.stare_scene import StaresRequest

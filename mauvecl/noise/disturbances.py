@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
@@ -20,12 +20,8 @@ from mauvecl.schema.physical import Duration
 from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from mauvecl.host.arrays import Float
     from mauvecl.host.exposure.expectation import Expectation
-
-    Float = NDArray[np.float64]
 
 #: Events in a pixel and draw with a smaller probability are neglected.
 NEGLIGIBLE = 2.0**-40
@@ -90,10 +86,8 @@ class CosmicRays(AdditiveProcess):
     ----------
     rate_per_cm2_s : float
         Hits per area and time.
-    area_cm2 : float
-        Area of the whole detector: 2048 pixels of 14 x 200 um.
-    pixels : int
-        Number of pixels that share the area; a hit affects one pixel.
+    area_cm2, pixels : float and int
+        Area of the whole detector, 2048 pixels of 14 x 200 um, and number of pixels; a hit affects one of them.
     electrons : tuple of float, shape (2,)
         Smallest and largest number of electrons of a hit.
     weights : tuple of float, optional
@@ -235,7 +229,7 @@ class Uniform:
         if not self.low <= self.high:
             raise InputError.of("low", self.low, f"at most high = {self.high:g}")
 
-    def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
+    def quantile(self, below: Float, above: Float | None = None) -> Float:
         """Return the quantiles at probabilities `below`; see `Normal.quantile`."""
         import numpy as np
 
@@ -274,7 +268,7 @@ class Normal:
         """Return whether both cuts are at least this many standard deviations from the mean."""
         return min(self.mean - self.low, self.high - self.mean) >= least_sd * self.sd * (1.0 - 1e-12)
 
-    def quantile(self, below: NDArray[np.float64], above: NDArray[np.float64] | None = None) -> Float:
+    def quantile(self, below: Float, above: Float | None = None) -> Float:
         """Return the quantiles at probabilities `below`; `above` is 1 - below, if subtraction would lose precision."""
         import numpy as np
         from scipy import special
@@ -301,14 +295,15 @@ def _from_study(given: Any) -> Prior:
     """Return the prior that a study gives as a table; raises InputError otherwise."""
     if isinstance(given, Uniform | Normal):
         return given
+    table = given if isinstance(given, Mapping) else {}
     for kind, form in _FORMS.items():
-        if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == {*form}:
+        if {key for key in table if table[key] is not None} == {*form}:
             for key in form:
-                if not isinstance(given[key], list | tuple) or len(given[key]) != 2:
-                    raise InputError.of(key, given[key], "2 numbers")
-            return kind(*(_number(value) for key in form for value in given[key]))
+                if not isinstance(table[key], list | tuple) or len(table[key]) != 2:
+                    raise InputError.of(key, table[key], "2 numbers")
+            return kind(*(_number(value) for key in form for value in table[key]))
     keys = [key for form in _FORMS.values() for key in form]
-    if isinstance(given, Mapping) and (other := next((key for key in given if key not in keys), None)):
+    if other := next((key for key in table if key not in keys), None):
         raise InputError(f"unknown key {other!r} of a prior; use some of {', '.join(keys)}", key=other)
     raise InputError(
         "a prior must be { uniform = [low, high] } or { normal = [mean, sd], between = [low, high] }", key="uniform"
@@ -324,9 +319,8 @@ def _number(value: Any) -> Any:
 
 def _to_study(prior: Prior) -> dict[str, tuple[float, ...]]:
     """Return the table that a study contains."""
-    if isinstance(prior, Uniform):
-        return {"uniform": (prior.low, prior.high)}
-    return {"normal": (prior.mean, prior.sd), "between": (prior.low, prior.high)}
+    values = astuple(prior)
+    return {key: values[2 * k : 2 * k + 2] for k, key in enumerate(_FORMS[type(prior)])}
 
 
 _SCHEMA = [

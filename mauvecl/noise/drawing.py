@@ -9,14 +9,15 @@ realistic number of draws reveals the difference.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
-from itertools import chain, product
-from typing import TYPE_CHECKING, Literal, Self, TypedDict, cast
+from itertools import product
+from typing import TYPE_CHECKING, Literal, Self, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import Prior
 from mauvecl.noise.unknowns import NONE, PROCESSES, SIGNAL_PARTS, Conditions, Processes, SignalPart
@@ -25,8 +26,6 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
 
 #: Gaussian noise with a standard deviation of this many Poisson steps reduces them to 2 exp(-2 pi^2 1.5^2) = 1e-19.
 SMOOTH_STEPS = 1.5
@@ -46,15 +45,12 @@ class Cumulants:
     """Cumulants of one draw of a scenario, DN; arrays have the shape (n_pixel,)."""
 
     mean: Float  # mean, including bias
-    #: Variance of the Gaussian part: read noise, rounding of a stack's frames, and Gaussian photon noise.
-    gaussian: Float
+    gaussian: Float  # variance of read noise, rounding of a stack's frames, and Gaussian photon noise
     photons: Float  # mean electrons of light
-    #: DN per Poisson count; the first is 0 for Gaussian photon noise.
-    photon_step: Float
+    photon_step: Float  # DN per Poisson count; 0 for Gaussian photon noise
     dark_step: Float
-    #: Means of dark and light.
-    dark_dn: Float
-    light_dn: Float
+    dark_dn: Float  # mean of the dark
+    light_dn: Float  # mean of the light
     light_variance: Float  # variance of the light, Gaussian or Poisson
 
     @staticmethod
@@ -66,15 +62,10 @@ class Cumulants:
         # A stack of n rounded frames has a rounding variance of n/12; the rounding of the draw adds the last 1/12.
         other = each * x.read_noise_dn**2 + (each - 1) / 12
         return Cumulants(
-            mean=each * x.mean_raw_dn,
-            gaussian=other if poisson else other + gain**2 * photons,
-            photons=photons,
-            photon_step=gain if poisson else np.zeros_like(gain),
-            dark_step=x.dark_step_dn,
-            dark_dn=each * x.dark_dn,
-            light_dn=gain * photons,
-            light_variance=gain**2 * photons,
-        )
+            mean=each * x.mean_raw_dn, gaussian=other if poisson else other + gain**2 * photons, photons=photons,
+            photon_step=gain if poisson else np.zeros_like(gain), dark_step=x.dark_step_dn, dark_dn=each * x.dark_dn,
+            light_dn=gain * photons, light_variance=gain**2 * photons,
+        )  # fmt: skip
 
     def photon_cumulant(self, order: int) -> Float:
         """Return a cumulant of the photons, for orders of 3 and above."""
@@ -114,18 +105,15 @@ class Cumulants:
             bounds.append(of_light + of_dark)
         return bounds
 
-    def scaled(self, light: float | Float, dark: float) -> Cumulants:
-        """Return the cumulants with light and dark multiplied by factors."""
+    def scaled(self, x: Expectation, on_light: float, dark: float, sky: float) -> Cumulants:
+        """Return the cumulants with factors on all light, on the dark and on the sky of the scenario."""
+        light = on_light if sky == 1.0 else factor_on_light(on_light, sky, x)
         gaussian_light = np.where(self.photon_step > 0, 0.0, self.light_variance)
         return replace(
-            self,
-            mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
-            gaussian=self.gaussian + (light - 1.0) * gaussian_light,
-            photons=light * self.photons,
-            dark_dn=dark * self.dark_dn,
-            light_dn=light * self.light_dn,
-            light_variance=light * self.light_variance,
-        )
+            self, mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
+            gaussian=self.gaussian + (light - 1.0) * gaussian_light, photons=light * self.photons,
+            dark_dn=dark * self.dark_dn, light_dn=light * self.light_dn, light_variance=light * self.light_variance,
+        )  # fmt: skip
 
 
 def is_noticeable(distance: Float, variance: Float) -> NDArray[np.bool_]:
@@ -240,17 +228,11 @@ class Drawing:
     # Whether to draw each frame, or their sum at once. "auto" draws frames only near zero or saturation, and if a frame
     # has too little noise to treat its rounding as noise.
     mode: Mode = "auto"
-    # Whether to draw all noise of a pixel from one normal, or Poisson counts separately. "auto" draws separately only
-    # if the joint draw is not exact.
+    # Whether to draw all noise of a pixel from one normal, or Poisson counts separately, as "auto" does only if the
+    # joint draw is not exact.
     recipe: Recipe = "auto"
     processes: Processes = NONE  # optional noise processes
-    # Number of the first frame. Frame k of an exposure is drawn with an expectation of one frame and ``first_frame=k``.
-    first_frame: int = 0
-
-    @property
-    def options(self) -> DrawingOptions:
-        """Fields as keyword arguments."""
-        return cast(DrawingOptions, dict(vars(self)))
+    first_frame: int = 0  # frame k of an exposure is drawn with an expectation of one frame and ``first_frame=k``
 
 
 #: Options that follow from the noise.
@@ -289,10 +271,8 @@ class Factors:
     #: then from the high end, divided by the factor at its median, minus one. In this form float32 resolves priors of
     #: any width and location.
     tables: NDArray[np.float32]
-    #: Factors at the priors' medians, to which the tables are relative, in the order of `SIGNAL_PARTS`.
-    medians: dict[SignalPart, float]
-    #: Smallest and largest factors of all priors together.
-    ends: dict[SignalPart, tuple[float, float]]
+    medians: dict[SignalPart, float]  # factors at the priors' medians, in the order of `SIGNAL_PARTS`
+    ends: dict[SignalPart, tuple[float, float]]  # smallest and largest factors of all priors together
 
     @classmethod
     def of(cls, processes: Processes, conditions: Conditions) -> Self:
@@ -315,14 +295,14 @@ class Factors:
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
         return cls(tables, centre, ends)
 
-    def median_on_light(self, share: Float) -> Float:
-        """Return `on_light` at the priors' medians."""
-        return self.on_light(self.medians["light"], self.medians["sky"], share)
+    def median_on_light(self, x: Expectation) -> Float:
+        """Return `factor_on_light` at the priors' medians."""
+        return factor_on_light(self.medians["light"], self.medians["sky"], x)
 
-    @staticmethod
-    def on_light(light: float, sky: float, share: Float) -> Float:
-        """Return the factor on each pixel's total light, of which the sky has this share, shape (n_pixel,)."""
-        return np.asarray(light * (1.0 + (sky - 1.0) * share))
+
+def factor_on_light(light: float, sky: float, x: Expectation) -> Float:
+    """Return the factor on each pixel's total light, which includes the sky's, shape (n_pixel,)."""
+    return np.asarray(light * (1.0 + (sky - 1.0) * sky_share(x)))
 
 
 #: Frames are drawn one by one if a pixel's mean is within this many standard deviations of a rail.
@@ -349,6 +329,7 @@ class DrawMethod:
     photons: bool
     each: int  # frames per draw
     cumulants: list[Cumulants]  # of one draw of each scenario
+    tables: list[layout.AliasTable] = field(default_factory=list)  # of the scene, filled as its arrays are
 
 
 def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMethod:
@@ -357,16 +338,21 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
     factors = Factors.of(drawing.processes, quiet.conditions)
     if quiet.wavelength_nm.size > MAX_PIXELS:
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
-    for other in scenarios[1:]:
-        _check_same_detector(quiet, other)
+    for other, name in product(scenarios[1:], OF_DETECTOR):
+        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
+            raise InputError(
+                f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "
+                f"that of {quiet.name}",
+                key=name,
+            )
     # A grid of factors on light, dark and sky that spans the priors in steps of at most 2.
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
     corners = [*product(*(grid.tolist() for grid in grids))]
     frames = _draw_frames(scenarios, drawing, factors, corners)
     each = 1 if frames else quiet.n_frames
     cumulants = [Cumulants.of(x, each) for x in scenarios]
-    varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
-    joint = _joint(scenarios, varied, drawing.recipe)
+    varied = [(x, c.scaled(x, *at)) for (x, c), at in product(zip(scenarios, cumulants, strict=True), corners)]
+    joint = _joint(varied, drawing.recipe)
     if modulations and not joint:
         raise InputError(
             f"the noise of {quiet.name} must be drawn jointly if {modulations[0][0]} varies within a run: it needs "
@@ -375,7 +361,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
         )
     quartic = joint and any(
         is_noticeable(truncation_distance(c.over_sd(), fourth_power=False, varying=bool(modulations)), c.variance).any()
-        for c in chain(*varied)
+        for _, c in varied
     )
     return DrawMethod(factors, frames, joint, quartic, not joint and quiet.photon_noise == "poisson", each, cumulants)
 
@@ -389,7 +375,7 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     mean = x.mean_raw_dn
     ends = []
     for end_light, more_dark, sky in zip(*factors.ends.values(), strict=True):
-        more_light = factors.on_light(end_light, sky, sky_share(x))
+        more_light = factor_on_light(end_light, sky, x)
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
         ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
@@ -399,16 +385,11 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     return low | high
 
 
-def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
-    light, dark, sky = corner
-    return c.scaled(light if sky == 1.0 else Factors.on_light(light, sky, sky_share(x)), dark)
-
-
-def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
+def _joint(varied: Sequence[tuple[Expectation, Cumulants]], recipe: Recipe) -> bool:
     """Return whether each pixel's noise can be drawn from one normal for all factors on light and dark."""
     if recipe == "apart":
         return False
-    for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
+    for x, c in varied:
         exact = joint_is_exact(c)
         if exact.all():
             continue
@@ -426,34 +407,29 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
 def _draw_frames(
     scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors, corners: Sequence[tuple[float, float, float]]
 ) -> bool:
-    mode = drawing.mode
-    if scenarios[0].n_frames == 1 or mode == "frames":
+    if scenarios[0].n_frames == 1 or drawing.mode == "frames":
         # For a single frame, both modes give the same draws.
-        return mode == "frames" and scenarios[0].n_frames > 1
+        return drawing.mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
         near = near_rail(x, factors, drawing.processes)
         # The approximation of rounding as noise is worst for the least light and dark.
-        coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
+        coarse = ~stack_is_exact(Cumulants.of(x, 1).scaled(x, *corners[0]), x)
         for pixels, why in (
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
             (coarse, "treats rounding as noise, and a frame has too little noise for that"),
         ):
+            if pixels.any() and drawing.mode == "stacked":
+                where = f"in the pixel at {x.wavelength_nm[pixels][0]:.1f} nm of {x.name}"
+                raise InputError(f"mode must be 'frames' or 'auto': 'stacked' {why} {where}", key="mode")
             if pixels.any():
-                if mode == "stacked":
-                    where = float(x.wavelength_nm[pixels][0])
-                    raise InputError(
-                        f"mode must be 'frames' or 'auto': 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}",
-                        key="mode",
-                    )
                 return True
     return False
 
 
 def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
-    share, ends = sky_share(x), factors.ends
-    least, most = (factors.on_light(*both, share) for both in zip(ends["light"], ends["sky"], strict=True))
-    middle = factors.median_on_light(share)
+    ends, middle = factors.ends, factors.median_on_light(x)
+    least, most = (factor_on_light(*both, x) for both in zip(ends["light"], ends["sky"], strict=True))
     light = np.maximum(most - middle, middle - least)
     dark = max(ends["dark"][1] - factors.medians["dark"], factors.medians["dark"] - ends["dark"][0])
     variance = c.variance + most * c.light_variance + ends["dark"][1] * c.dark_variance
@@ -465,16 +441,6 @@ def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
             f"{reach[pixel]:.3g}: shorten the exposure or draw frame by frame",
             key="priors",
         )
-
-
-def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
-    for name in OF_DETECTOR:
-        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
-            raise InputError(
-                f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "
-                f"that of {quiet.name}",
-                key=name,
-            )
 
 
 def sky_share(x: Expectation) -> Float:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.unknowns import CHANGING, PROCESSES, STARE_PROCESSES
 
@@ -204,7 +205,7 @@ def alias_table(mean: float) -> AliasTable:
     if not 0.0 <= mean <= LARGEST_MEAN:
         raise ValueError(f"Poisson mean must be 0 to {LARGEST_MEAN:g}, not {mean!r}")
     if mean == 0.0:
-        return AliasTable(0, 1, _pack(np.array([2**WORD_BITS, 0]), 1))
+        return alias_table_of(np.ones(1))
     # All counts beyond this range have together less than half a word.
     reach = 6.5 * np.sqrt(mean) + 16.0
     low = max(int(mean - reach), 0)
@@ -215,7 +216,7 @@ def alias_table(mean: float) -> AliasTable:
     return alias_table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
 
 
-def alias_table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
+def alias_table_of(probability: Float, low: int = 0) -> AliasTable:
     """Compute the alias table of a distribution over the integers from `low` on.
 
     `probability` has up to 2**24 values, which need not sum to one.
@@ -227,13 +228,8 @@ def alias_table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable
     exact = padded / padded.sum() * 2.0**WORD_BITS
     words: NDArray[np.int64] = np.floor(exact).astype(np.int64)
     words[np.argsort(words - exact, kind="stable")[: int(2**WORD_BITS - words.sum())]] += 1
-    return AliasTable(low, bits, _pack(words, bits))
-
-
-def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
     shift = WORD_BITS - bits
-    share = 1 << shift
-    left: list[int] = words.tolist()
+    share, left = 1 << shift, words.tolist()
     # A full column is its own alias, with threshold 0.
     entries = [column << shift for column in range(1 << bits)]
     small = [c for c, n in enumerate(left) if n < share]
@@ -246,4 +242,4 @@ def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
             large.pop()
             if left[rich] < share:
                 small.append(rich)
-    return np.array(entries, dtype=np.uint32)
+    return AliasTable(low, bits, np.array(entries, dtype=np.uint32))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE, PointingDrifts
 from mauvecl.noise.drawing import DrawingOptions
@@ -64,9 +65,8 @@ def words_at(
 ) -> Words:
     """Return the four words that four neighbouring pixels of a realisation and frame share in a stream.
 
-    The number of the stream, of which `layout.STREAMS` has the names, is the top byte of the counter's last word. The
-    group is the pixel index divided by four, and the exposure 0 for the observed one and `layout.REFERENCE` for the
-    reference.
+    The number of the stream is the top byte of the counter's last word. The group is the pixel index divided by four,
+    and the exposure 0 for the observed one and `layout.REFERENCE` for the reference.
     """
     index, half = np.asarray(realisation, dtype=np.uint64), np.uint64(32)
     last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
@@ -285,14 +285,9 @@ def digitise(v: Floats, edge: np.void | NDArray[np.void], *, clip: bool) -> Floa
 
 
 def observed(
-    scene: Scene,
-    realisation: NDArray[np.uint64],
-    seed: int,
-    *,
-    exposure: int = 0,
-    number: int = 0,
+    scene: Scene, realisation: NDArray[np.uint64], seed: int, *, exposure: int = 0, number: int = 0,
     scenarios: Sequence[int] | None = None,
-) -> NDArray[np.int64]:
+) -> NDArray[np.int64]:  # fmt: skip
     """Sum the DN above the base over the draws of exposure `number`, (n_scenario, n_padded, n_realisation)."""
     drawn_frames = range(number * scene.n_draws, (number + 1) * scene.n_draws)
     index, frames, changes = _all_frames(scene, realisation, drawn_frames, seed, exposure)
@@ -336,8 +331,6 @@ def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
     return raw
 
 
-Float = NDArray[np.float64]
-
 #: Drifts that are drawn at a time, per stare.
 DRIFTS_AT_ONCE = 16
 
@@ -347,8 +340,7 @@ def pointing_drifts(
 ) -> tuple[Float, Float, Float]:
     """Draw start, duration and depth of the drifts of stares up to a time, shape (n_stare, n_drift) each.
 
-    Each stare depends only on the seed and its number. Drifts are in order of time, and the last one of each stare
-    begins at `end_s` or later.
+    Drifts are in order of time, and the last one of each stare begins at `end_s` or later.
     """
     parts: list[tuple[Float, Float, Float]] = []
     begin = np.zeros((len(numbers), 1))
@@ -367,26 +359,22 @@ def pointing_drifts(
 
 
 def pointing_losses(
-    process: PointingDrifts, numbers: NDArray[np.uint64], start_s: NDArray[np.float64], frame_s: float, seed: int
+    process: PointingDrifts, numbers: NDArray[np.uint64], start_s: Float, frame_s: float, seed: int
 ) -> Float:
     """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
 
     Frames start at `start_s` after the start of the stare.
     """
-    start, lasts, depth = pointing_drifts(process, numbers, float(start_s[-1]) + frame_s, seed)
-    # Light lost up to the start of each drift, in seconds.
-    before = np.cumsum(depth * lasts / 2, axis=1) - depth * lasts / 2
-    rows = zip(start, lasts, depth, before, strict=True)
-    lost = np.array([_lost_until(start_s + frame_s, *row) - _lost_until(start_s, *row) for row in rows])
+    drifts = pointing_drifts(process, numbers, float(start_s[-1]) + frame_s, seed)
+    ends, lost = np.array([start_s, start_s + frame_s]), np.empty((len(numbers), start_s.size))
+    for row, (start, lasts, depth) in enumerate(zip(*drifts, strict=True)):
+        # The integral of the lost share of the light up to both ends of each frame, s.
+        before = np.cumsum(depth * lasts / 2) - depth * lasts / 2
+        k = np.searchsorted(start, ends, side="right") - 1
+        since = np.clip(ends - start[k], 0.0, lasts[k])
+        until = before[k] + depth[k] * since * (since / np.maximum(lasts[k], 1e-300)) / 2
+        lost[row] = np.diff(np.where(k < 0, 0.0, until), axis=0)[0]
     return np.clip(lost / frame_s, 0.0, 1.0)
-
-
-def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float, before_s: Float) -> Float:
-    """Return the integral of the lost share of the light up to some times, s."""
-    k = np.searchsorted(start_s, times_s, side="right") - 1
-    since = np.clip(times_s - start_s[k], 0.0, duration_s[k])
-    until = before_s[k] + depth[k] * since * (since / np.maximum(duration_s[k], 1e-300)) / 2
-    return np.asarray(np.where(k < 0, 0.0, until))
 
 
 #: Frames that are drawn together.

@@ -12,28 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
-from mauvecl.noise.drawing import (
-    Cumulants,
-    Drawing,
-    DrawingOptions,
-    DrawMethod,
-    Factors,
-    check_reach,
-    choose_method,
-    nodes,
-    polynomial,
-    sky_share,
-)
+from mauvecl.noise.drawing import Drawing, Factors, check_reach, choose_method, nodes, polynomial, sky_share
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table, alias_table_of
 from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, SIGNAL_PARTS, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-
-Float = NDArray[np.float64]
+    from mauvecl.noise.drawing import Cumulants, DrawingOptions, DrawMethod
 
 #: Number of nodes of the trapezoidal rule over a prior's normal score, and its range. The rule converges exponentially
 #: for functions that are smooth over a step (Trefethen & Weideman 2014, doi 10.1137/130932132).
@@ -85,9 +74,9 @@ class Nodes:
 def changes_of(x: Expectation) -> tuple[Float, Float]:
     """Return changes by factors of an exposure's means (DN) and variances (DN^2), each shape (3, n_pixel).
 
-    Rows are for all light, which includes the sky's, for the sky's alone, and for the dark current, each for an amount
-    of one. A pixel that saturates records a change only in those frames that are not clipped, and its variance changes
-    by the same fraction as without saturation, so that no factor makes it negative.
+    Rows are for all light, which includes the sky's, for the sky's alone, and for the dark current. A pixel that
+    saturates records a change only in frames that are not clipped, and its variance changes by the same fraction as
+    without saturation, so that no factor makes it negative.
     """
     light, dark = np.array([x.light_dn, x.sky_dn]), x.n_frames * x.dark_dn
     variances = np.array([*(x.gain_dn_per_electron * light), x.n_frames * x.dark_variance_dn2])
@@ -102,27 +91,31 @@ def drawn_factors(processes: Processes, quiet: Expectation) -> dict[SignalPart, 
 
 
 def factor_distributions(
-    modulations: Sequence[tuple[str, SignalPart]],
-    tables: NDArray[np.float32],
-    medians: tuple[float, ...],
-    n_frames: int,
+    modulations: Sequence[tuple[str, SignalPart]], tables: NDArray[np.float32], medians: Sequence[float], n_frames: int
 ) -> dict[SignalPart, FactorDistribution]:
-    """Return the distributions of drawn factors on light, dark and sky; parameters as the fields of `Scene`."""
-    at_median, every = dict(zip(SIGNAL_PARTS, medians, strict=True)), dict[SignalPart, list[FactorDistribution]]()
+    """Return the distributions of drawn factors on light, dark and sky; parameters as the fields of `Scene`.
+
+    A product of several independent factors is treated as normal.
+    """
+    every = dict[SignalPart, list[FactorDistribution]]()
     for (name, factor), table in zip(modulations, tables, strict=True):
         # Relative to the factor at the median, as the table is.
         one = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
         if PROCESSES[name].when == "frame" and n_frames > 1:
-            one = _normal(one.mean, one.sd / np.sqrt(n_frames))
+            one = FactorDistribution(one.mean + one.sd / np.sqrt(n_frames) * SCORE)
         every.setdefault(factor, []).append(one)
-    return {name: _product(ones, at_median[name]) for name, ones in every.items()}
+    found = {}
+    for name, ones in every.items():
+        values = ones[0].values
+        if len(ones) > 1:
+            mean = np.prod([one.mean for one in ones])
+            values = mean + np.sqrt(np.prod([one.mean**2 + one.sd**2 for one in ones]) - mean**2) * SCORE
+        found[name] = FactorDistribution(medians[SIGNAL_PARTS.index(name)] * values)
+    return found
 
 
 def factor_nodes(factors: Mapping[SignalPart, FactorDistribution], x: Expectation, *, weighted: bool) -> Nodes:
-    """Return the nodes over which a statistic of an exposure is integrated.
-
-    `weighted` tells whether the statistic is a weighted sum instead of a sum of squares.
-    """
+    """Return the nodes over which a statistic of an exposure, a weighted sum or a sum of squares, is integrated."""
     light, sky, dark = zip(*changes_of(x), strict=True)
     moved: dict[SignalPart, tuple[Float, Float]] = {"dark": dark, "light": light, "sky": sky}
     grids, rows = [], []
@@ -148,24 +141,11 @@ def factor_nodes(factors: Mapping[SignalPart, FactorDistribution], x: Expectatio
     return Nodes(math.prod(weights), amounts, dict(zip(moved, scores, strict=True)), spectra)
 
 
-def _normal(mean: float, sd: float) -> FactorDistribution:
-    return FactorDistribution(mean + sd * SCORE)
-
-
 def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
     """Interpolate a device's quantile table at standard normal scores; the result has the shape of `score`."""
     below, above = special.ndtr(score), special.ndtr(-score)
     tail, (low, high) = nodes(), np.split(table.astype(np.float64), 2)
     return np.asarray(np.where(below < 0.5, np.interp(below, tail, low), np.interp(above, tail, high)))
-
-
-def _product(ones: list[FactorDistribution], median: float) -> FactorDistribution:
-    """Return the distribution of a product of independent factors, which is normal if there are several."""
-    if len(ones) == 1:
-        return FactorDistribution(median * ones[0].values)
-    mean = np.prod([prior.mean for prior in ones])
-    square = np.prod([prior.mean**2 + prior.sd**2 for prior in ones])
-    return _normal(float(median * mean), float(median * np.sqrt(square - mean**2)))
 
 
 #: Pixels are padded to a multiple of this with pixels that do not contribute.
@@ -179,17 +159,12 @@ def padded(n_pixel: int) -> int:
     return -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
 
 
-def element_ends(x: Expectation) -> NDArray[np.bool_]:
-    """Return which pixels are the last of a resolution element, shape (n_pixel,)."""
-    return np.append(np.diff(x.element) > 0, True)
-
-
 def detector_pixels(quiet: Expectation, used: NDArray[np.bool_]) -> NDArray[np.void]:
     """Return the properties that all scenarios share: layout.PIXEL, shape (n_padded,)."""
     n_pixel = used.size
     pixels = np.zeros(padded(n_pixel), layout.PIXEL)
     pixels["used"][:n_pixel] = used
-    pixels["element_end"][:n_pixel] = element_ends(quiet)
+    pixels["element_end"][:n_pixel] = np.append(np.diff(quiet.element) > 0, True)
     # Groups of four used pixels in one element are summed without tests of single pixels.
     uneven = (pixels["element_end"] > 0) | (pixels["used"] == 0)
     pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
@@ -215,8 +190,8 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
     starts = np.cumsum([sum(t.entries.size for t in tables), *(t.entries.size for t in alias)])
     tables += alias
     out["table"][~expanded] = starts[which]
-    out["bits"][~expanded] = np.array([t.bits for t in alias])[which]
-    out["low"][~expanded] = np.array([t.low for t in alias])[which] - centre[~expanded]
+    out["bits"][~expanded], low = (np.array([getattr(t, of) for t in alias])[which] for of in ("bits", "low"))
+    out["low"][~expanded] = low - centre[~expanded]
     root = np.sqrt(mean[expanded])
     out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
     out["slope"][expanded] = root - 1 / (36 * root)
@@ -233,10 +208,9 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Fill `out` with a draw's response to factors on light, dark and sky, relative to the priors' medians."""
-    share, dark = sky_share(x), factors.medians["dark"]
-    light = factors.median_on_light(share)
+    light, dark = factors.median_on_light(x), factors.medians["dark"]
     # The sky's light follows both factors.
-    out["sky_share"] = factors.medians["light"] * factors.medians["sky"] * share / light
+    out["sky_share"] = factors.medians["light"] * factors.medians["sky"] * sky_share(x) / light
     out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
     out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
     # A lower limit avoids 0 / 0 in pixels without noise.
@@ -257,31 +231,25 @@ class Scene:
     n_pixel: int  # number of pixels; the arrays are padded to a multiple of `PIXEL_BLOCK`
     n_frames: int  # number of frames of the exposure
     frames: bool  # whether each frame is drawn, rounded and clipped, instead of their sum at once
-    #: Whether all noise of a draw comes from one normal through its cumulants, instead of separate Poisson counts.
-    joint: bool
+    joint: bool  # whether all noise of a draw comes from one normal, instead of separate Poisson counts
     quartic: bool  # whether a joint draw needs the fourth power of its normal and, if factors vary, fifth cumulants
     photons: bool  # whether photon counts are also drawn separately
     clip: bool  # whether single draws are clipped at the ADC's rails
     modulations: tuple[tuple[str, SignalPart], ...]  # priors that change light, dark or sky; see `Processes`
     job: NDArray[np.void]  # shape (); parameters of a launch without the seed
     pixels: NDArray[np.void]  # shape (n_padded,)
-    #: Shape (n_scenario, n_padded); structs layout.LEVEL, EDGE, POISSON and RESPONSE; the last two are empty if not
-    #: needed.
-    levels: NDArray[np.void]
+    levels: NDArray[np.void]  # shape (n_scenario, n_padded)
     edges: NDArray[np.void]  # shape (n_scenario, n_padded)
     dark_counts: NDArray[np.void]  # shape (n_padded,)
-    photon_counts: NDArray[np.void]  # shape (n_scenario, n_padded)
-    responses: NDArray[np.void]  # shape (n_scenario, n_padded)
+    photon_counts: NDArray[np.void]  # shape (n_scenario, n_padded); empty if not needed
+    responses: NDArray[np.void]  # shape (n_scenario, n_padded); empty if not needed
     tables: NDArray[np.uint32]  # concatenated alias tables
     priors: NDArray[np.float32]  # shape (n_modulation, 2 * PRIOR_NODES); quantile tables
     medians: tuple[float, ...]  # factors on light, dark and sky at the priors' medians
-    #: Shape (n_scenario,); for each scenario, the scenario with whose mean and variance it is compared.
-    references: NDArray[np.uint32]
-    #: Shape (n_scenario, n_padded); reference rounded to whole DN minus the reference; zero for noisy reference
-    #: exposures.
+    references: NDArray[np.uint32]  # scenario with whose mean and variance each scenario is compared
+    #: Shape (n_scenario, n_padded); reference rounded to whole DN minus the reference; zero for noisy references.
     fraction: Float
-    #: Shape (n_scenario, n_padded); parameters of estimated variances; empty for the model's.
-    estimates: NDArray[np.void]
+    estimates: NDArray[np.void]  # shape (n_scenario, n_padded); for estimated variances; empty for the model's
     comparison: Comparison
     base_dn: NDArray[np.int64]  # shape (n_scenario, n_pixel); whole DN of one draw's mean that the kernels omit
     used: NDArray[np.bool_]  # shape (n_pixel,); pixels that enter the statistics, those that no reference saturates
@@ -322,60 +290,35 @@ class Scene:
 
 
 def prepare(
-    scenarios: Sequence[Expectation],
-    drawing: Drawing | None = None,
-    *,
-    references: Sequence[int] | None = None,
-    comparison: Comparison = NOISE_FREE,
-    first_group: int = 0,
-    **words: Unpack[DrawingOptions],
-) -> Scene:
+    scenarios: Sequence[Expectation], drawing: Drawing | None = None, *, references: Sequence[int] | None = None,
+    comparison: Comparison = NOISE_FREE, first_group: int = 0, **words: Unpack[DrawingOptions],
+) -> Scene:  # fmt: skip
     """Compute the arrays of scenarios for the device, from expectations that differ only in their light.
 
     Options of the draw can also be given as keywords. Each scenario is compared with one of the quiescent `references`,
     by default the first; `first_group` is the number of the first group of four pixels in the generator's counter.
-    Raises InputError if scenarios differ in more than their light, stacked draws are requested near a rail, or a
-    process needs joint draws that are not exact.
     """
     drawing, quiet = drawing or Drawing(**words), scenarios[0]
     method = choose_method(scenarios, drawing)
     compared = np.array([0] * len(scenarios) if references is None else references, np.uint32)
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
-    tables = list[AliasTable]()
-    darks, dark_dn = _dark_counts(quiet, method, tables)
+    dark_dn, step, darks = np.zeros(used.size), quiet.dark_step_dn, np.zeros(padded(used.size), layout.POISSON)
+    if not method.joint:
+        # Separate dark counts are relative to integers.
+        mean = method.each * quiet.dark_dn / step
+        dark_dn = step * fill_poisson_counts(darks[: used.size], mean, step, method.tables)
     arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
-        _fill_draw(arrays, k, x, method, dark_dn, tables)
+        _fill_draw(arrays, k, x, method, dark_dn)
         _fill_comparison(arrays, k, method.each, scenarios[compared[k]], comparison, used)
+    job = _job(scenarios, drawing, method, comparison, first_group)
+    tables = np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32)
     return Scene(
-        n_pixel=used.size,
-        n_frames=quiet.n_frames,
-        frames=method.frames,
-        joint=method.joint,
-        quartic=method.quartic,
-        photons=method.photons,
-        clip=method.each == 1,
-        modulations=drawing.processes.modulations,
-        job=_job(scenarios, drawing, method, comparison, first_group, tables),
-        pixels=detector_pixels(quiet, used),
-        dark_counts=darks,
-        tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
-        priors=method.factors.tables,
-        medians=tuple(method.factors.medians.values()),
-        references=compared,
-        comparison=comparison,
-        used=used,
-        **arrays,
-    )
-
-
-def _dark_counts(quiet: Expectation, method: DrawMethod, tables: list[AliasTable]) -> tuple[NDArray[np.void], Float]:
-    """Return the array of separate dark counts, and the DN to which they are relative, both zero for joint draws."""
-    n_pixel, step = quiet.wavelength_nm.size, quiet.dark_step_dn
-    darks = np.zeros(padded(n_pixel), layout.POISSON)
-    if method.joint:
-        return darks, np.zeros(n_pixel)
-    return darks, step * fill_poisson_counts(darks[:n_pixel], method.each * quiet.dark_dn / step, step, tables)
+        used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons, clip=method.each == 1,
+        modulations=drawing.processes.modulations, job=job, pixels=detector_pixels(quiet, used), dark_counts=darks,
+        tables=tables, priors=method.factors.tables, medians=tuple(method.factors.medians.values()),
+        references=compared, comparison=comparison, used=used, **arrays,
+    )  # fmt: skip
 
 
 #: Arrays of a `Scene` with a row for each scenario, by the names of its fields.
@@ -398,33 +341,30 @@ def _padding(
         "base_dn": np.zeros((len(scenarios), n_pixel), np.int64),
     }
     arrays["responses"]["other_variance"] = NO_VARIANCE
-    for name, array in (("shift", "levels"), ("low", "edges"), ("high", "edges")):
-        arrays[array][name] = layout.MAGIC
+    arrays["levels"]["shift"] = arrays["edges"]["low"] = arrays["edges"]["high"] = layout.MAGIC
     return arrays
 
 
-def _fill_draw(
-    arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, dark_dn: Float, tables: list[AliasTable]
-) -> None:
+def _fill_draw(arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, dark_dn: Float) -> None:
     """Fill the arrays for the draw of scenario k, whose dark counts are relative to `dark_dn`."""
     c, factors, n_pixel, gain = method.cumulants[k], method.factors, dark_dn.size, x.gain_dn_per_electron
     level = arrays["levels"][k, :n_pixel]
     # The mean to which a draw is relative; separate Poisson counts are relative to integers.
     if method.joint:
-        light, dark = factors.median_on_light(sky_share(x)), factors.medians["dark"]
+        light, dark = factors.median_on_light(x), factors.medians["dark"]
         mean = c.mean + (light - 1.0) * c.light_dn + (dark - 1.0) * c.dark_dn
     else:
         photons = c.photons
         if method.photons:
-            photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, tables)
+            photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, method.tables)
         mean = method.each * x.bias_dn + dark_dn + gain * photons
     base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.each == 1 else np.inf)
     if arrays["responses"].size:
         fill_responses(arrays["responses"][k, :n_pixel], x, c, factors)
         check_reach(x, c, factors)
     elif method.joint:
-        for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), polynomial(c), strict=True):
-            level[name] = coefficient
+        for power, coefficient in enumerate(polynomial(c)):
+            level[f"c{power}"] = coefficient
     else:
         level["c1"] = np.sqrt(c.gaussian)
     level["c0"] += mean - base
@@ -455,7 +395,8 @@ def _fill_comparison(
         offset = np.rint(mean_sum) - reference.n_frames * (reference.bias_dn + reference.dark_dn)
         estimate["net_offset"][:n_pixel], estimate["gain"][:n_pixel] = offset, reference.gain_dn_per_electron
         estimate["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
-    ends = element_ends(reference)
+    # The last pixel of each element.
+    ends = np.append(np.diff(reference.element) > 0, True)
     element_variance = np.bincount(reference.element, variance * used)
     with np.errstate(divide="ignore"):
         edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
@@ -463,16 +404,10 @@ def _fill_comparison(
 
 
 def _job(
-    scenarios: Sequence[Expectation],
-    drawing: Drawing,
-    method: DrawMethod,
-    comparison: Comparison,
-    first_group: int,
-    tables: list[AliasTable],
+    scenarios: Sequence[Expectation], drawing: Drawing, method: DrawMethod, comparison: Comparison, first_group: int
 ) -> NDArray[np.void]:
-    """Return the parameters of a launch, layout.JOB, shape (); append the tables of additive processes to `tables`."""
-    quiet = scenarios[0]
-    job = np.zeros((), layout.JOB)
+    """Return the parameters of a launch, layout.JOB, shape (); append the tables of additive processes to `method`."""
+    quiet, job = scenarios[0], np.zeros((), layout.JOB)
     n_pixel = quiet.wavelength_nm.size
     job["pixel_count"], job["padded_count"] = n_pixel, padded(n_pixel)
     job["scenario_count"] = len(scenarios)
@@ -482,7 +417,7 @@ def _job(
     job["pair_scale"] = (1.0 + comparison.added_variance) / 2.0
     for name, process in drawing.processes.additive.items():
         table = alias_table_of(process.charge(method.each * quiet.frame_s))
-        job[f"{name}_table"] = sum(t.entries.size for t in tables)
+        job[f"{name}_table"] = sum(t.entries.size for t in method.tables)
         job[f"{name}_bits"], job[f"{name}_low"] = table.bits, table.low
-        tables.append(table)
+        method.tables.append(table)
     return job

@@ -9,21 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, get_args
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast, get_args
 
 from pydantic import create_model
 
-from mauvecl.noise.disturbances import (
-    ADDITIVE,
-    AdditiveProcess,
-    Normal,
-    ParticleRate,
-    PointingDrifts,
-    Prior,
-    PriorField,
-    Uniform,
-)
+from mauvecl.noise.disturbances import ADDITIVE, Normal, ParticleRate, PointingDrifts, PriorField, Uniform
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, range_of
@@ -31,13 +22,10 @@ from mauvecl.schema.physical import DetectorTemperature
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from mauvecl.host.arrays import Float
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
-
-    Float = NDArray[np.float64]
+    from mauvecl.noise.disturbances import AdditiveProcess, Prior
 
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]
@@ -55,19 +43,12 @@ COURSES: tuple[Course, ...] = get_args(Course)
 TILT_NM, MIDDLE_NM = 250.0, 450.0
 
 
-@dataclass(frozen=True)
-class Amplitude:
-    """Normal prior of zero mean for the amplitude of a known change; flat if the standard deviation is infinite."""
-
-    sd: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class Unknown:
     """Value that an observer does not know."""
 
     name: str  # its key in a section of studies
-    prior: Prior | Amplitude | None = None  # default prior; None if it is known by default
+    prior: Prior | None = None  # default prior; None if it is known by default
     label: str = ""  # description in messages and tables
 
 
@@ -77,7 +58,6 @@ class UnknownProcess(Unknown):
 
     of: SignalPart = "light"
     when: Literal["frame", "exposure"] = "exposure"
-    prior: Prior | None = None
     source: str = ""  # source of the default prior, or "assumption"
     stream: int  # its number in `layout.STREAMS`
     #: Range of allowed values.
@@ -103,7 +83,8 @@ class UnknownProcess(Unknown):
 class Nuisance(Unknown):
     """Unknown amplitude of a known spectrum, which statistics marginalise over."""
 
-    prior: Amplitude | None = None
+    #: Standard deviation of its normal prior of zero mean, infinite for a flat one; None if it is known by default.
+    sd: float | None = None
     #: Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
     spectrum: Callable[[Expectation], Float]
     #: Function that returns the relative change of a flare's light for unit amplitude; None if it does not change.
@@ -122,30 +103,21 @@ class Nuisance(Unknown):
 class InstrumentValue(Unknown):
     """Unknown but constant value of the instrument, over which answers are averaged."""
 
-    prior: Prior | None = None
     #: Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
     scales: str | None = None
     #: Whether it changes the throughput alone, so that modes of a calibrated throughput take its place.
     of_throughput: bool = False
-
-    def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
-        """Return the changes of an instrument that set a value."""
-        return {self.name: value} if self.scales is None else {self.scales: value * getattr(nominal, self.scales)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class ThroughputMode(InstrumentValue):
-    """Unknown amplitude of a mode of a calibration."""
-
-    number: int  # counted from 0
-    #: Changes of the logarithm of other values than the throughput for an amplitude of one, by name.
-    others: Mapping[str, float]
+    mode: int | None = None  # number of the mode of a calibration of which this is the amplitude, from 0
+    #: Changes of the logarithm of other values than the throughput for an amplitude of one of a mode, by name.
+    others: Mapping[str, float] = field(default_factory=dict)
 
     def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
         """Return the changes of an instrument that set a value, of which those of other modes are kept."""
-        set_before = nominal.throughput_amplitudes
-        amplitudes = [*set_before, *[0.0] * (self.number + 1 - len(set_before))]
-        value, amplitudes[self.number] = value - amplitudes[self.number], value
+        if self.mode is None:
+            return {self.name: value} if self.scales is None else {self.scales: value * getattr(nominal, self.scales)}
+        amplitudes = [*nominal.throughput_amplitudes]
+        amplitudes += [0.0] * (self.mode + 1 - len(amplitudes))
+        value, amplitudes[self.mode] = value - amplitudes[self.mode], value
         others = {name: getattr(nominal, name) * math.exp(step * value) for name, step in self.others.items()}
         return {"throughput_amplitudes": tuple(amplitudes)} | others
 
@@ -179,25 +151,13 @@ STARE_PROCESSES: dict[str, type[PointingDrifts]] = {"pointing": PointingDrifts}
 #: Processes in the order of their tables in kernels: fields of `Processes`, keys of studies' ``processes``.
 PROCESSES = _by_name(
     UnknownProcess(
-        name="jitter",
-        when="frame",
-        stream=4,
-        low=0.0,
-        high=0.5,
-        change=lambda _, lost: -lost,
-        expected=0.0,
-        prior=Uniform(0.0, 0.05),
-        drawn="share of the light lost in each frame, uniform, 0-5 %",
+        name="jitter", when="frame", stream=4, low=0.0, high=0.5, change=lambda _, lost: -lost, expected=0.0,
+        prior=Uniform(0.0, 0.05), drawn="share of the light lost in each frame, uniform, 0-5 %",
         source="the paper: light lost by pointing errors stays below 5 %; uniform and anew in each frame: assumption",
     ),
     UnknownProcess(
-        name="detector_temperature",
-        of="dark",
-        stream=5,
-        low=range_of(DetectorTemperature).low,
-        high=range_of(DetectorTemperature).high,
-        change=_dark_follows,
-        expected="temperature_c",
+        name="detector_temperature", of="dark", stream=5, low=range_of(DetectorTemperature).low,
+        high=range_of(DetectorTemperature).high, change=_dark_follows, expected="temperature_c",
         # Relative to the nominal temperature; see `default_processes`.
         prior=Normal(0.0, 0.5, -2.5, 2.5),
         drawn="detector temperature, normal, +-0.5 deg C around the nominal one, cut at 2.5 deg C",
@@ -205,59 +165,39 @@ PROCESSES = _by_name(
     ),
     UnknownProcess(name="light_loss", stream=6, low=0.0, high=0.99, change=_lost("light_loss"), expected="light_loss"),
     UnknownProcess(
-        name="pointing_loss", stream=7, low=0.0, high=0.99, change=_lost("pointing_loss"), expected="pointing_loss"
+        name="pointing_loss", stream=7, low=0.0, high=0.99, change=_lost("pointing_loss"), expected="pointing_loss",
     ),
     UnknownProcess(name="qe_scale", stream=8, low=0.01, high=100.0, change=lambda _, scale: scale - 1.0),
     UnknownProcess(
-        name="sky_level",
-        of="sky",
-        stream=11,
-        low=0.01,
-        high=100.0,
-        change=lambda _, level: level - 1.0,
-        prior=Normal(1.0, 0.1, 0.5, 1.5),
-        drawn="factor on the sky's light, normal, 1 +- 0.1, cut at 0.5 and 1.5",
+        name="sky_level", of="sky", stream=11, low=0.01, high=100.0, change=lambda _, level: level - 1.0,
+        prior=Normal(1.0, 0.1, 0.5, 1.5), drawn="factor on the sky's light, normal, 1 +- 0.1, cut at 0.5 and 1.5",
         source="assumption: the scatter of the zodiacal light about its model",
     ),
-)
+)  # fmt: skip
 
 #: Nuisance parameters with built-in spectra; keys of studies' ``nuisances``.
 NUISANCES = _by_name(
     Nuisance(
-        name="dark",
-        label="the dark level",
-        unit="deg C",
+        name="dark", label="the dark level", unit="deg C", process="detector_temperature", sd=math.inf,
         spectrum=lambda quiet: quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"],
-        process="detector_temperature",
-        prior=Amplitude(math.inf),
         marginalised="free: the dark current follows the temperature by an exponential, which is no normal amplitude",
     ),
     Nuisance(
-        name="light",
-        label="the light level",
-        spectrum=lambda quiet: quiet.recorded_light_dn,
-        of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
-        process="jitter",
-        prior=Amplitude(math.inf),
+        name="light", label="the light level", process="jitter", sd=math.inf,
+        spectrum=lambda quiet: quiet.recorded_light_dn, of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
         marginalised="free: the mean loss is unknown too, and so is the star's own level",
     ),
     Nuisance(
-        name="sky",
-        label="the sky level",
-        spectrum=lambda quiet: quiet.sky_dn,
-        process="sky_level",
-        prior=Amplitude(PROCESSES["sky_level"].moments[1]),
-        marginalised="10 %",
+        name="sky", label="the sky level", process="sky_level", sd=PROCESSES["sky_level"].moments[1],
+        spectrum=lambda quiet: quiet.sky_dn, marginalised="10 %",
     ),
     Nuisance(
-        name="tilt",
-        label="the response's colour",
-        spectrum=lambda quiet: quiet.recorded_light_dn * _tilt(quiet),
+        name="tilt", label="the response's colour", spectrum=lambda quiet: quiet.recorded_light_dn * _tilt(quiet),
         of_flare=_tilt,
     ),
-)
+)  # fmt: skip
 #: Nuisance parameters of the documented set.
-DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.prior is not None)
+DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.sd is not None)
 
 
 if TYPE_CHECKING:
@@ -286,19 +226,13 @@ INSTRUMENT_VALUES = _by_name(
     InstrumentValue(name="temperature_c", label="detector temperature (C)", prior=Uniform(13.0, 21.0)),
     InstrumentValue(name="light_loss", label="light loss", prior=Normal(0.34, 0.10, 0.04, 0.64), of_throughput=True),
     InstrumentValue(name="pointing_loss", label="pointing loss", prior=Uniform(0.0, 0.05), of_throughput=True),
-    InstrumentValue(
-        name="qe_scale",
-        label="quantum efficiency, scale",
-        prior=Normal(1.0, 0.3, 0.3, 1.7),
-        # The collecting area has the same effect.
-        scales="collecting_area_cm2",
-        of_throughput=True,
-    ),
-    InstrumentValue(
-        name="conversion_uv_per_electron", label="charge conversion (uV per electron)", prior=Uniform(20.0, 25.0)
-    ),
+    # The collecting area has the same effect as the scale of the quantum efficiency.
+    InstrumentValue(name="qe_scale", label="quantum efficiency, scale", prior=Normal(1.0, 0.3, 0.3, 1.7),
+                    scales="collecting_area_cm2", of_throughput=True),
+    InstrumentValue(name="conversion_uv_per_electron", label="charge conversion (uV per electron)",
+                    prior=Uniform(20.0, 25.0)),
     InstrumentValue(name="read_noise_dn", label="read noise (DN)", prior=Normal(12.0, 1.0, 9.0, 15.0)),
-)
+)  # fmt: skip
 
 
 #: Largest number of modes of a calibration that are unknown: of the light in eight bands and seven other values.
@@ -319,12 +253,11 @@ def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
     fitted = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")}
     measured = fitted.union(errors.values)
     values = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in measured}
-    modes = []
     for k in range(min(len(errors.modes), MAX_MODES)):
         others = {name: steps[k] for name, steps in errors.values.items() if k < len(steps) and steps[k]}
-        label = f"calibration, mode {k + 1}"
-        modes.append(ThroughputMode(name=f"throughput_{k + 1}", label=label, prior=MODE_PRIOR, number=k, others=others))
-    return values | _by_name(*modes)
+        name, label = f"throughput_{k + 1}", f"calibration, mode {k + 1}"
+        values[name] = InstrumentValue(name=name, label=label, prior=MODE_PRIOR, mode=k, others=others)
+    return values
 
 
 def default_processes(temperature_c: float) -> dict[str, Prior]:
@@ -356,10 +289,8 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
         Temperature in deg C, drawn per realisation; the dark current follows the instrument's law.
     light_loss, pointing_loss : Prior, optional
         Replacements of the instrument's values, drawn per realisation.
-    qe_scale : Prior, optional
-        Factor on the quantum efficiency, drawn per realisation.
-    sky_level : Prior, optional
-        Factor on the sky's light, drawn per realisation.
+    qe_scale, sky_level : Prior, optional
+        Factors on the quantum efficiency and on the sky's light, drawn per realisation.
     """
 
     @property
@@ -375,8 +306,7 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
     @property
     def additive_only(self) -> Self:
         """The processes without priors."""
-        copy: Self = self.model_copy(update=dict.fromkeys(PROCESSES))
-        return copy
+        return cast("Self", self.model_copy(update=dict.fromkeys(PROCESSES)))
 
     @property
     def particle_processes(self) -> list[AdditiveProcess]:
@@ -391,10 +321,12 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
         every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
-        caused = {name: process for name, process in every.items() if process.particles_per_cm2_s is not None}
-        update = {name: process.with_particles(rate_per_cm2_s) for name, process in caused.items()}
-        copy: Self = self.model_copy(update=update)
-        return copy
+        update = {
+            name: process.with_particles(rate_per_cm2_s)
+            for name, process in every.items()
+            if process.particles_per_cm2_s is not None
+        }
+        return cast("Self", self.model_copy(update=update))
 
 
 NONE = Processes()

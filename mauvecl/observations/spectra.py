@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.spectrum import Measurement, fit
-from mauvecl.noise.unknowns import NUISANCES, Amplitude
+from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.frame_model import (
     CLEARLY,
@@ -429,8 +429,8 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_
             expected = float(covariance[k, k]) * float((share[:-2] / 4 + share[1:-1] + share[2:] / 4).mean())
             beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
             found[name] = n_frames / size * float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
-    if "sky" in unknown and isinstance(NUISANCES["sky"].prior, Amplitude):
-        found["sky"] = NUISANCES["sky"].prior.sd
+    if "sky" in unknown and (sd := NUISANCES["sky"].sd) is not None:
+        found["sky"] = sd
     return found
 
 

@@ -233,6 +233,7 @@ class _Parameter:
 #: Types that modules import for type checkers only, and that are not public.
 FOREIGN = {
     "ArrayLike": "numpy.typing:ArrayLike",
+    "Float": "mauvecl.host.arrays:Float",
     "NDArray": "numpy.typing:NDArray",
     "StaresRequest": "mauvecl.flares.stare_scene:StaresRequest",
     "SkyCoord": "astropy.coordinates:SkyCoord",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, create_model, model_validator
 
-from mauvecl.detection.names import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
+from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
@@ -275,9 +275,7 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
         documented = DOCUMENTED_NUISANCES if self.usual else ()
         # Parameters without effect, such as the brightness of no sky, are left out.
-        sd = {
-            row.name: row.prior.sd for row in documented if row.prior is not None and spectrum_of(row.name, quiet).any()
-        }
+        sd = {row.name: row.sd for row in documented if row.sd is not None and spectrum_of(row.name, quiet).any()}
         sd |= {name: sd_of(spread) for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
         for name, nuisance in self.own.items():

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, Field
 
-from mauvecl.detection.names import DEFAULT_STATISTICS, countable, least_countable
+from mauvecl.detection import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables import files

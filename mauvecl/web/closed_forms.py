@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.closed_forms import InterpolatedForm, cost_lines, marginal_lines, unknown_cost
-from mauvecl.answers.limit_search import LimitSearch
+from mauvecl.answers.closed_forms import InterpolatedForm, unknown_cost, unknown_lines
+from mauvecl.answers.limit import LimitSearch
 from mauvecl.detection.distributions import Gaussian, Mixture
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.exposure.expectation import entirely_saturated
@@ -228,11 +228,7 @@ class ClosedForms:
         """Messages for the visitor, the most severe first."""
         nuisances = self.study.nuisances
         cost = unknown_cost("this flare", self.quiet, self.flare, nuisances, self.study.run.comparison())
-        return [
-            *collect_messages([self.quiet, self.flare]),
-            *marginal_lines(nuisances),
-            *cost_lines([cost], nuisances),
-        ]
+        return [*collect_messages([self.quiet, self.flare]), *unknown_lines([cost], nuisances)]
 
     @property
     def words(self) -> str:

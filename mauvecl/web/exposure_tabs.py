@@ -320,7 +320,7 @@ def costs(closed: ClosedForms) -> list[Cost]:
     chosen = {}
     for name, row in NUISANCES.items():
         if np.any(row.spectrum(closed.quiet)):
-            spread = "free" if row.prior is None or np.isinf(row.prior.sd) else row.prior.sd
+            spread = "free" if row.sd is None or np.isinf(row.sd) else row.sd
             alone = NuisanceChoice.model_validate({"usual": False, name: spread})
             chosen[spoken(alone).removeprefix("the ")] = alone
     chosen["all the usual together"] = NuisanceChoice()

@@ -15,7 +15,7 @@ from mauvecl.answers.answer import IF_KNOWN
 from mauvecl.answers.closed_forms import BOTH_CHANCES
 from mauvecl.answers.detect import chance_of_flare
 from mauvecl.answers.verbs import GROUPS, VERBS
-from mauvecl.detection.names import check_fap
+from mauvecl.detection import check_fap
 from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.stars.library import listed_note, resolve
 from mauvecl.host.tables.units import offline
