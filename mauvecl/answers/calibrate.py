@@ -80,12 +80,14 @@ COLUMNS = (
     Column("determined", "determined", "", "whether these observations determine it", "status",
            lambda determined: "" if determined else "assumed", kind=bool),
 )  # fmt: skip
+#: Columns of the goodness of fit, for pairs of a name and a fit.
 FIT_COLUMNS = (
-    Column("fit", "name", "", "what is fitted", "fit", kind=str),
-    Column("chi2", "chi2", "", "chi-squared", "chi-squared / dof", lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}",
-           ("dof",)),
-    Column("dof", "dof", "", "values less the effective number of parameters"),
-    Column("p_value", "p_value", "", "probability of a chi-squared at least as large", "p", number(".3g")),
+    Column("fit", lambda row: row[0], "", "what is fitted", "fit", kind=str),
+    Column("chi2", lambda row: row[1].chi2, "", "chi-squared", "chi-squared / dof",
+           lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}", ("dof",)),
+    Column("dof", lambda row: float(row[1].dof), "", "values less the effective number of parameters"),
+    Column("p_value", lambda row: row[1].p_value, "", "probability of a chi-squared at least as large", "p",
+           number(".3g")),
 )  # fmt: skip
 THROUGHPUT_COLUMNS = (
     Column("wavelength", "throughput.wavelength_nm", "nm", "middle of the pixel", "nm", ".1f"),
@@ -139,7 +141,11 @@ class CalibrateAnswer(Answer):
         f"{'s' if len(answer.stars) > 1 else ''}; dark current at {answer.dark.reference_c:.1f} C",
     )  # fmt: skip
     #: One row per fit: its goodness.
-    fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", about=())
+    fits = TableOf("fits", FIT_COLUMNS, lambda answer: [
+        (name, fit) for name, fit in (
+            ("throughput", answer.throughput), ("dark current", answer.dark), ("photon transfer", answer.transfer)
+        ) if fit.dof > 0
+    ], title="Goodness of fit", key="fits", about=())  # fmt: skip
     #: One row per pixel: fitted and nominal throughput.
     throughput_table = TableOf("throughput", THROUGHPUT_COLUMNS, lambda answer: answer)
     #: One row per pixel: dark current and bias.
@@ -172,14 +178,6 @@ class CalibrateAnswer(Answer):
         ):  # fmt: skip
             rows.append(Fitted(name, *((fit.value, fit.error) if fit else (usual, np.nan)), usual, "nm"))
         return rows
-
-    @property
-    def _fits(self) -> list[dict[str, Any]]:
-        fits: dict[str, ThroughputFit | detector.DarkFit | detector.PhotonTransfer] = {
-            "throughput": self.throughput, "dark current": self.dark, "photon transfer": self.transfer
-        }  # fmt: skip
-        return [{"name": name, "chi2": fit.chi2, "dof": float(fit.dof), "p_value": fit.p_value}
-                for name, fit in fits.items() if fit.dof > 0]  # fmt: skip
 
     @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:
@@ -334,24 +332,20 @@ class CalibrateAnswer(Answer):
         return {
             "throughput-factor": QTable(step_nm | {"factor": factor}, meta=origin),
             "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
-            "pixel-map": QTable(self._pixel_map, meta=origin, descriptions={"dark": "factor on the dark current"}),
+            "pixel-map": QTable(self._pixel_map(), meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
 
-    @property
     def _pixel_map(self) -> dict[str, Any]:
-        """Columns of the pixel map: factors on the dark current, values of the given map, and the bias."""
+        """Return the columns of the pixel map: factors on the dark current, values of the given map, and the bias."""
         nominal, level, bias = self.nominal, self.dark.level_dn_per_s, self.dark.bias_dn
         # Pixels that are not read have the mean of the others.
         dark, every_bias = np.ones(nominal.pixels), np.full(nominal.pixels, bias.mean())
         dark[nominal.read_pixels], every_bias[nominal.read_pixels] = level / level.mean(), bias
         columns: dict[str, Any] = {"pixel": np.arange(nominal.pixels), "dark": dark}
-        for name in ("response", "gain", "read_noise_dn"):
+        for name, unit in (("response", 1), ("gain", 1), ("read_noise_dn", u.DN)):
             given = getattr(nominal.pixel_map, name, None)
-            if given is not None:
-                columns[name] = given * u.DN if name.endswith("_dn") else given
-        if np.ptp(bias) > 0:
-            columns["bias_dn"] = every_bias * u.DN
-        return columns
+            columns |= {} if given is None else {name: given * unit}
+        return columns | ({"bias_dn": every_bias * u.DN} if np.ptp(bias) > 0 else {})
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.

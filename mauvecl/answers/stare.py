@@ -439,9 +439,7 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     lost = staring.stare.pointing_losses(numbers, seed)[0] if drifting else None
     kelvin, flares = temperatures_of(case.events), list[StareFlare]()
     for event in case.events:
-        of = partial(energy_of, case.study, case.source, event, temperatures_k=kelvin)
-        # None, for a star of unknown size, becomes NaN.
-        band, bolometric = np.array([of("band"), of("bolometric")], float).tolist()
+        band, bolometric = (energy_of(case.study, case.source, event, kind, kelvin) for kind in ("band", "bolometric"))
         own = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
         flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
     return StarStare(case.label, case.at, staring, flares, light, lost, **searched)
@@ -507,5 +505,4 @@ def _found_energy(case: Case, event: Event) -> float:
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
         return float("nan")
-    energy = energy_of(case.study, case.source, event, "bolometric")
-    return float("nan") if energy is None else energy
+    return energy_of(case.study, case.source, event, "bolometric")

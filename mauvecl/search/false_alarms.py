@@ -214,8 +214,8 @@ POWERS = 4
 DRAWS = 160
 #: Largest probability of an alarm in a stare for which importance sampling is used.
 MAX_PROBABILITY = 0.7
-#: Number of thresholds at which rates are tabulated for interpolation.
-FINE = 20_000
+#: Number of thresholds at which rates are tabulated for interpolation, and change of scatter that is neglected.
+FINE, NEGLIGIBLE = 20_000, 1e-6
 #: Second half of the generator's key, which makes the draws independent of others.
 NULL_KEY = 0x6E756C6C
 #: G is zero below u - BELOW / u.
@@ -260,29 +260,29 @@ class SampledRate:
         logs = np.log(-np.log1p(-p) / self.days) - scipy.special.log_ndtr(-u)
         return np.polynomial.Polynomial.fit(u, logs, min(POWERS, u.size) - 1, w=1 / self._relative)
 
-    def under(self, shifts: UnknownShifts) -> SampledRate:
-        """Return the rate for stares whose noise differs from the noise that the search assumes."""
-        shifted = bool(shifts.shifts.any())
-        if np.abs(shifts.scales - 1).max() < NEGLIGIBLE and not shifted:
+    def under(self, scales: Float, weights: Float, shifts: Float, shares: Float) -> SampledRate:
+        """Return the rate for stares whose noise differs from that which the search assumes; see `draw_shifts`."""
+        shifted = bool(shifts.any())
+        if np.abs(scales - 1).max() < NEGLIGIBLE and not shifted:
             return self
         # The rate is tabulated finely enough for linear interpolation.
-        low, high = self.thresholds[0] / shifts.scales.max(), self.thresholds[-1] / shifts.scales.min()
+        low, high = self.thresholds[0] / scales.max(), self.thresholds[-1] / scales.min()
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
         rates = np.exp(scipy.special.log_ndtr(-fine) + self._fit()(fine))
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
             # Probability of an alarm in each draw of a stare.
-            per_day, largest = np.zeros((2, shifts.weights.size))
-            for shift, share in zip(shifts.shifts, shifts.shares.T, strict=True):
-                per_day += share * np.interp((threshold - shift) / shifts.scales, fine, rates).mean(axis=1)
+            per_day, largest = np.zeros((2, weights.size))
+            for shift, share in zip(shifts, shares.T, strict=True):
+                per_day += share * np.interp((threshold - shift) / scales, fine, rates).mean(axis=1)
                 largest = np.where(share > 0, shift, largest)
             each = -np.expm1(-self.days * per_day)
             if shifted:
                 # A few templates with a large mean suffice for an alarm.
                 each = 1 - np.exp(-self.days * per_day) * scipy.special.ndtr(threshold - largest)
-            probability[k] = shifts.weights @ each
-            spread = np.sqrt(np.sum((shifts.weights * (each - probability[k])) ** 2))
+            probability[k] = weights @ each
+            spread = np.sqrt(np.sum((weights * (each - probability[k])) ** 2))
             error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
         return SampledRate(self.thresholds, probability, error, self.days, shifted)
 
@@ -422,20 +422,6 @@ def _estimates(values: Float) -> Float:
     return estimates
 
 
-#: Relative change of the scatter that is neglected.
-NEGLIGIBLE = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class UnknownShifts:
-    """Scatter and shift of templates' values for drawn conditions."""
-
-    scales: Float  # standard deviations of values at some times and all temperatures, nominally 1, shape (n_draw, n)
-    weights: Float  # of the draws, sum 1, shape (n_draw,)
-    shifts: Float  # means of values, ascending, shape (n_shift,)
-    shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
-
-
 #: Largest length of the part of a stare that importance sampling uses, star-days.
 SAMPLED_DAYS = 2.0
 #: Number of draws of the unknowns, and of times in the stare at which the noise is evaluated.
@@ -455,11 +441,16 @@ def sampled_rate(survey: Survey, seed: int) -> SampledRate:
     part, n = survey, int(SAMPLED_DAYS * DAY_S / survey.stare.frame_s)
     if survey.stare.n_frames > n:
         part = replace(survey, stare=select_frames(survey.stare, slice(0, n)))
-    return sample_rate(part.search, seed=seed).under(draw_shifts(survey, seed, part))
+    return sample_rate(part.search, seed=seed).under(*draw_shifts(survey, seed, part))
 
 
-def draw_shifts(survey: Survey, seed: int, part: Survey) -> UnknownShifts:
-    """Draw the unknowns of a stare and compute scatter and, in a part of the stare, shift of templates' values."""
+def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, Float, Float]:
+    """Draw the unknowns of a stare and compute scatter and, in a part of the stare, shift of templates' values.
+
+    Returns the standard deviations of values at some times and all temperatures, nominally 1, (n_draw, n); the weights
+    of the draws, of sum 1; means of values, ascending, (n_shift,); and the shares of templates with each mean,
+    (n_draw, n_shift).
+    """
     stare, components, rows = survey.stare, survey.components, survey.bank.directions
     at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
@@ -483,11 +474,11 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> UnknownShifts:
     known = part.unknowns
     # Unknowns of several standard deviations may shift a template's value.
     if known is None or part.search.largest(part.unsubtracted(known.extremes)).max() <= MIN_SHIFT:
-        return UnknownShifts(scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1)))
+        return scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1))
     # The same share of draws from both halves.
     some = slice(None, None, ONE_IN)
     weights = weights[some]
-    return UnknownShifts(scales[some], weights / weights.sum(), *_shifts(part, z[some]))
+    return scales[some], weights / weights.sum(), *_shifts(part, z[some])
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
