@@ -327,25 +327,23 @@ class CalibrateAnswer(Answer):
             knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=light
         )
         origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
+        # Pixels that are not read have the mean of the others.
+        level, bias, read = self.dark.level_dn_per_s, self.dark.bias_dn, self.nominal.read_pixels
+        dark, every_bias = np.ones(moved.pixels), np.full(moved.pixels, bias.mean())
+        dark[read], every_bias[read] = level / level.mean(), bias
+        by_pixel: dict[str, Any] = {"pixel": np.arange(moved.pixels), "dark": dark}
+        for name, unit in (("response", 1), ("gain", 1), ("read_noise_dn", u.DN)):
+            if (given := getattr(self.nominal.pixel_map, name, None)) is not None:
+                by_pixel[name] = given * unit
+        if np.ptp(bias) > 0:
+            by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
         values = {name: list(steps) for name, steps in errors.values.items()}
         return {
             "throughput-factor": QTable(step_nm | {"factor": factor}, meta=origin),
             "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
-            "pixel-map": QTable(self._pixel_map(), meta=origin, descriptions={"dark": "factor on the dark current"}),
+            "pixel-map": QTable(by_pixel, meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
-
-    def _pixel_map(self) -> dict[str, Any]:
-        """Return the columns of the pixel map: factors on the dark current, values of the given map, and the bias."""
-        nominal, level, bias = self.nominal, self.dark.level_dn_per_s, self.dark.bias_dn
-        # Pixels that are not read have the mean of the others.
-        dark, every_bias = np.ones(nominal.pixels), np.full(nominal.pixels, bias.mean())
-        dark[nominal.read_pixels], every_bias[nominal.read_pixels] = level / level.mean(), bias
-        columns: dict[str, Any] = {"pixel": np.arange(nominal.pixels), "dark": dark}
-        for name, unit in (("response", 1), ("gain", 1), ("read_noise_dn", u.DN)):
-            given = getattr(nominal.pixel_map, name, None)
-            columns |= {} if given is None else {name: given * unit}
-        return columns | ({"bias_dn": every_bias * u.DN} if np.ptp(bias) > 0 else {})
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.

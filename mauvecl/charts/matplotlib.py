@@ -102,13 +102,6 @@ def _own_part(ax: Any) -> Any:
     return ax.figure.add_subfigure(spec)
 
 
-def _headline(figure: Any, text: str) -> None:
-    """Add a title above all panels, wrapped to a part of the width; matplotlib would fill it to the edges."""
-    title = figure.suptitle(text, fontsize=9.0)
-    letters = int(TITLE * len(text) * figure.bbox.width / title.get_window_extent().width)
-    title.set_text(textwrap.fill(text, max(letters, 1), break_on_hyphens=False, break_long_words=False))
-
-
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
     """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
     for rows in range(1, len(handles) + 1):
@@ -205,7 +198,10 @@ def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any
         entries = [zip(*axis.get_legend_handles_labels(), strict=True) for axis, _ in drawn]
         _legend_below(figure, {name: handle for each in entries for handle, name in each})
     if title:
-        _headline(figure, title)
+        # Wrapped to a part of the width, which matplotlib would fill to the edges.
+        text = figure.suptitle(title, fontsize=9.0)
+        letters = int(TITLE * len(title) * figure.bbox.width / text.get_window_extent().width)
+        text.set_text(textwrap.fill(title, max(letters, 1), break_on_hyphens=False, break_long_words=False))
     return figure
 
 

@@ -155,14 +155,6 @@ class _StareSearch:
         n = MAX_FLARES_PER_FIT
         return [block[k : k + n] for block in blocks for k in range(0, len(block), n)]
 
-    def _near(self, peaks: Float, width_s: float) -> Float:
-        """Return the sum of the statistics of flares within reach of templates, shape of `peaks`."""
-        total = np.zeros(peaks.shape)
-        for candidate in self.found:
-            reach = TAIL * np.exp(candidate.theta[WIDTH]) + LEAD * width_s
-            total += np.where(np.abs(peaks - candidate.theta[PEAK]) < reach, candidate.rho, 0.0)
-        return total
-
     def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Float, NDArray[np.int64], Row]]:
         """Yield per row the best value of each onset, its excess over fit residuals, peak time and temperature."""
         theta, (low, high) = _thetas(self.found), self.sums.bounds
@@ -175,7 +167,12 @@ class _StareSearch:
         for row, rho in search.values(both.astype(np.float32)):
             peaks = search.peaks_s(row)
             rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
-            excess = rho[0] - np.maximum(rests, near_share * self._near(peaks, row.template.half_width_s))
+            # Statistics of flares within reach of the templates.
+            near = np.zeros(peaks.shape)
+            for candidate in self.found if near_share else ():
+                reach = TAIL * np.exp(candidate.theta[WIDTH]) + LEAD * row.template.half_width_s
+                near += np.where(np.abs(peaks - candidate.theta[PEAK]) < reach, candidate.rho, 0.0)
+            excess = rho[0] - np.maximum(rests, near_share * near)
             which = excess.argmax(axis=0)
             onsets = np.arange(excess.shape[1])
             yield rho[0, which, onsets], excess[which, onsets], peaks, which, row

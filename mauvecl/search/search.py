@@ -136,11 +136,10 @@ class Search:
 
         The bank's directions times these values are the values of rho. There may be any number of sums.
         """
-        spectra = self._spectra(sums)
-        real = _precision(sums)
+        spectra, real = self._spectra(sums), _precision(sums)
         window, level = (0, 0), []
-        for template in self.bank.templates:
-            onsets = self._onsets(template)
+        for row in self.grid:
+            template, onsets = row.template, self._onsets(row.template)
             # Templates with the same window share the correlations of the baseline.
             if window != (template.first, template.time.size):
                 window = template.first, template.time.size
@@ -148,17 +147,12 @@ class Search:
                     self._correlated(spectra[series], template.time**power, template.first)
                     for power, series in self._terms
                 ]
-            for row in self.grid:
-                if row.template is not template:
-                    continue
-                correlated = self._correlated(spectra[0], template.shapes[row.phase], template.first)[..., onsets]
-                for projected, term in zip(row.project.astype(real), level, strict=True):
-                    correlated -= projected * term[..., onsets]
-                scale = np.divide(
-                    1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=row.per_amplitude > 0
-                )
-                correlated *= scale.astype(real)
-                yield row, correlated
+            correlated = self._correlated(spectra[0], template.shapes[row.phase], template.first)[..., onsets]
+            for projected, term in zip(row.project.astype(real), level, strict=True):
+                correlated -= projected * term[..., onsets]
+            size = row.per_amplitude
+            correlated *= np.divide(1.0, size, out=np.zeros_like(size), where=size > 0).astype(real)
+            yield row, correlated
 
     def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
         """Return the weights of frames in templates of a row, without their direction, shape (n_onset, n_frame)."""
@@ -197,11 +191,7 @@ class Search:
             # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
             levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
         held[:, :, self._at] = levelled * self._weight[self._at]
-        used = {series for _, series in self._terms} | {0}
-        return [
-            scipy.fft.rfft(held * self._series[k].astype(real), self._size) if k in used else held[:0]
-            for k in range(len(self._series))
-        ]
+        return [scipy.fft.rfft(held * series.astype(real), self._size) for series in self._series]
 
     @cached_property
     def _level_span(self) -> Float:
