@@ -107,9 +107,13 @@ def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor 
     logarithm of the temperature.
     """
     net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
-    search = _StareSearch(SummedStare(survey, net), threshold)
-    search.run()
-    found = []
+    search, found = _StareSearch(SummedStare(survey, net), threshold), []
+    # Until there are no alarms, and no block improves with a further flare.
+    while new := search.searched() or search.split():
+        search.found += new
+        changed = set(new)
+        for _ in range(TURNS):
+            changed = search.fitted(changed)
     for number, block in enumerate(search.blocks(), 1):
         theta, measured = _thetas(block), list[Measured]()
         rows = search.sums.block(theta, _thetas(search.found))
@@ -133,14 +137,6 @@ class _StareSearch:
     found: list[Candidate] = field(default_factory=list)
     refused: list[tuple[float, float]] = field(default_factory=list)
     complete: set[tuple[float, ...]] = field(default_factory=set)  # blocks that no further flare improves
-
-    def run(self) -> None:
-        """Search and fit until there are no alarms and no block improves with a further flare."""
-        while new := self._searched() or self._split():
-            self.found += new
-            changed = set(new)
-            for _ in range(TURNS):
-                changed = self._fitted(changed)
 
     def blocks(self) -> list[list[Candidate]]:
         """Group overlapping flares in order of time, with at most `MAX_FLARES_PER_FIT` flares per group."""
@@ -186,7 +182,7 @@ class _StareSearch:
         theta = np.array([np.log(amplitude), peak, np.log(width), np.log(kelvin)])
         return Candidate(theta, rho, (peak, width))
 
-    def _searched(self) -> list[Candidate]:
+    def searched(self) -> list[Candidate]:
         """Return new candidates from the residuals, at most one within the window of another."""
         sums, bank = self.sums, self.sums.survey.bank
         candidates = []
@@ -210,7 +206,7 @@ class _StareSearch:
                 new.append(candidate)
         return new
 
-    def _split(self) -> list[Candidate]:
+    def split(self) -> list[Candidate]:
         """Return a further flare that improves the fit of a block as much as an alarm, if there is one."""
         blocks = [block for block in self.blocks() if self._key(block) not in self.complete]
         if not blocks:
@@ -280,7 +276,7 @@ class _StareSearch:
             evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
         return evened
 
-    def _fitted(self, changed: set[Candidate]) -> set[Candidate]:
+    def fitted(self, changed: set[Candidate]) -> set[Candidate]:
         """Fit all blocks that have changed or adjoin changed ones, and return the flares whose parameters changed."""
         moved: set[Candidate] = set()
         spans = [self.sums.window(candidate.theta) for candidate in changed]
