@@ -343,13 +343,21 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     weights = np.maximum(weights, MIN_WEIGHT * weights.max())
     shares = np.cumsum(weights * sizes[:, None])
     estimates = np.empty((draws, len(LADDER)))
-    directions = search.bank.directions
+    directions, noise_sd = search.bank.directions, np.sqrt(search.variance)
     # Batches are small so that they fit into the processor's caches.
     batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
     for first in range(0, draws, batch):
         count = min(batch, draws - first)
-        drawn = [_noise_of_chosen(search, rng, tried, shares) for _ in range(count)]
-        held, own, along = (np.array(each) for each in zip(*drawn, strict=True))
+        held, own, along = np.empty((count, search.stare.n_frames, n_sum + 1)), np.empty(count), []
+        for n in range(count):
+            which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
+            template = search.in_time(rows[which], np.array([int(rng.choice(tried[which]))]))[0]
+            noise = noise_sd[:, None] * rng.standard_normal((search.stare.n_frames, n_sum))
+            # One more sum holds the response that changes the chosen template's value by one, since it is proportional
+            # to the template in time.
+            held[n] = np.column_stack([noise, template * search.variance])
+            own[n] = template @ noise @ directions[direction]
+            along.append(directions @ directions[direction])
         values: list[list[Float]] = [[] for _ in range(count)]
         for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
             at = row.per_amplitude > 0
@@ -363,28 +371,8 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
         for n, nearby in enumerate(values):
             estimates[first + n] = _estimates(np.concatenate(nearby, axis=1))
     estimates *= shares[-1]
-    return SampledRate(
-        np.array(LADDER), estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / np.sqrt(draws),
-        search.stare.observed_s / DAY_S,
-    )  # fmt: skip
-
-
-def _noise_of_chosen(
-    search: Search, rng: np.random.Generator, tried: list[NDArray[np.intp]], shares: Float
-) -> tuple[Float, float, Float]:
-    """Choose a template; return noise and a response, (n_frame, n_sum + 1), its value, and directions along its own.
-
-    One more sum holds the response that changes the template's value by one, since it is proportional to the template
-    in time.
-    """
-    directions = search.bank.directions
-    which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
-    onset = int(rng.choice(tried[which]))
-    template = search.in_time(search.grid[which], np.array([onset]))[0]
-    normals = rng.standard_normal((search.stare.n_frames, directions.shape[1]))
-    noise = np.sqrt(search.variance)[:, None] * normals
-    held = np.column_stack([noise, template * search.variance])
-    return held, template @ noise @ directions[direction], directions @ directions[direction]
+    error = estimates.std(axis=0, ddof=1) / np.sqrt(draws)
+    return SampledRate(np.array(LADDER), estimates.mean(axis=0), error, search.stare.observed_s / DAY_S)
 
 
 #: Nodes and weights of an integral over exp(-x).
