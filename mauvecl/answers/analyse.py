@@ -27,7 +27,7 @@ from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
-from mauvecl.study.cases import cases
+from mauvecl.study.cases import Case, Use, cases
 from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.cases import Case, Use
     from mauvecl.study.study import Study
 
 

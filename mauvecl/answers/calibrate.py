@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf
 from mauvecl.answers.files import ecsv_text
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.host.exposure.expectation import expect
+from mauvecl.host.exposure.expectation import Expectation, expect
 from mauvecl.host.instrument import shipped_names
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
@@ -31,10 +31,7 @@ from mauvecl.schema.columns import Column, View, number, percent
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.device.engine import Engine
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.runs.pool import Pool
     from mauvecl.study.study import Study

@@ -18,7 +18,7 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, reported
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson, clopper_pearson_ends
-from mauvecl.detection.nuisances import fitted_amplitudes, join_names
+from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, join_names
 from mauvecl.device.engine import Engine
 from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, ReducedSums, usable_variance, variance_of
 from mauvecl.fits.profile import Profile
@@ -32,12 +32,11 @@ from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.analyses import fitted_models
-from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages
+from mauvecl.study.cases import Case, Use, amplitude_column, cases, collect_messages
 from mauvecl.study.questions import check_sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from mauvecl.detection.nuisances import Nuisances
     from mauvecl.detection.snr import Arrays
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.fits.time_course import CoolingCourse, MeasuredBins
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
     from mauvecl.flares.stare import Event
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.flare import FlareSpectrum
-    from mauvecl.study.cases import Use
 
 Float = NDArray[np.float64]
 

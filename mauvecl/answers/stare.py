@@ -24,7 +24,7 @@ from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
-from mauvecl.flares.stare import Event, coefficients, temperatures_of
+from mauvecl.flares.stare import Event, Stare, coefficients, temperatures_of
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.units import offline
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.detection.snr import Arrays
-    from mauvecl.flares.stare import Stare
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.search.flare_fits import Factor
     from mauvecl.study.observation import SkyLight

@@ -39,7 +39,6 @@ a stare are drawn from a widened distribution and weighted accordingly.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -49,11 +48,8 @@ from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_cou
 from mauvecl.flares.stare import select_frames
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
-from mauvecl.search.search import BATCH
+from mauvecl.search.search import BATCH, Search, Survey
 from mauvecl.search.templates import Bank
-
-if TYPE_CHECKING:
-    from mauvecl.search.search import Search, Survey
 
 Float = NDArray[np.float64]
 

@@ -27,11 +27,10 @@ from numpy.typing import NDArray
 from mauvecl.fits.profile import Profile
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import array_cache
-from mauvecl.search.templates import REACH
+from mauvecl.search.templates import REACH, Bank, Templates
 
 if TYPE_CHECKING:
     from mauvecl.search.search import SearchedFrames, Survey
-    from mauvecl.search.templates import Bank, Templates
 
 Float = NDArray[np.float64]
 

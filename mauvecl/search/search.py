@@ -25,22 +25,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.flares.frames import STEADY
-from mauvecl.flares.stare import select_frames
+from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.noise.unknowns import NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
-
-if TYPE_CHECKING:
-    from mauvecl.flares.frames import Components
-    from mauvecl.flares.stare import Stare
 
 Float = NDArray[np.float64]
 
