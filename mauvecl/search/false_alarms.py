@@ -15,25 +15,19 @@ follows from Owen's T function (Owen 1956, doi 10.1214/aoms/1177728074). Neighbo
 onset of maximum correlation, which makes them independent of neighbours in onset to first order; neighbours in
 temperature are independent of both.
 
-*Importance sampling in normal noise.* The method gives an unbiased estimate of P(max > u) for M correlated normal
-values rho_j at any u. One of them, i, is chosen with a probability proportional to w_i, and the noise is drawn except
-for rho_i, so that every value is r_j + c_ij z with z = rho_i. Then, for any function G that is not zero above u,
+*Importance sampling in normal noise* (docs/completeness.md, "False alarms"). One of the correlated values rho_j, i, is
+chosen with a probability proportional to w_i, and the noise is drawn except for z = rho_i, so that every value is
+r_j + c_ij z. Then, without bias and for any function G that is not zero above u,
 
-    P = sum(w) E[integral phi(z) G(z) 1(max_j rho_j > u) / sum_j w_j G(rho_j) dz].
+    P(max > u) = sum(w) E[integral phi(z) G(z) 1(max_j rho_j > u) / sum_j w_j G(rho_j) dz].
 
-With G a step at u this is the method of Naiman & Priebe (J. Comput. Graph. Stat. 10, 296, 2001) and of Adler, Blanchet
-& Liu (2012, doi 10.1214/11-AAP792), whose 1 / number of values above u has a large variance if clusters of values above
-u vary in size. Here G(z) = exp(u z) from slightly below u: the sum over a cluster then follows its maximum, and the
-integral over z is computed by quadrature, so that the estimate hardly depends on how far the maximum exceeds u. The
-weights w are the probabilities that a template is a local maximum, so that all clusters contribute equally.
+Here G(z) = exp(u z) from slightly below u, so that the sum over a cluster follows its maximum, and the integral is
+computed by quadrature. The weights w are the probabilities that a template is a local maximum, so that all clusters
+contribute equally.
 
-*Unknown light, sky and temperature.* If the star is brighter or the detector warmer than assumed, the scatter of a
-template's value increases by a factor r, and it exceeds u as often as u / r is exceeded otherwise. If the baseline has
-trends that the search neither subtracts nor marginalises over, values are shifted, and exceed u as often as u less the
-shift is exceeded otherwise.
-
-*Rate of a survey.* A search weights frames by their known variance and marginalises over known curves. The unknowns of
-a stare are drawn from a widened distribution and weighted accordingly.
+*Unknowns of a survey's stare* are drawn from a widened distribution and weighted accordingly. Where they increase the
+scatter of a template's value by a factor r, it exceeds u as often as u / r is exceeded otherwise; where they shift it,
+as often as u less the shift is.
 """
 
 from __future__ import annotations

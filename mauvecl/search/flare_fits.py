@@ -5,12 +5,11 @@ is the unit of a fit: overlapping flares, over the union of their windows. The b
 search: a straight line over the window of the widest flare, or a continuous piecewise line in longer blocks. Flux of
 flares outside the block is subtracted. The noise of a frame includes the photon noise of the flares.
 
-A single flare has a peak, amplitude, half-width, temperature and equivalent duration, with standard errors. For a given
-peak and half-width, the frames under the shape add up to one measurement of the flare's spectrum, of which
-`mauvecl.fits` finds amplitude and temperature. Peak and half-width follow by least squares from the template that
-detected the flare, with the baseline of the search (Levenberg 1944, doi 10.1090/qam/10666; Marquardt 1963, doi
-10.1137/0111030; Golub & Pereyra 1973, doi 10.1137/0710036); errors from the inverse of the information. Amplitudes of
-flares near the threshold are biased high, because noise contributes to their detection; fits do not correct for that.
+Single flares are fitted many at a time, with standard errors from the inverse of the information. For a given peak and
+half-width, the frames under the shape add up to one measurement of the flare's spectrum, of which `mauvecl.fits` finds
+amplitude and temperature; peak and half-width follow by least squares from the template that detected the flare, with
+the baseline of the search (Marquardt 1963, doi 10.1137/0111030; Golub & Pereyra 1973, doi 10.1137/0710036). Amplitudes
+near the threshold are biased high, because noise contributes to detection; fits do not correct for that.
 """
 
 from __future__ import annotations

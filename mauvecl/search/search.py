@@ -9,15 +9,10 @@ with m the inverse variance of a frame, zero in gaps. Without a flare it is norm
 mean is the S/N. All sums over time are correlations, computed by FFT. (Matched filters: Turin 1960, doi
 10.1109/TIT.1960.1057571.)
 
-Non-linear trends are fitted to the sums of a stare and subtracted. A search marginalises over the baseline of a window
-to first order: offset, slope and cycles. But dark current is exponential in temperature, so that a temperature drift is
-curved, and drifts of light and star multiply. This part follows from the amplitudes of the unknowns, which are well
-measured if they matter: over a whole stare, each changes the sums by many standard deviations. The amplitudes are
-fitted, and their effect beyond first order is subtracted. An error of one standard deviation in the baseline then
-leaves a few per cent of it, the relative change of the dark current.
-
-The fit uses the Gauss-Newton method on means over half a minute, with the distribution of the unknowns as prior. Means
-with flares have less weight (Huber 1964, doi 10.1214/aoms/1177703732), so that flares hardly affect the fit.
+What unknowns do to the sums beyond first order, such as the bend of the dark current by a drifting temperature, is
+fitted to the whole stare and subtracted (docs/completeness.md, "Beyond first order"): by the Gauss-Newton method on
+means over half a minute, with the distribution of the unknowns as prior, and less weight for means with flares (Huber
+1964, doi 10.1214/aoms/1177703732).
 """
 
 from __future__ import annotations
@@ -34,7 +29,7 @@ from numpy.typing import NDArray
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
-from mauvecl.noise.unknowns import NONE, Changing, Processes
+from mauvecl.noise.unknowns import CHANGED_PART, NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
 
@@ -357,11 +352,8 @@ class Trend:
 
     def _changes(self, amplitudes: Float) -> dict[str, Float]:
         """Return the relative changes of star, light and sky, and that of the temperature, (n_stare, n_frame)."""
-        changes: dict[str, Float] = {}
-        for of in ("star", "light", "sky", "temperature"):
-            these = [k for k, name in enumerate(self.of) if name == of]
-            changes[of] = amplitudes[:, these] @ self.curves[these]
-        return changes
+        of = np.array(self.of)
+        return {name: amplitudes[:, of == name] @ self.curves[of == name] for name in CHANGED_PART}
 
     def _gradient(self, amplitudes: Float) -> Float:
         """Return the derivatives of `effect` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
