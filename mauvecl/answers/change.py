@@ -66,6 +66,11 @@ class IndexRow(InCell):
     flux: NDArray[np.float64]  # mean of the exposure, erg s-1 cm-2 nm-1
     saturated: tuple[int, int]  # pixels near saturation, and all of the index
 
+    @property
+    def note(self) -> str:
+        """Why the index has no value; empty if it has one."""
+        return _lost_pixels(*self.saturated)
+
 
 @dataclass(frozen=True, eq=False)
 class PeriodRow(InCell):
@@ -124,8 +129,7 @@ INDEX_COLUMNS = (
     *interval_columns("band_{}", lambda row: row.value.index.band_nm, "nm", "the band"),
     Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
            kind=str),
-    Column("note", lambda row: _lost_pixels(*row.saturated), "", "saturated pixels of the index, which has no value "
-           "then", "note", kind=str),
+    Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
 )  # fmt: skip
 MAGNITUDE_COLUMNS = (Column("magnitude", "magnitude", "mag", "of the star in its band"), *COLUMNS[:2], COLUMNS[4])
 PERIOD_COLUMNS = (
