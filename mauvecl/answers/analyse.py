@@ -17,7 +17,6 @@ from mauvecl.fits.flare_model import FlareModel
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.stars.flare import check_scales
-from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, SpectralAnalysis, analyse_frames
 from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
@@ -28,14 +27,14 @@ from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
-from mauvecl.study.cases import cases
+from mauvecl.study.cases import Case, Use, cases
+from mauvecl.study.star import Star
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.device.engine import Engine
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.cases import Case, Use
     from mauvecl.study.study import Study
 
 
@@ -81,8 +80,8 @@ COLUMNS = (
 
 #: Name of the bolometric energy among measured quantities.
 ENERGY = "energy bolometric"
-#: V magnitude of the star that replaces one that is not named: far from saturation.
-ANY_MAGNITUDE = 12.0
+#: Star that replaces one that is not named: far from saturation.
+ANY_STAR = Star(library="G2V", magnitude=12.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -557,18 +556,15 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
     """
     if frames.flux.ndim == 1:
         return ""
-    named = len(study.star) == 1
-    (case, *_) = cases(study, swept=False)
+    (case, *_), named = cases(study, swept=False), len(study.star) == 1
     observation = study.observation.model_copy(update={"exposure_s": float(np.median(frames.exposure_s))})
-    case = case.with_sections(observation=observation)
-    source = case.source if named else Source.from_library("G2V").at_magnitude(ANY_MAGNITUDE)
+    case = case.with_sections(observation=observation, star=study.star if named else (ANY_STAR,))
+    source = case.source
     try:
-        quiet = case.expect(source)[0]
+        quiet = case.quiet
         flare = FlareModel.of(
             source, case.instrument, quiet, band=study.flare.band, bands_nm=study.measure.bands_nm,
-            distance_pc=case.star.distance_pc if named else None,
-            radius_rsun=case.star.radius_rsun if named else None,
-            order=study.observation.order,
+            distance_pc=case.star.distance_pc, radius_rsun=case.star.radius_rsun, order=study.observation.order,
         )  # fmt: skip
         if not named:
             # An amplitude is relative to the star.

@@ -16,14 +16,13 @@ from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure.background import rate_of
 from mauvecl.host.instrument import shipped_names
 from mauvecl.schema.columns import Column, Drawable, View, percent, records, stacked, table_of
-from mauvecl.study.cases import assumptions_of, cases, full_label, place_columns
+from mauvecl.study.cases import Case, Use, assumptions_of, cases, full_label, place_columns
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.answers.verbs import Progress
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.cases import Case, Use
     from mauvecl.study.study import Study
 
 

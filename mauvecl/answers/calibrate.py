@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf
 from mauvecl.answers.files import ecsv_text
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.host.exposure.expectation import expect
+from mauvecl.host.exposure.expectation import Expectation, expect
 from mauvecl.host.instrument import shipped_names
 from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import FILE_VERSION, Instrument
@@ -31,10 +31,7 @@ from mauvecl.schema.columns import Column, View, number, percent
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.device.engine import Engine
-    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.runs.pool import Pool
     from mauvecl.study.study import Study
@@ -80,12 +77,14 @@ COLUMNS = (
     Column("determined", "determined", "", "whether these observations determine it", "status",
            lambda determined: "" if determined else "assumed", kind=bool),
 )  # fmt: skip
+#: Columns of the goodness of fit, for pairs of a name and a fit.
 FIT_COLUMNS = (
-    Column("fit", "name", "", "what is fitted", "fit", kind=str),
-    Column("chi2", "chi2", "", "chi-squared", "chi-squared / dof", lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}",
-           ("dof",)),
-    Column("dof", "dof", "", "values less the effective number of parameters"),
-    Column("p_value", "p_value", "", "probability of a chi-squared at least as large", "p", number(".3g")),
+    Column("fit", lambda row: row[0], "", "what is fitted", "fit", kind=str),
+    Column("chi2", lambda row: row[1].chi2, "", "chi-squared", "chi-squared / dof",
+           lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}", ("dof",)),
+    Column("dof", lambda row: float(row[1].dof), "", "values less the effective number of parameters"),
+    Column("p_value", lambda row: row[1].p_value, "", "probability of a chi-squared at least as large", "p",
+           number(".3g")),
 )  # fmt: skip
 THROUGHPUT_COLUMNS = (
     Column("wavelength", "throughput.wavelength_nm", "nm", "middle of the pixel", "nm", ".1f"),
@@ -139,7 +138,11 @@ class CalibrateAnswer(Answer):
         f"{'s' if len(answer.stars) > 1 else ''}; dark current at {answer.dark.reference_c:.1f} C",
     )  # fmt: skip
     #: One row per fit: its goodness.
-    fits = TableOf("fits", FIT_COLUMNS, "_fits", title="Goodness of fit", key="fits", about=())
+    fits = TableOf("fits", FIT_COLUMNS, lambda answer: [
+        (name, fit) for name, fit in (
+            ("throughput", answer.throughput), ("dark current", answer.dark), ("photon transfer", answer.transfer)
+        ) if fit.dof > 0
+    ], title="Goodness of fit", key="fits", about=())  # fmt: skip
     #: One row per pixel: fitted and nominal throughput.
     throughput_table = TableOf("throughput", THROUGHPUT_COLUMNS, lambda answer: answer)
     #: One row per pixel: dark current and bias.
@@ -172,14 +175,6 @@ class CalibrateAnswer(Answer):
         ):  # fmt: skip
             rows.append(Fitted(name, *((fit.value, fit.error) if fit else (usual, np.nan)), usual, "nm"))
         return rows
-
-    @property
-    def _fits(self) -> list[dict[str, Any]]:
-        fits: dict[str, ThroughputFit | detector.DarkFit | detector.PhotonTransfer] = {
-            "throughput": self.throughput, "dark current": self.dark, "photon transfer": self.transfer
-        }  # fmt: skip
-        return [{"name": name, "chi2": fit.chi2, "dof": float(fit.dof), "p_value": fit.p_value}
-                for name, fit in fits.items() if fit.dof > 0]  # fmt: skip
 
     @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:
@@ -329,29 +324,23 @@ class CalibrateAnswer(Answer):
             knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=light
         )
         origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
+        # Pixels that are not read have the mean of the others.
+        level, bias, read = self.dark.level_dn_per_s, self.dark.bias_dn, self.nominal.read_pixels
+        dark, every_bias = np.ones(moved.pixels), np.full(moved.pixels, bias.mean())
+        dark[read], every_bias[read] = level / level.mean(), bias
+        by_pixel: dict[str, Any] = {"pixel": np.arange(moved.pixels), "dark": dark}
+        for name, unit in (("response", 1), ("gain", 1), ("read_noise_dn", u.DN)):
+            if (given := getattr(self.nominal.pixel_map, name, None)) is not None:
+                by_pixel[name] = given * unit
+        if np.ptp(bias) > 0:
+            by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
         values = {name: list(steps) for name, steps in errors.values.items()}
         return {
             "throughput-factor": QTable(step_nm | {"factor": factor}, meta=origin),
             "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
-            "pixel-map": QTable(self._pixel_map, meta=origin, descriptions={"dark": "factor on the dark current"}),
+            "pixel-map": QTable(by_pixel, meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
-
-    @property
-    def _pixel_map(self) -> dict[str, Any]:
-        """Columns of the pixel map: factors on the dark current, values of the given map, and the bias."""
-        nominal, level, bias = self.nominal, self.dark.level_dn_per_s, self.dark.bias_dn
-        # Pixels that are not read have the mean of the others.
-        dark, every_bias = np.ones(nominal.pixels), np.full(nominal.pixels, bias.mean())
-        dark[nominal.read_pixels], every_bias[nominal.read_pixels] = level / level.mean(), bias
-        columns: dict[str, Any] = {"pixel": np.arange(nominal.pixels), "dark": dark}
-        for name in ("response", "gain", "read_noise_dn"):
-            given = getattr(nominal.pixel_map, name, None)
-            if given is not None:
-                columns[name] = given * u.DN if name.endswith("_dn") else given
-        if np.ptp(bias) > 0:
-            columns["bias_dn"] = every_bias * u.DN
-        return columns
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.

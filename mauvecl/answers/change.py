@@ -13,7 +13,7 @@ from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations import visits
 from mauvecl.schema.columns import Column, View, formatted, interval_columns, number, percent
-from mauvecl.study.cases import Case, cases, collect_messages
+from mauvecl.study.cases import Case, Use, cases, collect_messages
 from mauvecl.study.plan import targets_of
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.cases import Use
     from mauvecl.study.study import Study
 
 #: Magnitudes around that of the star at which changes are computed.

@@ -24,7 +24,7 @@ from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
-from mauvecl.flares.stare import Event, coefficients, temperatures_of
+from mauvecl.flares.stare import Event, Stare, coefficients, temperatures_of
 from mauvecl.host import VERSION
 from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.tables.units import offline
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.detection.snr import Arrays
-    from mauvecl.flares.stare import Stare
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.search.flare_fits import Factor
     from mauvecl.study.observation import SkyLight
@@ -439,9 +438,7 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     lost = staring.stare.pointing_losses(numbers, seed)[0] if drifting else None
     kelvin, flares = temperatures_of(case.events), list[StareFlare]()
     for event in case.events:
-        of = partial(energy_of, case.study, case.source, event, temperatures_k=kelvin)
-        # None, for a star of unknown size, becomes NaN.
-        band, bolometric = np.array([of("band"), of("bolometric")], float).tolist()
+        band, bolometric = (energy_of(case.study, case.source, event, kind, kelvin) for kind in ("band", "bolometric"))
         own = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
         flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
     return StarStare(case.label, case.at, staring, flares, light, lost, **searched)
@@ -507,5 +504,4 @@ def _found_energy(case: Case, event: Event) -> float:
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
         return float("nan")
-    energy = energy_of(case.study, case.source, event, "bolometric")
-    return float("nan") if energy is None else energy
+    return energy_of(case.study, case.source, event, "bolometric")

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from mauvecl.study.keywords import Keyword
     from mauvecl.study.study import Study
 
@@ -45,10 +43,12 @@ SIZE = ("star.distance_pc", "star.radius_rsun", "star.effective_temperature_k")
 SIGNAL = ("observation.signal",)
 DRAWS = ("run.realisations", "run.seed")
 DETECTION = ("run.statistics", "run.fap", "run.tails", "run.reference", "run.variances")
-NUISANCES = ("nuisances.own", "nuisances.usual")
+#: Whether everything but the noise is known.
+USUAL = "nuisances.usual"
+NUISANCES = ("nuisances.own", USUAL)
 UNKNOWN = ("unknowns.draws", "unknowns.known")
 FRAMES = ("stare.duration_s", "stare.gaps", "stare.orbit_gap_s", "stare.thermal", "stare.pointing")
-STARE = (*FRAMES, "stare.half_width_s", "stare.shape", "stare.energies_erg", "stare.search", "nuisances.usual")
+STARE = (*FRAMES, "stare.half_width_s", "stare.shape", "stare.energies_erg", "stare.search", USUAL)
 FLARE_LIGHT = tuple(
     f"flare.{key}" for key in ("temperature_k", "band", "geometry", "photosphere_temperature_k", "spectrum")
 )
@@ -66,13 +66,11 @@ class Verb:
 
     name: str
     help: str  # help text of the command, with examples
-    # Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
-    takes: tuple[str, ...]
+    keys: tuple[str, ...]  # keys and sections of the study whose flags the command takes, in the order of `--help-all`
     # Key of `GROUPS`: where `mauvecl` lists the command, and the page its tabs.
     group: str = "plan"
     common: tuple[str, ...] = ()  # parameters of flags that `--help` shows in addition to `COMMON`
     counts: str = ""  # what the command line's progress bar counts; empty if a closed form answers at once
-    observation: tuple[str, ...] = OBSERVATION  # keys of an observation, or their replacements
     # Values of keys where neither a study file nor a flag is given, if they differ from the study's.
     defaults: Mapping[str, Any] | None = None
     # Makes the study from the flags where no file is given; the paper's question by default.
@@ -90,11 +88,6 @@ class Verb:
     def accepts(self, key: str) -> bool:
         """Return whether the command has the flags of a key or section of the study."""
         return any(key == prefix or key.startswith(f"{prefix}.") for prefix in self.keys)
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Keys and sections of the study that the verb takes, in the order of `--help-all`."""
-        return (*self.observation, *self.takes)
 
     def study_of(
         self, given: dict[str, Any], keywords: Mapping[str, Keyword], study: Study | None, where: str
@@ -161,7 +154,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
     """,
-            ("flare", *SIGNAL, "run.seed"),
+            (*OBSERVATION, "flare", *SIGNAL, "run.seed"),
             group="simulate",
             common=("flare_temperature", "sky", "seed"),
             home="signal",
@@ -180,7 +173,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """,
-            (*DRAWS, *SIGNAL, "signal.wavelength_nm", "sweep"),
+            (*OBSERVATION, *DRAWS, *SIGNAL, "signal.wavelength_nm", "sweep"),
             group="simulate",
             common=("realisations", "at", "signal", "sky", "sweep"),
             counts="realisations",
@@ -196,9 +189,8 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """,
-            ("signal", *SIGNAL),
+            (*WITHOUT_EXPOSURE, "signal", *SIGNAL),
             common=("snr", "at", "per", "sky"),
-            observation=WITHOUT_EXPOSURE,
             home="signal",
         ),
         Verb(
@@ -210,7 +202,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """,
-            ("flare", *DRAWS, *DETECTION, "campaign", *NUISANCES, "run.template_temperatures_k", "sweep"),
+            (*OBSERVATION, "flare", *DRAWS, *DETECTION, "campaign", *NUISANCES, "run.template_temperatures_k", "sweep"),
             common=("flare_temperature", "realisations", "fap", "with_unknowns", "sweep"),
             counts="realisations",
         ),
@@ -224,7 +216,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """,
-            ("limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep"),
+            (*OBSERVATION, "limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep"),
             common=("of", "power", "realisations", "fap", "with_unknowns"),
             counts="steps",
             tab=True,
@@ -238,7 +230,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
     """,
-            ("map", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN),
+            (*OBSERVATION, "map", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN),
             common=("x", "y", "realisations", "fap", "with_unknowns"),
             counts="cells",
             defaults=FEWER,
@@ -254,7 +246,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """,
-            (*DRAWS, *DETECTION, *SIGNAL, "sweep"),
+            (*OBSERVATION, *DRAWS, *DETECTION, *SIGNAL, "sweep"),
             group="simulate",
             common=("realisations", "fap", "signal", "sweep"),
             counts="realisations",
@@ -274,7 +266,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --joint-fit --duration 1800 --distance 5
     """,
-            ("flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep"),
+            (*OBSERVATION, "flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep"),
             common=("flare_temperature", "balmer_jump", "distance", "with_unknowns", "sweep"),
             counts="flares",
             tab=True,
@@ -289,11 +281,10 @@ VERBS: dict[str, Verb] = {
 
     mauvecl stare --star G2V --magnitude 7.4 --distance 14.1 --energy 1e33 --energy 1e34 --orbit-gap 2100
     """,
-            ("flare", *STARE, *SIZE, "run.seed", "sweep"),
+            (*WITHOUT_EXPOSURE, "flare", *STARE, *SIZE, "run.seed", "sweep"),
             group="simulate",
             common=("duration", "orbit_gap", "half_width", "energy", "distance", "with_unknowns"),
             counts="stares",
-            observation=WITHOUT_EXPOSURE,
         ),
         Verb(
             "inject",
@@ -307,10 +298,9 @@ VERBS: dict[str, Verb] = {
 
     mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
     """,
-            (*FLARE_LIGHT, *FRAMES, "nuisances.usual", *SIZE, "search", "injections", "run.seed", "sweep"),
+            (*WITHOUT_EXPOSURE, *FLARE_LIGHT, *FRAMES, USUAL, *SIZE, "search", "injections", "run.seed", "sweep"),
             common=("duration", "orbit_gap", "distance", "false_alarms", "alarms_per", "injections", "with_unknowns"),
             counts="injections",
-            observation=WITHOUT_EXPOSURE,
             defaults={"stare.duration_s": 86_400.0},
         ),
         Verb(
@@ -325,11 +315,10 @@ VERBS: dict[str, Verb] = {
 
     mauvecl analyse light-curve-1.fits --star M3V --magnitude 9 --distance 5
     """,
-            ("data", "orbit.tle", "orbit.kind", *SIZE, "flare.temperature_k", *ALARMS, "run.seed"),
+            (*WITHOUT_EXPOSURE, "data", "orbit.tle", "orbit.kind", *SIZE, "flare.temperature_k", *ALARMS, "run.seed"),
             group="analyse",
             common=("mapping", "quality_bits", "false_alarms", "alarms_per", "distance", "report"),
             counts="frames",
-            observation=WITHOUT_EXPOSURE,
             tab=True,
         ),
         Verb(
@@ -343,7 +332,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl change --star K5V -m 8 --exposure 300 --visits 40 --periods --look-at "eps Eri" --days 60
     """,
-            ("change", "limit.power", "run.fap", "run.seed", *NUISANCES, *ORBIT, *TARGETS, "sweep"),
+            (*OBSERVATION, "change", "limit.power", "run.fap", "run.seed", *NUISANCES, *ORBIT, *TARGETS, "sweep"),
             common=("change", "visits", "periods", "look_at", "days", "with_unknowns"),
             tab=True,
         ),
@@ -359,7 +348,6 @@ VERBS: dict[str, Verb] = {
             ("observation.instrument", "sky", "calibrate"),
             group="analyse",
             common=("knots", "light_error", "spectrum_error"),
-            observation=(),
             tab=True,
         ),
         Verb(
@@ -370,9 +358,8 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
     """,
-            TARGETS,
+            (*ORBIT, *TARGETS),
             common=("look_at", "targets", "start", "days", "simbad"),
-            observation=ORBIT,
         ),
         Verb(
             "plan",
@@ -383,10 +370,9 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl plan targets.csv --hours 200 --start 2027-01-01
     """,
-            ("plan", *ALARMS, *INSTRUMENT, "flare.temperature_k", "flare.band", "flare.spectrum", "nuisances.usual"),
+            (*ORBIT, "plan", *ALARMS, *INSTRUMENT, "flare.temperature_k", "flare.band", "flare.spectrum", USUAL),
             common=("targets", "hours", "start", "days", "completeness", "report", "false_alarms"),
             counts="targets",
-            observation=ORBIT,
             tab=True,
         ),
     )

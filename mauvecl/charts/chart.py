@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib import import_module
@@ -12,11 +11,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, TypeVar
 
-from mauvecl.schema.errors import InputError
-
 F = TypeVar("F", bound=Callable[..., Any])
-#: Caller's axes to draw in; None if the picture creates its own figure.
-AXES: ContextVar[Any] = ContextVar("axes", default=None)
 #: Largest number of curves of targets on the page; further targets are in the table alone.
 MOST_TARGETS = 8
 
@@ -290,7 +285,10 @@ def register(kind: str, name: str, make: F, **how: Any) -> F:
 
 def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:
     """Return every picture of an object by file name, as functions of `path` and `ax`."""
-    return {name: partial(_draw, draw) for name, draw in _made_of(thing, document=False)}
+    return {
+        name: lambda path=None, draw=draw, **how: draw(path=path, **how)
+        for name, draw in _made_of(thing, document=False)
+    }
 
 
 def documents_of(thing: Any) -> dict[str, Callable[[], bytes]]:
@@ -319,15 +317,3 @@ def load() -> None:
     """Import all modules of pictures, so that they register their functions."""
     for module in iter_modules([str(Path(__file__).parent)]):
         import_module(f"{__package__}.{module.name}")
-
-
-def _draw(draw: Callable[..., Any], path: str | Path | None = None, *, ax: Any = None, **options: Any) -> Any:
-    """Draw a picture and return the figure, the path of the saved file, or `ax`."""
-    if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
-        raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
-    before = AXES.set(ax)
-    try:
-        drawn = draw(path=path, **options)
-    finally:
-        AXES.reset(before)
-    return drawn if ax is None else ax

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.gaussian import GaussianAnswer
     from mauvecl.answers.limit import LimitAnswer
     from mauvecl.answers.map import MapAnswer
-    from mauvecl.answers.measure import MeasureAnswer, MeasuredFlare
-    from mauvecl.answers.measurements import JointFit, MeasuredStare
+    from mauvecl.answers.measure import JointFit, MeasureAnswer, MeasuredFlare, MeasuredStare
     from mauvecl.answers.signal import ExposureAnswer, SnrAnswer
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.study import Study

@@ -8,16 +8,14 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from itertools import cycle
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import Any
 
 import numpy as np
 
-from mauvecl.charts import chart
-from mauvecl.charts.chart import Area, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets
+from mauvecl.charts.chart import Area, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets, register
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
-P = ParamSpec("P")
 #: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color); neighbours differ in
 #: lightness as well.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
@@ -104,13 +102,6 @@ def _own_part(ax: Any) -> Any:
     return ax.figure.add_subfigure(spec)
 
 
-def _headline(figure: Any, text: str) -> None:
-    """Add a title above all panels, wrapped to a part of the width; matplotlib would fill it to the edges."""
-    title = figure.suptitle(text, fontsize=9.0)
-    letters = int(TITLE * len(text) * figure.bbox.width / title.get_window_extent().width)
-    title.set_text(textwrap.fill(text, max(letters, 1), break_on_hyphens=False, break_long_words=False))
-
-
 def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
     """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
     for rows in range(1, len(handles) + 1):
@@ -142,34 +133,38 @@ def in_figure(unit: str) -> str:
     return str(Unit(unit).to_string("latex_inline"))
 
 
-def styled_picture(draw: Callable[P, Any]) -> Callable[..., Any]:
-    """Decorate a function that returns a picture, a panel or a figure: draw it in the common style, and save it.
+def styled_picture(draw: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate a function that returns a picture or a panel: draw it in the common style, and save it.
 
-    The decorated function takes the `path` of the file as well, and returns the figure without one.
+    The decorated function also takes the `path` of the file, without which it returns the figure, and the axes `ax` to
+    draw in, which it then returns.
     """
 
     @wraps(draw)
-    def picture(*what: Any, path: str | Path | None = None, **how: Any) -> Any:
+    def picture(*what: Any, path: str | Path | None = None, ax: Any = None, **how: Any) -> Any:
+        if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
+            raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
         with style():
             made = draw(*what, **how)
-            made = Picture([[made]]) if isinstance(made, Panel) else made
-            return save_or_return(draw_picture(made) if isinstance(made, Picture) else made, path)
+            figure = draw_picture(Picture([[made]]) if isinstance(made, Panel) else made, ax=ax)
+            saved = save_or_return(figure, path)
+        return saved if ax is None else ax
 
     return picture
 
 
-def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[P, Any]], Callable[..., Any]]:
+def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
 
     `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `how` is as for
-    `chart.Entry`.
+    `chart.Entry`. A function that is a picture of several classes is decorated once.
     """
-    return lambda draw: chart.register(kind, name, styled_picture(draw), **how)
+    return lambda draw: register(kind, name, draw if hasattr(draw, "__wrapped__") else styled_picture(draw), **how)
 
 
-def draw_picture(picture: Picture, figure: Any = None) -> Any:
-    """Draw a picture in a figure, by default one of its own or the caller's axes, and return the figure."""
-    rows, n, ax = picture.rows, max(len(row) for row in picture.rows), chart.AXES.get()
+def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any:
+    """Draw a picture in a figure, by default one of its own or that of axes `ax`, and return the figure."""
+    rows, n = picture.rows, max(len(row) for row in picture.rows)
     alone = ax is not None and len(rows) == n == 1
     if figure is None:
         figure = new_figure(picture.size) if ax is None else ax.figure if alone else _own_part(ax)
@@ -203,7 +198,10 @@ def draw_picture(picture: Picture, figure: Any = None) -> Any:
         entries = [zip(*axis.get_legend_handles_labels(), strict=True) for axis, _ in drawn]
         _legend_below(figure, {name: handle for each in entries for handle, name in each})
     if title:
-        _headline(figure, title)
+        # Wrapped to a part of the width, which matplotlib would fill to the edges.
+        text = figure.suptitle(title, fontsize=9.0)
+        letters = int(TITLE * len(title) * figure.bbox.width / text.get_window_extent().width)
+        text.set_text(textwrap.fill(title, max(letters, 1), break_on_hyphens=False, break_long_words=False))
     return figure
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from mauvecl.answers.verbs import DRAWS, FEWER, VERBS, Verb
+from mauvecl.answers.verbs import DRAWS, FEWER, OBSERVATION, VERBS, Verb
 from mauvecl.cli import flags
 from mauvecl.cli.console import Meter, show, show_view
 from mauvecl.schema.columns import Column, View
@@ -141,7 +141,7 @@ RowsFlag = Annotated[
     Verb(
         "realise",
         "",
-        ("flare", *DRAWS, "nuisances.usual", "sweep", "bulk"),
+        (*OBSERVATION, "flare", *DRAWS, "nuisances.usual", "sweep", "bulk"),
         group="simulate",
         common=("realisations", "seed", "frames", "components", "resume"),
         counts="spectra",

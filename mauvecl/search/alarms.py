@@ -8,7 +8,7 @@ passes end when there are no more alarms.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -56,8 +56,14 @@ MAX_PROFILED_SNR = 40.0
 #: The rise of chi-squared that 68 % of the true values stay within is 1 + this / (S/N of the fit)^2: a correction of
 #: the likelihood ratio as Bartlett's (1937, doi 10.1098/rspa.1937.0109), counted by `bench/blends.py`.
 BARTLETT = 14.0
-#: Quantities with intervals, by their names in `FittedFlares`.
-QUANTITIES = ("peak_s", "amplitude", "half_width_s", "temperature_k", "equivalent_duration_s")
+#: Quantities with intervals by their names in `FittedFlares`; the duration is that of a shape of unit area.
+QUANTITIES = {
+    "peak_s": ProfiledQuantity(PEAK),
+    "amplitude": ProfiledQuantity(AMPLITUDE),
+    "half_width_s": ProfiledQuantity(WIDTH),
+    "temperature_k": ProfiledQuantity(KELVIN),
+    "equivalent_duration_s": ProfiledQuantity(AMPLITUDE, lambda _: (0.0, 0.0)),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +95,11 @@ class Candidate:
     template: tuple[float, float]  # peak time and half-width of the template, s
 
 
+def _thetas(candidates: Iterable[Candidate]) -> Float:
+    """Return the parameters of flares, shape (n_flare, 4)."""
+    return np.array([candidate.theta for candidate in candidates]).reshape(-1, 4)
+
+
 def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor | None = None) -> list[Alarm]:
     """Detect and fit all flares of a stare in its simulated sums, (n_frame, n_sum), largest statistic first.
 
@@ -96,12 +107,16 @@ def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor 
     logarithm of the temperature.
     """
     net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
-    search = _StareSearch(SummedStare(survey, net), threshold)
-    search.run()
-    found = []
+    search, found = _StareSearch(SummedStare(survey, net), threshold), []
+    # Until there are no alarms, and no block improves with a further flare.
+    while new := search.searched() or search.split():
+        search.found += new
+        changed = set(new)
+        for _ in range(TURNS):
+            changed = search.fitted(changed)
     for number, block in enumerate(search.blocks(), 1):
-        theta = np.array([candidate.theta for candidate in block])
-        rows, measured = search.sums.block(theta, search.thetas), list[Measured]()
+        theta, measured = _thetas(block), list[Measured]()
+        rows = search.sums.block(theta, _thetas(search.found))
         best = rows.fit(theta)
         while not measured:
             try:
@@ -123,19 +138,6 @@ class _StareSearch:
     refused: list[tuple[float, float]] = field(default_factory=list)
     complete: set[tuple[float, ...]] = field(default_factory=set)  # blocks that no further flare improves
 
-    def run(self) -> None:
-        """Search and fit until there are no alarms and no block improves with a further flare."""
-        while new := self._searched() or self._split():
-            self.found += new
-            changed = {id(candidate) for candidate in new}
-            for _ in range(TURNS):
-                changed = self._fitted(changed)
-
-    @property
-    def thetas(self) -> Float:
-        """Parameters of all flares, shape (n_flare, 4)."""
-        return np.array([candidate.theta for candidate in self.found]).reshape(len(self.found), 4)
-
     def blocks(self) -> list[list[Candidate]]:
         """Group overlapping flares in order of time, with at most `MAX_FLARES_PER_FIT` flares per group."""
         spans = sorted(((*self.sums.overlap(candidate.theta), k) for k, candidate in enumerate(self.found)))
@@ -149,27 +151,24 @@ class _StareSearch:
         n = MAX_FLARES_PER_FIT
         return [block[k : k + n] for block in blocks for k in range(0, len(block), n)]
 
-    def _near(self, peaks: Float, width_s: float) -> Float:
-        """Return the sum of the statistics of flares within reach of templates, shape of `peaks`."""
-        total = np.zeros(peaks.shape)
-        for candidate in self.found:
-            reach = TAIL * np.exp(candidate.theta[WIDTH]) + LEAD * width_s
-            total += np.where(np.abs(peaks - candidate.theta[PEAK]) < reach, candidate.rho, 0.0)
-        return total
-
     def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Float, NDArray[np.int64], Row]]:
         """Yield per row the best value of each onset, its excess over fit residuals, peak time and temperature."""
-        light = self.sums.light(self.thetas)
+        theta, (low, high) = _thetas(self.found), self.sums.bounds
+        light = self.sums.light(theta)
         # Flares at the bounds of the fit may remain in the residuals entirely.
-        low, high = self.sums.bounds
-        at_end = np.minimum(self.thetas - low, high - self.thetas) <= AT_BOUND * (high - low)
-        wrong = self.sums.light(self.thetas[at_end[:, [PEAK, WIDTH]].any(axis=1)])
+        at_end = np.minimum(theta - low, high - theta) <= AT_BOUND * (high - low)
+        wrong = self.sums.light(theta[at_end[:, [PEAK, WIDTH]].any(axis=1)])
         both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
         search = self.sums.survey.search
         for row, rho in search.values(both.astype(np.float32)):
             peaks = search.peaks_s(row)
             rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
-            excess = rho[0] - np.maximum(rests, near_share * self._near(peaks, row.template.half_width_s))
+            # Statistics of flares within reach of the templates.
+            near = np.zeros(peaks.shape)
+            for candidate in self.found if near_share else ():
+                reach = TAIL * np.exp(candidate.theta[WIDTH]) + LEAD * row.template.half_width_s
+                near += np.where(np.abs(peaks - candidate.theta[PEAK]) < reach, candidate.rho, 0.0)
+            excess = rho[0] - np.maximum(rests, near_share * near)
             which = excess.argmax(axis=0)
             onsets = np.arange(excess.shape[1])
             yield rho[0, which, onsets], excess[which, onsets], peaks, which, row
@@ -183,7 +182,7 @@ class _StareSearch:
         theta = np.array([np.log(amplitude), peak, np.log(width), np.log(kelvin)])
         return Candidate(theta, rho, (peak, width))
 
-    def _searched(self) -> list[Candidate]:
+    def searched(self) -> list[Candidate]:
         """Return new candidates from the residuals, at most one within the window of another."""
         sums, bank = self.sums, self.sums.survey.bank
         candidates = []
@@ -207,7 +206,7 @@ class _StareSearch:
                 new.append(candidate)
         return new
 
-    def _split(self) -> list[Candidate]:
+    def split(self) -> list[Candidate]:
         """Return a further flare that improves the fit of a block as much as an alarm, if there is one."""
         blocks = [block for block in self.blocks() if self._key(block) not in self.complete]
         if not blocks:
@@ -232,10 +231,9 @@ class _StareSearch:
 
     def _improves(self, block: list[Candidate], candidate: Candidate) -> bool:
         """Return whether a further flare improves a block significantly, and update the flares to the better fit."""
-        before = np.array([each.theta for each in block])
-        with_it = [*block, candidate]
-        rows = self.sums.block(np.array([each.theta for each in with_it]), np.vstack([self.thetas, candidate.theta]))
-        best = self._best(rows, with_it, {id(candidate)})
+        before, with_it = _thetas(block), [*block, candidate]
+        rows = self.sums.block(_thetas(with_it), _thetas([*self.found, candidate]))
+        best = self._best(rows, with_it, [candidate])
         # The other flares alone may fit better from their new parameters.
         alone = min((rows.fit(before), rows.without(best, len(block))), key=lambda fit: fit.chi2)
         fall = alone.chi2 - best.chi2
@@ -243,18 +241,17 @@ class _StareSearch:
         mine, others = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
         seen = abs(float(mine @ others)) / max(float(np.linalg.norm(mine)), 1e-300)
         rests = max(LEFT_UNSEEN * seen, LEFT_BEHIND * max(each.rho for each in block))
-        if fall < (self.threshold + rests) ** 2:
-            for each, theta in zip(block, alone.theta, strict=True):
-                each.theta = theta
-            return False
-        for each, theta in zip(with_it, best.theta, strict=True):
+        improves = bool(fall >= (self.threshold + rests) ** 2)
+        if improves:
+            candidate.rho = float(np.sqrt(fall))
+        flares, better = (with_it, best) if improves else (block, alone)
+        for each, theta in zip(flares, better.theta, strict=True):
             each.theta = theta
-        candidate.rho = float(np.sqrt(fall))
-        return True
+        return improves
 
     @staticmethod
     def _key(block: list[Candidate]) -> tuple[float, ...]:
-        return tuple(np.round([candidate.theta for candidate in block], 2).ravel().tolist())
+        return tuple(np.round(_thetas(block), 2).ravel().tolist())
 
     def _was_refused(self, peak: float, width: float) -> bool:
         return any(abs(peak - other) <= max(width, wide) and 1 / 3 < width / wide < 3 for other, wide in self.refused)
@@ -263,7 +260,7 @@ class _StareSearch:
         """Scale residuals under flares down to the noise of frames without a flare."""
         if not self.found:
             return left
-        noise = self.sums.noise(self.thetas, light)
+        noise = self.sums.noise(_thetas(self.found), light)
         base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
         loud = excess > 1.01
@@ -279,57 +276,47 @@ class _StareSearch:
             evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
         return evened
 
-    def _fitted(self, changed: set[int]) -> set[int]:
+    def fitted(self, changed: set[Candidate]) -> set[Candidate]:
         """Fit all blocks that have changed or adjoin changed ones, and return the flares whose parameters changed."""
-        moved: set[int] = set()
-        spans = [self.sums.window(candidate.theta) for candidate in self.found if id(candidate) in changed]
+        moved: set[Candidate] = set()
+        spans = [self.sums.window(candidate.theta) for candidate in changed]
         for block in self.blocks():
             mine = [self.sums.window(candidate.theta) for candidate in block]
             if any(a < d and c < b for a, b in mine for c, d in spans):
-                moved |= self._fit(block, {id(candidate) for candidate in block} & changed)
+                moved |= self._fit(block, changed)
         return moved
 
-    def _fit(self, block: list[Candidate], new: set[int]) -> set[int]:
-        sums = self.sums
-        before = np.array([candidate.theta for candidate in block])
-        rows = sums.block(before, self.thetas)
-        best = self._best(rows, block, new)
+    def _fit(self, block: list[Candidate], new: Collection[Candidate]) -> set[Candidate]:
+        best = self._best(self.sums.block(_thetas(block), _thetas(self.found)), block, new)
         # The noise depends on the fitted flares.
-        inside = {id(candidate) for candidate in block}
-        others = np.array([candidate.theta for candidate in self.found if id(candidate) not in inside]).reshape(-1, 4)
-        rows = sums.block(best.theta, np.vstack([others, best.theta]))
-        best = rows.fit(best.theta)
-        left = list(block)
+        others = _thetas(candidate for candidate in self.found if candidate not in block)
+        rows = self.sums.block(best.theta, np.vstack([others, best.theta]))
+        best, left = rows.fit(best.theta), list(block)
         while len(left) > 1:
             falls = [rows.without(best, j) for j in range(len(left))]
             j = int(np.argmin([fit.chi2 for fit in falls]))
             if falls[j].chi2 - best.chi2 >= self.threshold**2:
                 break
             self.refused.append(left[j].template)
-            self.found.remove(left[j])
+            self.found.remove(left.pop(j))
             best = falls[j]
-            del left[j]
         moved = set()
         for candidate, theta in zip(left, best.theta, strict=True):
             if np.abs(theta - candidate.theta).max() > 1e-4:
-                moved.add(id(candidate))
+                moved.add(candidate)
             candidate.theta = theta
         return moved
 
-    def _best(self, rows: Block, block: list[Candidate], new: set[int]) -> BlendFit:
+    def _best(self, rows: Block, block: list[Candidate], new: Collection[Candidate]) -> BlendFit:
         """Return the best of several fits with different starting points for blends with a new flare."""
-        start = np.array([candidate.theta for candidate in block])
+        start = _thetas(block)
         fits = [rows.fit(start)]
-        if len(block) > 1:
-            for k, candidate in enumerate(block):
-                if id(candidate) not in new:
-                    continue
-                # A flare that was fitted alone may be too wide because it includes another.
-                for j in range(len(block)):
-                    if j != k and start[j, WIDTH] > start[k, WIDTH]:
-                        other = start.copy()
-                        other[j, WIDTH] = start[k, WIDTH]
-                        fits.append(rows.fit(other))
+        for k in (k for k, candidate in enumerate(block) if candidate in new):
+            # A flare that was fitted alone may be too wide because it includes another.
+            for j in np.flatnonzero(start[:, WIDTH] > start[k, WIDTH]):
+                other = start.copy()
+                other[j, WIDTH] = start[k, WIDTH]
+                fits.append(rows.fit(other))
         return min(fits, key=lambda fit: fit.chi2)
 
 
@@ -361,15 +348,7 @@ def _intervals(
 ) -> tuple[dict[str, tuple[float, float]], str]:
     """Return the intervals of a flare's values, and a note."""
     area = np.log(rows.sums.survey.bank.shape.equivalent_duration)
-    quantities = {
-        "peak_s": ProfiledQuantity(PEAK),
-        "amplitude": ProfiledQuantity(AMPLITUDE),
-        "half_width_s": ProfiledQuantity(WIDTH),
-        "temperature_k": ProfiledQuantity(KELVIN),
-        "equivalent_duration_s": ProfiledQuantity(AMPLITUDE, lambda _: (0.0, 0.0)),
-    }
-    if energy is not None:
-        quantities["energy"] = ProfiledQuantity(AMPLITUDE, energy)
+    quantities = QUANTITIES | ({} if energy is None else {"energy": ProfiledQuantity(AMPLITUDE, energy)})
     intervals, notes = {"energy": (np.nan, np.nan)}, []
     for name, quantity in quantities.items():
         if quantity.column == KELVIN and KELVIN not in rows.sums.free:

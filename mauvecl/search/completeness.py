@@ -216,10 +216,7 @@ def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]
         tau = (edges[None, :] - peaks[:, None]) / half
         frames = consecutive_integrals(shape, tau) * half / frame_s
         gain[i] = np.linalg.norm(frames - (frames @ line.T) @ line, axis=1)
-    gain = np.maximum(gain, 1e-12)
-    for shared in (widths, gain):
-        shared.setflags(write=False)
-    return widths, gain
+    return widths, np.maximum(gain, 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,8 +298,7 @@ class Yield:
     @validated
     def of(cls, rates: Rates, completeness: Completeness, days: NotNegative) -> Yield:
         """Compute the yield from flare rates, completeness and observed days; energies must be in the same band."""
-        expected = recovered_per_day(rates, completeness) * days
-        return cls.of_expected(expected, rates.scatter_dex)
+        return cls.of_expected(recovered_per_day(rates, completeness) * days, rates.scatter_dex)
 
     @classmethod
     def of_expected(cls, expected: float, scatter_dex: float) -> Yield:
@@ -349,12 +345,7 @@ class FittedPowerLaw:
 
 @validated
 def fit_power_law(
-    energy_erg: Float,
-    completeness: Completeness,
-    days: Positive,
-    *,
-    error_dex: float = 0.0,
-    bias_dex: float = 0.0,
+    energy_erg: Float, completeness: Completeness, days: Positive, *, error_dex: float = 0.0, bias_dex: float = 0.0
 ) -> FittedPowerLaw:
     """Estimate exponent and rate of flares from recovered energies by maximum likelihood.
 

@@ -15,31 +15,24 @@ follows from Owen's T function (Owen 1956, doi 10.1214/aoms/1177728074). Neighbo
 onset of maximum correlation, which makes them independent of neighbours in onset to first order; neighbours in
 temperature are independent of both.
 
-*Importance sampling in normal noise.* The method gives an unbiased estimate of P(max > u) for M correlated normal
-values rho_j at any u. One of them, i, is chosen with a probability proportional to w_i, and the noise is drawn except
-for rho_i, so that every value is r_j + c_ij z with z = rho_i. Then, for any function G that is not zero above u,
+*Importance sampling in normal noise* (docs/completeness.md, "False alarms"). One of the correlated values rho_j, i, is
+chosen with a probability proportional to w_i, and the noise is drawn except for z = rho_i, so that every value is
+r_j + c_ij z. Then, without bias and for any function G that is not zero above u,
 
-    P = sum(w) E[integral phi(z) G(z) 1(max_j rho_j > u) / sum_j w_j G(rho_j) dz].
+    P(max > u) = sum(w) E[integral phi(z) G(z) 1(max_j rho_j > u) / sum_j w_j G(rho_j) dz].
 
-With G a step at u this is the method of Naiman & Priebe (J. Comput. Graph. Stat. 10, 296, 2001) and of Adler, Blanchet
-& Liu (2012, doi 10.1214/11-AAP792), whose 1 / number of values above u has a large variance if clusters of values above
-u vary in size. Here G(z) = exp(u z) from slightly below u: the sum over a cluster then follows its maximum, and the
-integral over z is computed by quadrature, so that the estimate hardly depends on how far the maximum exceeds u. The
-weights w are the probabilities that a template is a local maximum, so that all clusters contribute equally.
+Here G(z) = exp(u z) from slightly below u, so that the sum over a cluster follows its maximum, and the integral is
+computed by quadrature. The weights w are the probabilities that a template is a local maximum, so that all clusters
+contribute equally.
 
-*Unknown light, sky and temperature.* If the star is brighter or the detector warmer than assumed, the scatter of a
-template's value increases by a factor r, and it exceeds u as often as u / r is exceeded otherwise. If the baseline has
-trends that the search neither subtracts nor marginalises over, values are shifted, and exceed u as often as u less the
-shift is exceeded otherwise.
-
-*Rate of a survey.* A search weights frames by their known variance and marginalises over known curves. The unknowns of
-a stare are drawn from a widened distribution and weighted accordingly.
+*Unknowns of a survey's stare* are drawn from a widened distribution and weighted accordingly. Where they increase the
+scatter of a template's value by a factor r, it exceeds u as often as u / r is exceeded otherwise; where they shift it,
+as often as u less the shift is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -49,11 +42,8 @@ from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_cou
 from mauvecl.flares.stare import select_frames
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
-from mauvecl.search.search import BATCH
+from mauvecl.search.search import BATCH, Search, Survey
 from mauvecl.search.templates import Bank
-
-if TYPE_CHECKING:
-    from mauvecl.search.search import Search, Survey
 
 Float = NDArray[np.float64]
 
@@ -214,8 +204,8 @@ POWERS = 4
 DRAWS = 160
 #: Largest probability of an alarm in a stare for which importance sampling is used.
 MAX_PROBABILITY = 0.7
-#: Number of thresholds at which rates are tabulated for interpolation.
-FINE = 20_000
+#: Number of thresholds at which rates are tabulated for interpolation, and change of scatter that is neglected.
+FINE, NEGLIGIBLE = 20_000, 1e-6
 #: Second half of the generator's key, which makes the draws independent of others.
 NULL_KEY = 0x6E756C6C
 #: G is zero below u - BELOW / u.
@@ -260,29 +250,29 @@ class SampledRate:
         logs = np.log(-np.log1p(-p) / self.days) - scipy.special.log_ndtr(-u)
         return np.polynomial.Polynomial.fit(u, logs, min(POWERS, u.size) - 1, w=1 / self._relative)
 
-    def under(self, shifts: UnknownShifts) -> SampledRate:
-        """Return the rate for stares whose noise differs from the noise that the search assumes."""
-        shifted = bool(shifts.shifts.any())
-        if np.abs(shifts.scales - 1).max() < NEGLIGIBLE and not shifted:
+    def under(self, scales: Float, weights: Float, shifts: Float, shares: Float) -> SampledRate:
+        """Return the rate for stares whose noise differs from that which the search assumes; see `draw_shifts`."""
+        shifted = bool(shifts.any())
+        if np.abs(scales - 1).max() < NEGLIGIBLE and not shifted:
             return self
         # The rate is tabulated finely enough for linear interpolation.
-        low, high = self.thresholds[0] / shifts.scales.max(), self.thresholds[-1] / shifts.scales.min()
+        low, high = self.thresholds[0] / scales.max(), self.thresholds[-1] / scales.min()
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
         rates = np.exp(scipy.special.log_ndtr(-fine) + self._fit()(fine))
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
             # Probability of an alarm in each draw of a stare.
-            per_day, largest = np.zeros((2, shifts.weights.size))
-            for shift, share in zip(shifts.shifts, shifts.shares.T, strict=True):
-                per_day += share * np.interp((threshold - shift) / shifts.scales, fine, rates).mean(axis=1)
+            per_day, largest = np.zeros((2, weights.size))
+            for shift, share in zip(shifts, shares.T, strict=True):
+                per_day += share * np.interp((threshold - shift) / scales, fine, rates).mean(axis=1)
                 largest = np.where(share > 0, shift, largest)
             each = -np.expm1(-self.days * per_day)
             if shifted:
                 # A few templates with a large mean suffice for an alarm.
                 each = 1 - np.exp(-self.days * per_day) * scipy.special.ndtr(threshold - largest)
-            probability[k] = shifts.weights @ each
-            spread = np.sqrt(np.sum((shifts.weights * (each - probability[k])) ** 2))
+            probability[k] = weights @ each
+            spread = np.sqrt(np.sum((weights * (each - probability[k])) ** 2))
             error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
         return SampledRate(self.thresholds, probability, error, self.days, shifted)
 
@@ -343,13 +333,21 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     weights = np.maximum(weights, MIN_WEIGHT * weights.max())
     shares = np.cumsum(weights * sizes[:, None])
     estimates = np.empty((draws, len(LADDER)))
-    directions = search.bank.directions
+    directions, noise_sd = search.bank.directions, np.sqrt(search.variance)
     # Batches are small so that they fit into the processor's caches.
     batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
     for first in range(0, draws, batch):
         count = min(batch, draws - first)
-        drawn = [_noise_of_chosen(search, rng, tried, shares) for _ in range(count)]
-        held, own, along = (np.array(each) for each in zip(*drawn, strict=True))
+        held, own, along = np.empty((count, search.stare.n_frames, n_sum + 1)), np.empty(count), []
+        for n in range(count):
+            which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
+            template = search.in_time(rows[which], np.array([int(rng.choice(tried[which]))]))[0]
+            noise = noise_sd[:, None] * rng.standard_normal((search.stare.n_frames, n_sum))
+            # One more sum holds the response that changes the chosen template's value by one, since it is proportional
+            # to the template in time.
+            held[n] = np.column_stack([noise, template * search.variance])
+            own[n] = template @ noise @ directions[direction]
+            along.append(directions @ directions[direction])
         values: list[list[Float]] = [[] for _ in range(count)]
         for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
             at = row.per_amplitude > 0
@@ -363,28 +361,8 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
         for n, nearby in enumerate(values):
             estimates[first + n] = _estimates(np.concatenate(nearby, axis=1))
     estimates *= shares[-1]
-    return SampledRate(
-        np.array(LADDER), estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / np.sqrt(draws),
-        search.stare.observed_s / DAY_S,
-    )  # fmt: skip
-
-
-def _noise_of_chosen(
-    search: Search, rng: np.random.Generator, tried: list[NDArray[np.intp]], shares: Float
-) -> tuple[Float, float, Float]:
-    """Choose a template; return noise and a response, (n_frame, n_sum + 1), its value, and directions along its own.
-
-    One more sum holds the response that changes the template's value by one, since it is proportional to the template
-    in time.
-    """
-    directions = search.bank.directions
-    which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
-    onset = int(rng.choice(tried[which]))
-    template = search.in_time(search.grid[which], np.array([onset]))[0]
-    normals = rng.standard_normal((search.stare.n_frames, directions.shape[1]))
-    noise = np.sqrt(search.variance)[:, None] * normals
-    held = np.column_stack([noise, template * search.variance])
-    return held, template @ noise @ directions[direction], directions @ directions[direction]
+    error = estimates.std(axis=0, ddof=1) / np.sqrt(draws)
+    return SampledRate(np.array(LADDER), estimates.mean(axis=0), error, search.stare.observed_s / DAY_S)
 
 
 #: Nodes and weights of an integral over exp(-x).
@@ -422,20 +400,6 @@ def _estimates(values: Float) -> Float:
     return estimates
 
 
-#: Relative change of the scatter that is neglected.
-NEGLIGIBLE = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class UnknownShifts:
-    """Scatter and shift of templates' values for drawn conditions."""
-
-    scales: Float  # standard deviations of values at some times and all temperatures, nominally 1, shape (n_draw, n)
-    weights: Float  # of the draws, sum 1, shape (n_draw,)
-    shifts: Float  # means of values, ascending, shape (n_shift,)
-    shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
-
-
 #: Largest length of the part of a stare that importance sampling uses, star-days.
 SAMPLED_DAYS = 2.0
 #: Number of draws of the unknowns, and of times in the stare at which the noise is evaluated.
@@ -455,11 +419,16 @@ def sampled_rate(survey: Survey, seed: int) -> SampledRate:
     part, n = survey, int(SAMPLED_DAYS * DAY_S / survey.stare.frame_s)
     if survey.stare.n_frames > n:
         part = replace(survey, stare=select_frames(survey.stare, slice(0, n)))
-    return sample_rate(part.search, seed=seed).under(draw_shifts(survey, seed, part))
+    return sample_rate(part.search, seed=seed).under(*draw_shifts(survey, seed, part))
 
 
-def draw_shifts(survey: Survey, seed: int, part: Survey) -> UnknownShifts:
-    """Draw the unknowns of a stare and compute scatter and, in a part of the stare, shift of templates' values."""
+def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, Float, Float]:
+    """Draw the unknowns of a stare and compute scatter and, in a part of the stare, shift of templates' values.
+
+    Returns the standard deviations of values at some times and all temperatures, nominally 1, (n_draw, n); the weights
+    of the draws, of sum 1; means of values, ascending, (n_shift,); and the shares of templates with each mean,
+    (n_draw, n_shift).
+    """
     stare, components, rows = survey.stare, survey.components, survey.bank.directions
     at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
@@ -483,11 +452,11 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> UnknownShifts:
     known = part.unknowns
     # Unknowns of several standard deviations may shift a template's value.
     if known is None or part.search.largest(part.unsubtracted(known.extremes)).max() <= MIN_SHIFT:
-        return UnknownShifts(scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1)))
+        return scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1))
     # The same share of draws from both halves.
     some = slice(None, None, ONE_IN)
     weights = weights[some]
-    return UnknownShifts(scales[some], weights / weights.sum(), *_shifts(part, z[some]))
+    return scales[some], weights / weights.sum(), *_shifts(part, z[some])
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:

@@ -5,12 +5,11 @@ is the unit of a fit: overlapping flares, over the union of their windows. The b
 search: a straight line over the window of the widest flare, or a continuous piecewise line in longer blocks. Flux of
 flares outside the block is subtracted. The noise of a frame includes the photon noise of the flares.
 
-A single flare has a peak, amplitude, half-width, temperature and equivalent duration, with standard errors. For a given
-peak and half-width, the frames under the shape add up to one measurement of the flare's spectrum, of which
-`mauvecl.fits` finds amplitude and temperature. Peak and half-width follow by least squares from the template that
-detected the flare, with the baseline of the search (Levenberg 1944, doi 10.1090/qam/10666; Marquardt 1963, doi
-10.1137/0111030; Golub & Pereyra 1973, doi 10.1137/0710036); errors from the inverse of the information. Amplitudes of
-flares near the threshold are biased high, because noise contributes to their detection; fits do not correct for that.
+Single flares are fitted many at a time, with standard errors from the inverse of the information. For a given peak and
+half-width, the frames under the shape add up to one measurement of the flare's spectrum, of which `mauvecl.fits` finds
+amplitude and temperature; peak and half-width follow by least squares from the template that detected the flare, with
+the baseline of the search (Marquardt 1963, doi 10.1137/0111030; Golub & Pereyra 1973, doi 10.1137/0710036). Amplitudes
+near the threshold are biased high, because noise contributes to detection; fits do not correct for that.
 """
 
 from __future__ import annotations
@@ -27,11 +26,10 @@ from numpy.typing import NDArray
 from mauvecl.fits.profile import Profile
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import array_cache
-from mauvecl.search.templates import REACH
+from mauvecl.search.templates import REACH, Bank, Templates
 
 if TYPE_CHECKING:
     from mauvecl.search.search import SearchedFrames, Survey
-    from mauvecl.search.templates import Bank, Templates
 
 Float = NDArray[np.float64]
 
@@ -84,19 +82,6 @@ class ProfiledQuantity:
             return float(flare[self.column]), np.eye(4)[self.column]
         value, slope = self.factor(float(flare[KELVIN]))
         return float(flare[AMPLITUDE] + flare[WIDTH] + value), np.array([1.0, 0.0, 1.0, slope])
-
-
-@dataclass(frozen=True)
-class Held:
-    """Constraint of a fit: the value of a quantity of a flare."""
-
-    flare: int
-    quantity: ProfiledQuantity
-    value: float
-
-    def apply(self, theta: Float) -> None:
-        """Set the parameter that follows from the others."""
-        theta[self.flare, self.quantity.column] += self.value - self.quantity.of(theta[self.flare])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,21 +236,23 @@ class Block:
         derivatives = rows.reshape(4, len(theta), -1)
         return derivatives[AMPLITUDE].sum(axis=0), derivatives.T
 
-    def fit(self, theta: Float, held: Held | None = None) -> BlendFit:
-        """Fit all flares from a starting point, shape (n_flare, 4), optionally with a constraint."""
+    def fit(self, theta: Float, held: tuple[int, ProfiledQuantity, float] | None = None) -> BlendFit:
+        """Fit all flares from a starting point, shape (n_flare, 4), with a quantity of a flare held at a value."""
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
         moved = np.zeros(theta.shape, np.bool_)
         moved[:, self.sums.free] = True
-        if held is not None:
-            moved[held.flare, held.quantity.column] = False
+        flare, quantity, value = held or (0, None, 0.0)
+        if quantity is not None:
+            moved[flare, quantity.column] = False
         margin = 1e-9 * (high - low)
         start = np.clip(theta, low + margin, high - margin)
 
         def whole(x: Float) -> Float:
             every = start.copy()
             every[moved] = x
-            if held is not None:
-                held.apply(every)
+            if quantity is not None:
+                # This parameter follows from the others.
+                every[flare, quantity.column] += value - quantity.of(every[flare])[0]
             return every
 
         @array_cache(2)
@@ -276,10 +263,10 @@ class Block:
             """
             every = whole(x)
             model, derivatives = self.model(every)
-            if held is not None:
+            if quantity is not None:
                 # The other parameters have an effect through the one that follows from them.
-                slope, own = held.quantity.of(every[held.flare])[1], derivatives[:, held.flare]
-                own -= own[:, held.quantity.column, None] * slope
+                own = derivatives[:, flare]
+                own -= own[:, quantity.column, None] * quantity.of(every[flare])[1]
             columns = np.column_stack([-derivatives[:, moved], self.data - model])
             return np.asarray(np.linalg.qr(columns, mode="r"))
 
@@ -328,8 +315,7 @@ class Block:
 
             def refit(step: float, start: Float | None, sign: float = sign) -> BlendFit:
                 straight = theta + along * sign * step / variance if variance > 0 else theta
-                held = Held(j, quantity, float(middle + sign * step))
-                return self.fit(straight if start is None else start, held)
+                return self.fit(straight if start is None else start, (j, quantity, float(middle + sign * step)))
 
             step, short, there = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest)
             for _ in range(PROBES):

@@ -9,15 +9,10 @@ with m the inverse variance of a frame, zero in gaps. Without a flare it is norm
 mean is the S/N. All sums over time are correlations, computed by FFT. (Matched filters: Turin 1960, doi
 10.1109/TIT.1960.1057571.)
 
-Non-linear trends are fitted to the sums of a stare and subtracted. A search marginalises over the baseline of a window
-to first order: offset, slope and cycles. But dark current is exponential in temperature, so that a temperature drift is
-curved, and drifts of light and star multiply. This part follows from the amplitudes of the unknowns, which are well
-measured if they matter: over a whole stare, each changes the sums by many standard deviations. The amplitudes are
-fitted, and their effect beyond first order is subtracted. An error of one standard deviation in the baseline then
-leaves a few per cent of it, the relative change of the dark current.
-
-The fit uses the Gauss-Newton method on means over half a minute, with the distribution of the unknowns as prior. Means
-with flares have less weight (Huber 1964, doi 10.1214/aoms/1177703732), so that flares hardly affect the fit.
+What unknowns do to the sums beyond first order, such as the bend of the dark current by a drifting temperature, is
+fitted to the whole stare and subtracted (docs/completeness.md, "Beyond first order"): by the Gauss-Newton method on
+means over half a minute, with the distribution of the unknowns as prior, and less weight for means with flares (Huber
+1964, doi 10.1214/aoms/1177703732).
 """
 
 from __future__ import annotations
@@ -25,22 +20,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.flares.frames import STEADY
-from mauvecl.flares.stare import select_frames
+from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
-from mauvecl.noise.unknowns import NONE, Changing, Processes
+from mauvecl.noise.unknowns import CHANGED_PART, NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
-
-if TYPE_CHECKING:
-    from mauvecl.flares.frames import Components
-    from mauvecl.flares.stare import Stare
 
 Float = NDArray[np.float64]
 
@@ -136,11 +127,10 @@ class Search:
 
         The bank's directions times these values are the values of rho. There may be any number of sums.
         """
-        spectra = self._spectra(sums)
-        real = _precision(sums)
+        spectra, real = self._spectra(sums), _precision(sums)
         window, level = (0, 0), []
-        for template in self.bank.templates:
-            onsets = self._onsets(template)
+        for row in self.grid:
+            template, onsets = row.template, self._onsets(row.template)
             # Templates with the same window share the correlations of the baseline.
             if window != (template.first, template.time.size):
                 window = template.first, template.time.size
@@ -148,17 +138,12 @@ class Search:
                     self._correlated(spectra[series], template.time**power, template.first)
                     for power, series in self._terms
                 ]
-            for row in self.grid:
-                if row.template is not template:
-                    continue
-                correlated = self._correlated(spectra[0], template.shapes[row.phase], template.first)[..., onsets]
-                for projected, term in zip(row.project.astype(real), level, strict=True):
-                    correlated -= projected * term[..., onsets]
-                scale = np.divide(
-                    1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=row.per_amplitude > 0
-                )
-                correlated *= scale.astype(real)
-                yield row, correlated
+            correlated = self._correlated(spectra[0], template.shapes[row.phase], template.first)[..., onsets]
+            for projected, term in zip(row.project.astype(real), level, strict=True):
+                correlated -= projected * term[..., onsets]
+            size = row.per_amplitude
+            correlated *= np.divide(1.0, size, out=np.zeros_like(size), where=size > 0).astype(real)
+            yield row, correlated
 
     def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
         """Return the weights of frames in templates of a row, without their direction, shape (n_onset, n_frame)."""
@@ -197,11 +182,7 @@ class Search:
             # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
             levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
         held[:, :, self._at] = levelled * self._weight[self._at]
-        used = {series for _, series in self._terms} | {0}
-        return [
-            scipy.fft.rfft(held * self._series[k].astype(real), self._size) if k in used else held[:0]
-            for k in range(len(self._series))
-        ]
+        return [scipy.fft.rfft(held * series.astype(real), self._size) for series in self._series]
 
     @cached_property
     def _level_span(self) -> Float:
@@ -371,11 +352,8 @@ class Trend:
 
     def _changes(self, amplitudes: Float) -> dict[str, Float]:
         """Return the relative changes of star, light and sky, and that of the temperature, (n_stare, n_frame)."""
-        changes: dict[str, Float] = {}
-        for of in ("star", "light", "sky", "temperature"):
-            these = [k for k, name in enumerate(self.of) if name == of]
-            changes[of] = amplitudes[:, these] @ self.curves[these]
-        return changes
+        of = np.array(self.of)
+        return {name: amplitudes[:, of == name] @ self.curves[of == name] for name in CHANGED_PART}
 
     def _gradient(self, amplitudes: Float) -> Float:
         """Return the derivatives of `effect` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""

@@ -100,17 +100,15 @@ class Bank:
 
     @cached_property
     def templates(self) -> tuple[Template, ...]:
-        """Templates of all half-widths."""
-        return tuple(self.template(w) for w in self.half_widths_s)
-
-    def template(self, half_width_s: float) -> Template:
-        """Compute the template of a half-width, with one or two phases, depending on the half-width."""
-        frames = half_width_s / self.frame_s
-        phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
-        lead, tail = self.window(half_width_s)
-        edges = np.arange(-lead, tail + 2) * self.frame_s
-        shapes = np.array([self.shape.mean_over(edges, p * self.frame_s, half_width_s) for p in phases])
-        return Template(half_width_s, -lead, phases, shapes, max(1, int(frames / ONSETS)))
+        """Templates of all half-widths, with two phases of narrow ones and one of others."""
+        templates = []
+        for width in self.half_widths_s:
+            frames, (lead, tail) = width / self.frame_s, self.window(width)
+            phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
+            edges = np.arange(-lead, tail + 2) * self.frame_s
+            shapes = np.array([self.shape.mean_over(edges, p * self.frame_s, width) for p in phases])
+            templates.append(Template(width, -lead, phases, shapes, max(1, int(frames / ONSETS))))
+        return tuple(templates)
 
     def window(self, half_width_s: float) -> tuple[int, int]:
         """Return the number of frames of the window before and after the peak."""

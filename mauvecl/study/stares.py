@@ -154,15 +154,13 @@ def energy_scale(study: Study, source: Source, kind: Kind, flare_k: float) -> En
     return None
 
 
-def energy_of(
-    study: Study, source: Source, event: Event, kind: Kind, temperatures_k: Float | None = None
-) -> float | None:
-    """Return the energy of a flare, erg, or None if the star's distance and radius are unknown.
+def energy_of(study: Study, source: Source, event: Event, kind: Kind, temperatures_k: Float | None = None) -> float:
+    """Return the energy of a flare, erg; NaN if the star's distance and radius are unknown.
 
     `temperatures_k` are the temperatures between which flare spectra are interpolated; see `Event.total_energy`.
     """
     if energy_scale(study, source, kind, event.hottest_k) is None:
-        return None
+        return float("nan")
     scale_of = cast("Callable[[float], EnergyScale]", partial(energy_scale, study, source, kind))
     return event.total_energy(scale_of, temperatures_k)
 
@@ -186,7 +184,7 @@ def events_of(study: Study, source: Source) -> list[Event]:
         if choice.energy_erg is None:
             continue
         energy = energy_of(study, source, event, choice.energy, kelvin)
-        if energy is None:
+        if np.isnan(energy):
             raise InputError(
                 f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} needs the star's distance_pc, "
                 "or radius_rsun and effective_temperature_k",

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.answers.measure import COLUMNS
-from mauvecl.answers.measurements import expected_measurements, models_of
+from mauvecl.answers.measure import COLUMNS, expected_measurements, models_of
 from mauvecl.charts.chart import Area, Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.charts.limits import RISES
 from mauvecl.fits.flare_model import FlareModel
@@ -28,8 +27,7 @@ from mauvecl.web.uploads import Shelf
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
-    from mauvecl.answers.measure import MeasuredFlare
-    from mauvecl.answers.measurements import ExpectedMeasurement
+    from mauvecl.answers.measure import ExpectedMeasurement, MeasuredFlare
     from mauvecl.detection.statistics import DetectionForms
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.web.closed_forms import ClosedForms

@@ -14,7 +14,7 @@ from scenes import paper
 from scipy import stats
 
 from mauvecl import Study, plan, stare
-from mauvecl.answers.plan_targets import found_by_energy
+from mauvecl.answers.plan import found_by_energy
 from mauvecl.search import completeness
 
 #: Injections take ten seconds a target.
