@@ -204,17 +204,19 @@ def test_instruments_take_quantities(name: str) -> None:
     assert error.value.key == name
 
 
-@pytest.mark.parametrize(
-    ("quantity", "value", "plain", "key"),
-    [
-        ("magnitude", 7000 * u.mmag, 7.0, lambda study: study.star[0].magnitude),
-        ("exposure", 2 * u.min, 120.0, lambda study: study.observation.exposure_s),
-        ("detector_temperature", 300 * u.K, 26.85, lambda study: study.observation.temperature_c),
-        ("flare_temperature", 12 * u.kK, 12_000.0, lambda study: study.flare.temperature_k),
-        ("sky", 22 * u.mag / u.arcsec**2, 22.0, lambda study: study.sky.surface_brightness),
-    ],
-)
-def test_studies_take_quantities(quantity: str, value: Any, plain: float, key: Callable[[Any], float]) -> None:
+#: Quantities of studies, values and plain values, and where they are.
+QUANTITIES: dict[str, tuple[Any, float, Callable[[Any], float]]] = {
+    "magnitude": (7000 * u.mmag, 7.0, lambda study: study.star[0].magnitude),
+    "exposure": (2 * u.min, 120.0, lambda study: study.observation.exposure_s),
+    "detector_temperature": (300 * u.K, 26.85, lambda study: study.observation.temperature_c),
+    "flare_temperature": (12 * u.kK, 12_000.0, lambda study: study.flare.temperature_k),
+    "sky": (22 * u.mag / u.arcsec**2, 22.0, lambda study: study.sky.surface_brightness),
+}
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_studies_take_quantities(quantity: str) -> None:
+    value, plain, key = QUANTITIES[quantity]
     assert key(mauvecl.Study().paper().at(quantity, value)) == pytest.approx(plain)
     for wrong in (3 * u.kg, np.nan, "x"):
         with refused("value" if wrong is np.nan else quantity):
