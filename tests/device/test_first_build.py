@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import forked, printed, python
+from processes import printed, python
 
 pytestmark = pytest.mark.long
 
@@ -47,7 +47,7 @@ ACTS = {
 
 def run(cache: Path | str, before: str = "", **environment: str) -> dict[str, str]:
     """Run a separate process and return what it prints."""
-    return printed(forked(RUN.format(before=before), cache=cache, **environment))
+    return printed(python(RUN.format(before=before), cache=cache, **environment).stdout)
 
 
 @pytest.fixture(scope="module")
