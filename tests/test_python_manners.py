@@ -14,6 +14,7 @@ from scenes import study_of_g2v
 
 import mauvecl
 from mauvecl import Engine, Expectation, Instrument, Pool, Sky, Source, Study, detect, expect, snr
+from mauvecl.observations import visits
 
 
 def study(**settings: object) -> Study:
@@ -115,6 +116,13 @@ def test_made_up_pixels_have_their_scatter_about_one() -> None:
 def test_frames_are_shifted_to_later_times() -> None:
     frames = mauvecl.Frames.of(5.0 * np.arange(30), np.ones(30))
     np.testing.assert_array_equal(frames.shifted(np.full(30, 60.0)).time_s, frames.time_s + 60.0)
+
+
+def test_periodogram_has_the_range_of_its_periods_by_default() -> None:
+    time, periods = 60.0 * np.linspace(0.0, 1.0, 30) ** 1.1, np.array([2.0, 10.0])
+    how: dict[str, Any] = {"fap": 0.05, "trials": 5}
+    stated = visits.recover_periods(time, periods, np.ones(1), shortest_d=2.0, longest_d=10.0, **how)
+    assert visits.recover_periods(time, periods, np.ones(1), **how).threshold == stated.threshold
 
 
 def test_tables_have_units() -> None:
