@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl import Detection, Engine, Expectation, Study
-from mauvecl.study.cases import Case
+from mauvecl import Detection, Engine, Expectation, Study, simulate
 
 #: Questions, in the order of the command line.
 VERBS = ("simulate", "snr", "exposure", "detect", "limit", "map", "gaussian", "measure", "stare", "inject", "analyse",
@@ -65,8 +64,8 @@ def of_kind(messages: Iterable[str], kind: str) -> list[str]:
 
 def expectations(study: Study) -> list[Expectation]:
     """Return what a study expects of its first star without and with each flare."""
-    # `simulate` has them as well, and draws the components of each, which takes a second.
-    return Case(study.model_copy(update={"star": study.star[:1]})).expectations
+    observed = simulate(study.model_copy(update={"star": study.star[:1]}), flaring=True).observations
+    return [expectation for _, expectation, _ in observed]
 
 
 def same_snr(one: Any, other: Any) -> None:

@@ -19,13 +19,7 @@ def counts(
 ) -> Float:
     """Return the probabilities of low, low + 1, ... for the sum of frames that are each rounded to whole DN.
 
-    Parameters
-    ----------
-    gaussian : float
-        Variance of a frame's Gaussian noise, above 0.
-    poisson : sequence of (mean count, DN of one count)
-    mean : float
-        Of one frame.
+    A frame has a mean, a variance of Gaussian noise, and pairs of a mean Poisson count and the DN of one count.
     """
     sd = np.sqrt(frames * (gaussian + sum(m * s * s for m, s in poisson) + 1 / 12))
     length = int(2 ** np.ceil(np.log2(max(24 * sd + 64, size + 40))))
@@ -71,16 +65,9 @@ def worst_tail(p: Float, q: Float) -> float:
 def expansion(
     gaussian: float, poisson: Sequence[tuple[float, float]], *, fourth_power: bool = True, varying: bool = False
 ) -> tuple[float, Float]:
-    """Return the standard deviation of Gaussian and Poisson noise, and its Cornish-Fisher polynomial of a normal.
+    """Return the standard deviation of the noise of `counts`, and its Cornish-Fisher polynomial of a normal.
 
-    Parameters
-    ----------
-    gaussian, poisson
-        As in `counts`.
-    fourth_power : bool
-        Whether the polynomial includes z^4.
-    varying : bool
-        Whether it is that of factors on light and dark: without the fourth power, it lacks all of third order.
+    Without the fourth power of the normal, that of factors on light and dark (`varying`) lacks all of third order.
     """
     sd = float(np.sqrt(gaussian + sum(mean * step**2 for mean, step in poisson)))
     a, b, c = (sum(mean * (step / sd) ** order for mean, step in poisson) for order in (3, 4, 5))

@@ -9,15 +9,7 @@ from mauvecl.device import build
 
 
 class Probes:
-    """Probe kernels of a device.
-
-    Parameters
-    ----------
-    width : int, optional
-        Realisations per vector; by default the device's.
-    vector_forms : bool, optional
-        Whether to use the fast forms for PoCL instead of built-in functions; by default the device's choice.
-    """
+    """Probe kernels of a device, by default with its vector width and its choice of the fast forms for PoCL."""
 
     def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, device: build.Device) -> None:
         self.cl, self.context, self.queue = device.cl, device.context, device.queue

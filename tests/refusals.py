@@ -11,15 +11,7 @@ from mauvecl import InputError
 
 @contextmanager
 def refused(key: str | None, *facts: str) -> Iterator[pytest.ExceptionInfo]:
-    """Check that the block raises an InputError of one sentence about a key.
-
-    Parameters
-    ----------
-    key : str or None
-        The parameter, or key of a study, that the error names.
-    facts : str
-        Numbers and names that the sentence must give.
-    """
+    """Check that the block raises an InputError of one sentence about a key, with these numbers and names."""
     with pytest.raises(InputError) as caught:
         yield caught
     error = caught.value

@@ -24,6 +24,7 @@ from scenes import instrument, star
 from mauvecl import Source, Study, read_frames
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars import flare as flare_tables
+from mauvecl.host.tables import opening
 from mauvecl.observations import frames as observed
 
 # Astropy warns of the usual units when it writes a VOTable.
@@ -219,8 +220,8 @@ TEXTS = re.compile(r"(text_tables (?!machine-readable|IPAC).*|odd_frames (rows|u
 def test_large_tables_are_read_in_pieces_as_they_say(
     case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mauvecl.host.tables.opening.LARGE", 0)
-    monkeypatch.setattr("mauvecl.host.tables.opening.PIECE", 200)
+    monkeypatch.setattr(opening, "LARGE", 0)
+    monkeypatch.setattr(opening, "PIECE", 200)
     test_files_are_read_as_they_say(case, tmp_path)
 
 

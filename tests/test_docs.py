@@ -9,7 +9,7 @@ import re
 import shlex
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import pytest
 from typer.main import get_command
@@ -17,7 +17,6 @@ from typer.main import get_command
 import mauvecl
 from mauvecl import Instrument, Study
 from mauvecl.cli import app
-from mauvecl.observations.mapping import FrameMapping
 
 ROOT = Path(__file__).parent.parent
 #: `mauvecl/detection/detection.py`, or with a name in it: `mauvecl/detection/detection.py: Roc`.
@@ -30,11 +29,6 @@ def all_pages() -> list[Path]:
     return [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
-def blocks(page: Path, language: str) -> list[str]:
-    text = page.read_text(encoding="utf-8")
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
-
-
 def test_every_page_is_in_the_contents() -> None:
     contents = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     pages = [p for p in (ROOT / "docs").glob("*.md") if p.name != "index.md"]
@@ -45,18 +39,12 @@ def test_every_page_is_in_the_contents() -> None:
 
 def test_documented_names_exist() -> None:
     named = [(page.name, *found) for page in all_pages() for found in NAMED.findall(page.read_text(encoding="utf-8"))]
-    missing = [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
-    assert not missing
-    undefined = [
-        (page, file, name)
-        for page, file, name in named
-        if name
-        and not re.search(
-            DEFINITIONS[Path(file).suffix].format(name), (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE
-        )
-    ]
-    assert not undefined
-    assert len([name for *_, name in named if name]) > 40
+    assert not [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
+    defined = [(page, file, name) for page, file, name in named if name]
+    assert len(defined) > 40
+    for page, file, name in defined:
+        pattern, text = DEFINITIONS[Path(file).suffix].format(name), (ROOT / file).read_text(encoding="utf-8")
+        assert re.search(pattern, text, re.MULTILINE), (page, file, name)
 
 
 def test_dotted_names_of_the_architecture_exist() -> None:
@@ -82,21 +70,19 @@ def test_imports_of_pages_and_scripts_exist() -> None:
 
 
 def test_studies_and_instruments_shown_are_valid() -> None:
+    mapping, *_ = get_args(get_type_hints(mauvecl.read_frames)["mapping"])
     seen = 0
     for page in all_pages():
-        for text in blocks(page, "toml"):
+        for text in re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
             data = tomllib.loads(text)
             if "extends" in data:
-                values = {
-                    key: v["value"] if isinstance(v, dict) else v
-                    for key, v in data.items()
-                    if key not in ("extends", "version")
-                }
+                given = {key: one for key, one in data.items() if key not in ("extends", "version")}
+                values = {key: one["value"] if isinstance(one, dict) else one for key, one in given.items()}
                 # Files of the reader's are not here.
                 Instrument.load(data["extends"]).with_(**{k: v for k, v in values.items() if ".ecsv" not in str(v)})
                 assert set(values) <= set(Instrument.model_fields)
             elif "time" in data:
-                FrameMapping(**data)
+                mapping(**data)
             else:
                 Study.build(data, page.name)
             seen += 1
@@ -121,27 +107,23 @@ def test_documented_commands_have_existing_verbs_and_flags() -> None:
     assert seen > 40
 
 
-def test_notebooks_have_no_output() -> None:
+def test_notebooks_have_no_output_and_links_have_text() -> None:
+    """Refuse links without text, which appear only in the built documentation."""
     for page in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
         cells = json.loads(page.read_text(encoding="utf-8"))["cells"]
         assert all(not cell.get("outputs") for cell in cells), page.name
+    assert not [page for page in all_pages() if re.search(r"\[\]\([^)]*\)", page.read_text(encoding="utf-8"))]
 
 
-def test_links_have_text() -> None:
-    """Refuse links without text, which appear only in the built documentation."""
-    empty = re.compile(r"\[\]\([^)]*\)")
-    assert not [str(page) for page in all_pages() if empty.search(page.read_text(encoding="utf-8"))]
+EXAMPLES = sorted(
+    ".".join((*above, *path.relative_to(ROOT).with_suffix("").parts))
+    for folder, above in (("mauvecl", ()), ("host", ("mauvecl",)))
+    for path in (ROOT / folder).rglob("*.py")
+    if ">>> " in path.read_text(encoding="utf-8")
+)
 
 
-FILES = [p for room in ("mauvecl", "host") for p in (ROOT / room).rglob("*.py") if ">>> " in p.read_text("utf-8")]
-
-
-def module(path: Path) -> str:
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts if parts[0] == "mauvecl" else ("mauvecl", *parts))
-
-
-@pytest.mark.parametrize("name", sorted({module(path) for path in FILES}))
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_of_docstrings_run(name: str) -> None:
     failed, attempted = doctest.testmod(importlib.import_module(name))
     assert failed == 0 < attempted

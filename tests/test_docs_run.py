@@ -36,9 +36,6 @@ def snippets(page: Path) -> Iterator[tuple[str, str]]:
             yield kind, block
 
 
-# What readers bring
-
-
 def brought(*folders: str) -> Callable[[], None]:
     """Return what copies the files that readers bring, by their folders among the data."""
 

@@ -1,5 +1,6 @@
-"""The import contracts find every forbidden import, at module level, inside functions and for type checkers."""
+"""The import contracts find every forbidden import; modules form layers, and those below the top name no flag."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from mauvecl import Engine
 from mauvecl.runs import checkpoint
 
 ROOT = Path(__file__).parent.parent
@@ -19,13 +21,7 @@ FORBIDDEN = tomllib.loads((ROOT / "tests" / "data" / "forbidden_imports.toml").r
 def test_forbidden_imports_fail_the_contracts(tmp_path: Path) -> None:
     """Add one forbidden import to each of six files in a copy of the package."""
     pytest.importorskip("importlinter")
-    sources = [path for path in (ROOT / "mauvecl").glob("*") if path.name != "__pycache__"]
-    (tmp_path / "mauvecl").mkdir()
-    for path in sources:
-        if path.is_dir():
-            shutil.copytree(path, tmp_path / "mauvecl" / path.name, ignore=only_python)
-        elif path.suffix == ".py":
-            shutil.copy(path, tmp_path / "mauvecl")
+    shutil.copytree(ROOT / "mauvecl", tmp_path / "mauvecl", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for file, (text, _) in FORBIDDEN.items():
         with (tmp_path / "mauvecl" / file).open("a") as opened:
@@ -38,30 +34,23 @@ def test_forbidden_imports_fail_the_contracts(tmp_path: Path) -> None:
         assert arrow in report
 
 
-def test_packages_form_layers_without_cycles() -> None:
-    """Check every level of packages, including lazy imports and imports for types."""
-    grimp = pytest.importorskip("grimp")
-    graph = grimp.build_graph("mauvecl", cache_dir=None)
+@pytest.fixture(scope="module")
+def graph() -> Any:
+    """Return all imports, those inside functions and for types as well."""
+    return pytest.importorskip("grimp").build_graph("mauvecl", cache_dir=None)
+
+
+def test_packages_form_layers_and_modules_no_circle(graph: Any) -> None:
     layers = {package: layers_of(graph, package) for package in graph.modules if packages_in(graph, package)}
     assert len(layers["mauvecl"]) <= 20
     assert max(layers["mauvecl"].values()) <= 13
-
-
-def test_modules_form_no_circle() -> None:
-    """Check every import between modules, including those inside functions and those for types."""
-    grimp = pytest.importorskip("grimp")
-    graph = grimp.build_graph("mauvecl", cache_dir=None)
     TopologicalSorter({module: graph.find_modules_directly_imported_by(module) for module in graph.modules}).prepare()
 
 
-def test_digest_of_the_code_covers_what_counts() -> None:
-    """Check that the digest of workers' code has every package that the engine imports.
-
-    Expectations, which `host` computes, are part of a request, and `schema` only reads and names values.
-    """
-    grimp = pytest.importorskip("grimp")
-    graph = grimp.build_graph("mauvecl", cache_dir=None)
-    needed = {name.split(".")[1] for name in graph.find_upstream_modules("mauvecl.device.engine")}
+def test_digest_of_the_code_covers_what_counts(graph: Any) -> None:
+    """Check that the digest of workers' code has every package that the engine imports, but for its requests' own."""
+    needed = {name.split(".")[1] for name in graph.find_upstream_modules(Engine.__module__)}
+    # Expectations, which `host` computes, are part of a request, and `schema` only reads and names values.
     assert needed - {"host", "schema"} <= set(checkpoint.DRAWING_PACKAGES)
     assert all(list((ROOT / "mauvecl" / name).glob("*.*")) for name in checkpoint.DRAWING_PACKAGES)
 
@@ -84,5 +73,16 @@ def layers_of(graph: Any, package: str) -> dict[str, int]:
     return layer
 
 
-def only_python(folder: str, names: list[str]) -> list[str]:
-    return [name for name in names if not (name.endswith(".py") or (Path(folder) / name).is_dir())]
+#: The command line itself, and the command that the page offers.
+OF_FLAGS = ("mauvecl/cli/", "mauvecl/web/tab.py")
+FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+#: Docstrings, help texts, comments, the names of flags of fields, and whole commands, named as they are typed.
+MEANT = re.compile(r'"""[\s\S]*?"""|#.*|Flag\([^)]*|flag="[^"]*"|`(?:mauvecl|wsl) [^`]*`')
+
+
+def test_no_module_below_the_command_line_names_a_flag() -> None:
+    files = [file for folder in ("mauvecl", "host") for file in (ROOT / folder).rglob("*.py")]
+    below = {name: file for file in files if not (name := str(file.relative_to(ROOT))).startswith(OF_FLAGS)}
+    assert len(below) > 120
+    named = {name: FLAG.findall(MEANT.sub("", file.read_text(encoding="utf-8"))) for name, file in below.items()}
+    assert {name: flags for name, flags in named.items() if flags} == {}

@@ -5,11 +5,10 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable, Table
-from commands import run
+from astropy.table import Table
 from scenes import star
 
-from mauvecl import Blackbody, Source
+from mauvecl import Blackbody, Source, Study
 from mauvecl.host.stars import flare as flare_tables
 
 
@@ -30,6 +29,14 @@ def test_synphot_blackbody_is_read() -> None:
     inside = (body.wavelength_nm > 200) & (body.wavelength_nm < 700)
     shape = body.flux_flam[inside] / Blackbody(6000.0).flux(body.wavelength_nm[inside])
     np.testing.assert_allclose(shape, shape[0], rtol=1e-3)
+
+
+def test_reddening_has_the_total_extinction_of_its_law() -> None:
+    """The laws of dust_extinction are those relative to A(V), which is A at 550 nm."""
+    pytest.importorskip("dust_extinction")
+    star = Source.from_library("G2V")
+    bare, dimmed = (np.interp(550.0, one.wavelength_nm, one.flux_flam) for one in (star, star.reddened(0.3)))
+    assert 2.5 * np.log10(bare / dimmed) == pytest.approx(3.1 * 0.3, rel=2e-3)
 
 
 def test_stsynphot_spectrum_is_read(recwarn: pytest.WarningsRecorder) -> None:
@@ -71,13 +78,10 @@ ALTAIPONY = """istart,istop,cstart,cstop,tstart,tstop,ed_rec,ed_rec_err,ampl_rec
 
 def test_altaipony_table_is_read(tmp_path: Path) -> None:
     """Read the columns that FlareLightCurve.flares writes to CSV; the corpus compares them."""
-    file = tmp_path / "flares.csv"
-    file.write_text(ALTAIPONY)
-    words = ("--flares", file, "--flare-band", "TESS", "-n", "100000", "--no-pictures", "-o", "out")
-    done = run("detect", "--star", "G2V", "-m", "7.4", *words, folder=tmp_path)
-    assert "not used: istart" in done.stderr + done.stdout, "the remark is printed"
-    found = QTable.read(tmp_path / "out" / "detection.ecsv", format="ascii.ecsv")
-    assert sorted(set(found["amplitude"])) == [0.081, 0.24], "each amplitude once"
+    (tmp_path / "flares.csv").write_text(ALTAIPONY)
+    with pytest.warns(UserWarning, match="not used: istart"):
+        study = Study.of(flares=str(tmp_path / "flares.csv"))
+    assert study.flare.amplitudes == (0.081, 0.24), "each amplitude once"
 
 
 def test_data_frame_and_fits_table_are_read(tmp_path: Path) -> None:

@@ -1,12 +1,52 @@
-"""The list of `tools/mutation_check.py` is in step with the code: a renamed line or test would leave a check idle."""
+"""Benches end if a process that they measure dies, and the list of mutations is in step with the code."""
 
+import importlib
+import os
+import signal
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from scripts import tool
 
 ROOT = Path(__file__).parent.parent
 check = tool("mutation_check")
+
+
+def dies_at_start(model: Any) -> Any:
+    """End as a peer does that the system kills while it compiles."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def dies_in_a_run(model: Any) -> Any:
+    """Return a peer that dies at its second run."""
+    from peers import Peer
+
+    runs: list[int] = []
+
+    def chi2(n: int) -> Any:
+        runs.append(n)
+        if len(runs) > 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.full(n, 10.0)
+
+    return Peer("mortal", "1", 10, chi2)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("make", [dies_at_start, dies_in_a_run])
+def test_death_of_a_peer_raises(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Its child processes import the module, too.
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    peers = importlib.import_module("peers")
+    signal.signal(signal.SIGALRM, lambda *_: pytest.fail("waits for a process that has ended"))
+    signal.alarm(60)
+    try:
+        with pytest.raises(ChildProcessError, match="ended with exit code -9"):
+            peers.Child(make, peers.Model(*[np.ones(10, np.float32)] * 5)).seconds()
+    finally:
+        signal.alarm(0)
 
 
 def test_every_mutation_has_its_texts_and_its_test() -> None:

@@ -8,7 +8,6 @@ import sys
 import tarfile
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -35,14 +34,6 @@ build_wheel(sys.argv[1])
 """
 
 
-class Packages(NamedTuple):
-    """Tree of sources and the packages that are built from it."""
-
-    tree: Path
-    wheel: bytes
-    sdist: bytes
-
-
 def copied(tree: Path) -> Path:
     """Copy the sources, links as links."""
     for name in FOLDERS:
@@ -52,11 +43,11 @@ def copied(tree: Path) -> Path:
     return tree
 
 
-def built(tree: Path, out: Path) -> Packages:
-    """Build without a network: the backend is installed with the tests."""
+def built(tree: Path, out: Path) -> tuple[bytes, bytes]:
+    """Build wheel and sdist without a network: the backend is installed with the tests."""
     unset = {key: value for key, value in os.environ.items() if key != "SOURCE_DATE_EPOCH"}
     subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=tree, env=unset, check=True)
-    return Packages(tree, (out / WHEEL).read_bytes(), (out / SDIST).read_bytes())
+    return (out / WHEEL).read_bytes(), (out / SDIST).read_bytes()
 
 
 def files_below(tree: Path) -> set[str]:
@@ -69,45 +60,41 @@ def files_below(tree: Path) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def packages(tmp_path_factory: pytest.TempPathFactory) -> Packages:
-    tree = copied(tmp_path_factory.mktemp("checkout"))
-    return built(tree, tmp_path_factory.mktemp("built"))
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return copied(tmp_path_factory.mktemp("checkout"))
 
 
 @pytest.fixture(scope="module")
-def unpacked(packages: Packages, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("unpacked")
-    (folder / SDIST).write_bytes(packages.sdist)
-    with tarfile.open(folder / SDIST) as archive:
-        archive.extractall(folder, filter="data")
-    return folder / f"mauvecl-{VERSION}"
+def packages(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, bytes]:
+    return built(tree, tmp_path_factory.mktemp("built"))
 
 
-def test_same_files_give_the_same_packages(packages: Packages, tmp_path: Path) -> None:
+def test_same_files_give_the_same_packages(packages: tuple[bytes, bytes], tmp_path: Path) -> None:
     """Build in another folder, with other times and permissions of the files."""
     tree = copied(tmp_path / "elsewhere")
     for number, path in enumerate(sorted(tree.rglob("*"))):
         if not path.is_symlink():
             os.utime(path, (1_000_000_000 + number, 1_000_000_000 + number))
             path.chmod(path.stat().st_mode & 0o750)
-    again = built(tree, tmp_path / "out")
-    assert again.wheel == packages.wheel
-    assert again.sdist == packages.sdist
+    assert built(tree, tmp_path / "out") == packages
 
 
-def test_sdist_holds_every_file_and_no_link(packages: Packages, unpacked: Path) -> None:
-    assert files_below(unpacked) - {"PKG-INFO"} == files_below(packages.tree)
+def test_sdist_holds_every_file_no_link_and_the_same_wheel(
+    tree: Path, packages: tuple[bytes, bytes], tmp_path: Path
+) -> None:
+    wheel, sdist = packages
+    with tarfile.open(fileobj=io.BytesIO(sdist)) as archive:
+        archive.extractall(tmp_path, filter="data")
+    unpacked = tmp_path / f"mauvecl-{VERSION}"
+    assert files_below(unpacked) - {"PKG-INFO"} == files_below(tree)
     assert not [path for path in unpacked.rglob("*") if path.is_symlink()]
+    assert built(unpacked, tmp_path)[0] == wheel
 
 
-def test_wheel_from_the_sdist_equals_that_from_the_checkout(packages: Packages, unpacked: Path, tmp_path: Path) -> None:
-    assert built(unpacked, tmp_path).wheel == packages.wheel
-
-
-def test_wheel_holds_the_package_and_the_licences(packages: Packages) -> None:
+def test_wheel_holds_the_package_and_the_licences(tree: Path, packages: tuple[bytes, bytes]) -> None:
     """Check that it holds nothing else; the sdist, from which the same wheel is built, has the licences as well."""
-    wheel = zipfile.ZipFile(io.BytesIO(packages.wheel))
-    package = {f"mauvecl/{name}" for name in files_below(packages.tree / "mauvecl")}
+    wheel = zipfile.ZipFile(io.BytesIO(packages[0]))
+    package = {f"mauvecl/{name}" for name in files_below(tree / "mauvecl")}
     assert {name for name in wheel.namelist() if ".dist-info/" not in name} == package
     texts = [ROOT / "LICENSE", *(ROOT / "host" / "stars" / "library" / "licenses").iterdir()]
     assert len(texts) == 4

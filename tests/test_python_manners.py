@@ -14,6 +14,7 @@ from scenes import study_of_g2v
 
 import mauvecl
 from mauvecl import Engine, Expectation, Instrument, Pool, Sky, Source, Study, detect, expect, snr
+from mauvecl.observations import visits
 
 
 def study(**settings: object) -> Study:
@@ -94,14 +95,34 @@ def test_whole_numbers_can_be_floats_and_tuples_single_values(engine: Engine) ->
     found = engine.detect(quiet, flare, realisations=1e4, **kind)
     assert found == engine.detect(quiet, [flare], realisations=10_000, seed=1, statistics=("matched",))
     assert found == Pool().detect(quiet, flare, realisations=np.float64(1e4), **kind)
-    assert engine.snr(quiet, realisations=1e3, seed=1) == Pool().snr(quiet, realisations=1000, seed=1.0)
-    np.testing.assert_array_equal(engine.realise(quiet, count=5.0, seed=1), engine.realise(quiet, count=5, seed=1))
 
 
 def test_names_are_accepted_for_stars_and_instruments() -> None:
     usual = expect(Source.from_library("Vega"), Instrument.load("mauvesim"), exposure=5, sky=Sky.of_brightness(22.1))
     assert expect("Vega", "mauvesim", exposure=5) == usual
     assert expect("Vega", "mauvesim", exposure=5 * u.s, sky=22.1) == usual
+
+
+def test_made_up_pixels_have_their_scatter_about_one() -> None:
+    """Five standard errors."""
+    pixels = mauvecl.PixelMap.made_up(5000, seed=3, response_rms=0.2, dark_rms=0.3, hot_share=0.01)
+    usual = pixels.dark[pixels.dark < 5]
+    assert abs(pixels.response.mean() - 1) < 5 * 0.2 / np.sqrt(pixels.size)
+    assert pixels.response.std() == pytest.approx(0.2, rel=0.1)
+    assert abs(usual.mean() - 1) < 5 * 0.3 / np.sqrt(usual.size)
+    assert 0.005 < 1 - usual.size / pixels.size < 0.015
+
+
+def test_frames_are_shifted_to_later_times() -> None:
+    frames = mauvecl.Frames.of(5.0 * np.arange(30), np.ones(30))
+    np.testing.assert_array_equal(frames.shifted(np.full(30, 60.0)).time_s, frames.time_s + 60.0)
+
+
+def test_periodogram_has_the_range_of_its_periods_by_default() -> None:
+    time, periods = 60.0 * np.linspace(0.0, 1.0, 30) ** 1.1, np.array([2.0, 10.0])
+    how: dict[str, Any] = {"fap": 0.05, "trials": 5}
+    stated = visits.recover_periods(time, periods, np.ones(1), shortest_d=2.0, longest_d=10.0, **how)
+    assert visits.recover_periods(time, periods, np.ones(1), **how).threshold == stated.threshold
 
 
 def test_tables_have_units() -> None:

@@ -5,7 +5,6 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
 from astropy.table import Table
 from commands import run
@@ -32,25 +31,15 @@ PYPROJECT: dict[str, Any] = tomllib.loads(text_of("pyproject.toml"))
 PROJECT: dict[str, Any] = PYPROJECT["project"]
 
 
-def test_version_is_semantic_and_the_same_everywhere() -> None:
+def test_version_date_and_authors_are_the_same_everywhere() -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+", __version__)
     assert CITATION["version"] == __version__
     assert run("--version", folder=Path()).stdout == f"mauvecl {__version__}\n"
     assert loaded("recipe/recipe.yaml")["context"]["version"] == __version__
-
-
-def test_changelog_begins_with_what_is_unreleased_and_this_version() -> None:
-    assert HEADINGS[0] == "Unreleased"
-    assert HEADINGS[1] == f"{__version__} - {CITATION['date-released']}"
+    assert HEADINGS[:2] == ["Unreleased", f"{__version__} - {CITATION['date-released']}"]
     assert all(re.fullmatch(r"\d+\.\d+\.\d+ - \d{4}-\d{2}-\d{2}", one) for one in HEADINGS[1:])
-
-
-def test_classifier_says_stable_from_the_first_major_version_on() -> None:
     stable = "Development Status :: 5 - Production/Stable" in PROJECT["classifiers"]
     assert stable == (int(__version__.partition(".")[0]) >= 1)
-
-
-def test_authors_are_those_of_the_licence() -> None:
     (author,) = PROJECT["authors"]
     (line,) = re.findall(r"^Copyright \(c\) \d{4},? (.+)$", text_of("LICENSE"), re.MULTILINE)
     assert author["name"].casefold() in line.casefold()
@@ -69,31 +58,22 @@ NOTICES = {
 }
 
 
-@pytest.mark.parametrize("package", NOTICES)
-def test_every_source_of_data_has_its_licence(package: str) -> None:
-    text = (LIBRARY / "licenses" / f"{package}.txt").read_text()
-    assert all(notice in text for notice in NOTICES[package])
-
-
 def test_all_data_have_a_licence() -> None:
+    for package, notices in NOTICES.items():
+        text = (LIBRARY / "licenses" / f"{package}.txt").read_text()
+        assert all(notice in text for notice in notices)
     for file in LIBRARY.glob("*/*.ecsv"):
         meta = Table.read(file, format="ascii.ecsv").meta
         assert meta["licence"]
-        packages = [name for name in NOTICES if name in meta["origin"]]
-        assert packages, file
-        assert all((LIBRARY / "licenses" / f"{name}.txt").exists() for name in packages)
+        assert any(package in meta["origin"] for package in NOTICES), file
 
 
-def test_references_of_the_paper_are_cited_and_identified() -> None:
-    entries = text_of("paper/paper.bib").split("\n@")[1:]
-    names = {re.match(r"\w+\{(\w+),", one)[1] for one in entries}  # type: ignore[index]
-    assert names == set(re.findall(r"@(\w+)", text_of("paper/paper.md")))
-    assert all("doi = {" in one or "eprint = {" in one for one in entries)
-
-
-def test_paper_has_the_sections_and_the_length_that_the_journal_asks_for() -> None:
+def test_paper_cites_its_references_and_has_the_form_that_the_journal_asks_for() -> None:
     """The form of 2026: https://joss.readthedocs.io/en/latest/paper.html."""
-    body = text_of("paper/paper.md").split("---", 2)[2]
+    entries, paper = text_of("paper/paper.bib").split("\n@")[1:], text_of("paper/paper.md")
+    assert {re.match(r"\w+\{(\w+),", one)[1] for one in entries} == set(re.findall(r"@(\w+)", paper))  # type: ignore[index]
+    assert all("doi = {" in one or "eprint = {" in one for one in entries)
+    body = paper.split("---", 2)[2]
     assert 750 <= len(body.split()) <= 1750
     assert re.findall(r"^# (.+)$", body, re.MULTILINE) == [
         "Summary", "Statement of need", "State of the field", "Software design", "Research impact statement",
@@ -138,37 +118,25 @@ def test_recipe_needs_what_the_package_needs() -> None:
     assert set(recipe["about"]["license_file"]) == licences
 
 
-def test_environment_needs_what_the_package_needs() -> None:
-    listed = [one for one in loaded("environment.yml")["dependencies"] if isinstance(one, str)]
-    versions = bounds(listed)
+def test_environment_and_container_need_what_the_package_needs() -> None:
+    versions = bounds([one for one in loaded("environment.yml")["dependencies"] if isinstance(one, str)])
     assert versions.pop("python") == PROJECT["requires-python"].removeprefix(">=")
     assert versions.pop("pip") == ""
     assert versions == expected()
-
-
-def test_container_ends_with_the_self_test() -> None:
     lines = text_of("Dockerfile").splitlines()
     assert lines[-2:] == ["RUN mauvecl selftest", 'ENTRYPOINT ["mauvecl"]']
 
 
-@pytest.mark.parametrize("job", ["pythons", "wheel"])
-def test_workflow_tests_every_python_that_is_declared(job: str) -> None:
+def test_workflow_tests_every_python_and_pins_what_it_runs() -> None:
     declared = {one.rsplit(" ", 1)[1] for one in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", one)}
-    jobs = loaded(".github/workflows/ci.yml")["jobs"]
-    run = set(jobs[job]["strategy"]["matrix"]["python"])
-    assert run | {jobs["all"]["steps"][1]["with"]["python-version"]} == declared
-
-
-def test_workflow_runs_targets_that_exist() -> None:
+    text, jobs = text_of(".github/workflows/ci.yml"), loaded(".github/workflows/ci.yml")["jobs"]
+    for job in ("pythons", "wheel"):
+        run = set(jobs[job]["strategy"]["matrix"]["python"])
+        assert run | {jobs["all"]["steps"][1]["with"]["python-version"]} == declared
     targets = set(re.findall(r"^([\w-]+):", text_of("Makefile"), re.MULTILINE))
-    called = set(re.findall(r"run: (?:sudo )?make ([\w-]+)", text_of(".github/workflows/ci.yml")))
-    assert called >= {"quick", "lowest", "coverage", "dist", "try-wheel", "docs"}
-    assert called <= targets
-
-
-def test_workflow_pins_actions_by_commit() -> None:
-    """A tag can be moved to other code."""
-    jobs = loaded(".github/workflows/ci.yml")["jobs"].values()
-    used = [step["uses"] for job in jobs for step in job["steps"] if "uses" in step]
+    called = set(re.findall(r"run: (?:sudo )?make ([\w-]+)", text))
+    assert {"quick", "lowest", "coverage", "dist", "try-wheel", "docs"} <= called <= targets
+    # A tag can be moved to other code; a commit cannot.
+    used = [step["uses"] for job in jobs.values() for step in job["steps"] if "uses" in step]
     assert len(used) > 15
     assert not [one for one in used if not re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", one)]

@@ -1,10 +1,15 @@
-"""Every public function validates every argument: the cases follow from the annotations."""
+"""Every public function validates every argument: the cases follow from the annotations.
+
+Values that annotations refuse are refused; those that fit an annotation and cannot be right, such as a name that is
+unknown or an array of a wrong shape, are answered, or refused by the function itself.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -14,13 +19,14 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel
 from refusals import refused, says_what_is_accepted
+from scenes import study_of_g2v
 from study_keys import metadata
 
 import mauvecl
 from mauvecl import InputError, bulk
 
 #: Modules below the validation, and the inner interface of statistics, whose methods public classes inherit.
-INNER = ("mauvecl.schema", "mauvecl.detection.statistics")
+INNER = ("mauvecl.schema", mauvecl.Linear.__module__)
 #: Other units in which a parameter of each unit is given.
 EQUIVALENT = {"nm": ("um", "THz"), "K": ("kK", "deg_C"), "deg_C": ("K",), "s": ("min",), "mag": ("mmag",)}
 
@@ -100,8 +106,7 @@ def holds_arrays(hint: Any) -> bool:
 
 def having(condition: Callable[[Any], bool]) -> list[tuple[str, str]]:
     """Return the parameters whose annotations meet a condition."""
-    checked = [(path, name) for path, name in PARAMETERS if hasattr(FUNCTIONS[path], "__validated__")]
-    return [(path, name) for path, name in checked if condition(annotation(path, name))]
+    return [(path, name) for path, name in PARAMETERS if condition(annotation(path, name))]
 
 
 def wrong_values(path: str, name: str) -> Iterator[tuple[str, Any]]:
@@ -113,7 +118,7 @@ def wrong_values(path: str, name: str) -> Iterator[tuple[str, Any]]:
     yield "a list of two kinds", [1, object()]
     if not named("AnyUnit", hint):
         yield "a mass", 3 * u.kg
-    if not accepted(hint, str, __import__("pathlib").Path):
+    if not accepted(hint, str, Path):
         yield "text", "no such thing"
     if not accepted(hint, bool) and not arrays:
         yield "a truth", True
@@ -199,30 +204,23 @@ def test_instruments_take_quantities(name: str) -> None:
     assert error.value.key == name
 
 
-@pytest.mark.parametrize(
-    ("quantity", "value", "plain", "key"),
-    [
-        ("magnitude", 7000 * u.mmag, 7.0, lambda study: study.star[0].magnitude),
-        ("exposure", 2 * u.min, 120.0, lambda study: study.observation.exposure_s),
-        ("detector_temperature", 300 * u.K, 26.85, lambda study: study.observation.temperature_c),
-        ("flare_temperature", 12 * u.kK, 12_000.0, lambda study: study.flare.temperature_k),
-        ("sky", 22 * u.mag / u.arcsec**2, 22.0, lambda study: study.sky.surface_brightness),
-    ],
-)
-def test_studies_take_quantities(quantity: str, value: Any, plain: float, key: Callable[[Any], float]) -> None:
+#: Quantities of studies, values and plain values, and where they are.
+QUANTITIES: dict[str, tuple[Any, float, Callable[[Any], float]]] = {
+    "magnitude": (7000 * u.mmag, 7.0, lambda study: study.star[0].magnitude),
+    "exposure": (2 * u.min, 120.0, lambda study: study.observation.exposure_s),
+    "detector_temperature": (300 * u.K, 26.85, lambda study: study.observation.temperature_c),
+    "flare_temperature": (12 * u.kK, 12_000.0, lambda study: study.flare.temperature_k),
+    "sky": (22 * u.mag / u.arcsec**2, 22.0, lambda study: study.sky.surface_brightness),
+}
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_studies_take_quantities(quantity: str) -> None:
+    value, plain, key = QUANTITIES[quantity]
     assert key(mauvecl.Study().paper().at(quantity, value)) == pytest.approx(plain)
     for wrong in (3 * u.kg, np.nan, "x"):
         with refused("value" if wrong is np.nan else quantity):
             mauvecl.Study().paper().at(quantity, wrong)
-
-
-def error_of(call: Callable[[], Any]) -> InputError | None:
-    """Return the InputError that a call raises, if any."""
-    try:
-        call()
-    except InputError as error:
-        return error
-    return None
 
 
 def records(record: type[BaseModel] = BaseModel) -> Iterator[type[BaseModel]]:
@@ -249,13 +247,17 @@ def test_wrong_fields_of_records_raise(record: type[BaseModel]) -> None:
         hint = record.model_fields[field].annotation if field in record.model_fields else None
         numeric = {int, float} & types(hint) and bool not in types(hint)
         for value in (*wrong, *truths):
-            error = error_of(lambda field=field, value=value: record(**{field: value}))
-            if error is None:
+            refusal = None
+            try:
+                record(**{field: value})
+            except InputError as error:
+                refusal = str(error)
+            if refusal is None:
                 assert type(value) is not object or hint is Any, field
                 assert not numeric or not any(value is one for one in truths), (field, value)
             else:
-                assert "\n" not in str(error)
-                assert says_what_is_accepted(str(error)) or "did you mean" in str(error), error
+                assert "\n" not in refusal
+                assert says_what_is_accepted(refusal), refusal
 
 
 def test_attributes_and_arguments_that_do_not_exist_are_refused() -> None:
@@ -268,3 +270,90 @@ def test_attributes_and_arguments_that_do_not_exist_are_refused() -> None:
     for call in (lambda: star.flaring(), lambda: star.binned(1.0, 2.0), lambda: mauvecl.Study().run.__class__(5)):
         with pytest.raises(TypeError, match="argument"):
             call()
+
+
+#: Values of required parameters that are text, by name of the parameter.
+WORDS = {
+    "band": "Kepler", "kind": "band", "quantity": "magnitude", "statistic": "matched", "target": "290.0 -11.2",
+    "time": "2027-01-01", "shape": "fiducial", "instrument": "mauvesim", "path": "no such file", "file": "x.fits",
+}  # fmt: skip
+#: What the package calls with arrays that it has made, which nothing checks again in a loop.
+IN_LOOPS = (
+    "BalmerFlare.", "Blackbody.", "FlareWithLines.", "Frames.shifted", "Normal.quantile", "Nuisances.finite",
+    "Nuisances.rows", "ObservedFlare.flux", "ObservedFlare.grid", "Pool.realise", "Stares.", "TableShape.",
+    "TwoBlackbodies.", "Uniform.quantile", "bulk.unfinished",
+)  # fmt: skip
+
+
+@cache
+def instances() -> dict[type, Any]:
+    """Return an instance of each class that functions take or whose methods are called."""
+    star = mauvecl.Source.from_library("G2V").at_magnitude(7.4)
+    part = mauvecl.Instrument.load("mauvesim").with_(output_min_nm=300.0, output_max_nm=306.0)
+    quiet, flare = (mauvecl.expect(one, part, exposure=5) for one in (star, star.flaring(0.5)))
+    study = study_of_g2v(observation={"changes": {"output_min_nm": 300.0, "output_max_nm": 306.0}})
+    time = 5.0 * np.arange(30)
+    model = mauvecl.FlareModel.of(star, part, quiet)
+    made = (
+        star, part, quiet, study, model, mauvecl.Engine(), mauvecl.EnergyScale.of_blackbody(1.0, 5772.0),
+        mauvecl.Engine().detect(quiet, [flare], realisations=500, seed=1), mauvecl.Cooling(1e4, 5000.0, 300.0),
+        mauvecl.Event(0.0, 60.0, 0.1), mauvecl.Nuisances.of(quiet, {"dark": 0.1}), mauvecl.Pool(), mauvecl.Processes(),
+        mauvecl.PixelMap.made_up(5, seed=1), mauvecl.Sky.of_brightness(22.0), mauvecl.Stare.of(60.0),
+        mauvecl.Comparison(), mauvecl.BalmerFlare(9000.0), mauvecl.Normal(0.0, 1.0, -5.0, 5.0), mauvecl.Sinusoid(0.1),
+        mauvecl.Blackbody(9000.0), mauvecl.TwoBlackbodies(9000.0, 5000.0, 1.0), mauvecl.Uniform(0.0, 1.0),
+        mauvecl.FlareWithLines(mauvecl.Blackbody(9000.0), {"Mg II": 0.05}), mauvecl.Stares(),
+        mauvecl.ObservedFlare.from_arrays(np.linspace(170, 1200, 1200), np.ones(1200)),
+        mauvecl.TableShape(np.array([-1.0, 0.0, 1.0, 4.0]), np.array([0.0, 3.0, 1.0, 0.0])),
+        mauvecl.Frames.of(time, np.ones(30)), mauvecl.SHAPES["fiducial"],
+    )  # fmt: skip
+    return {type(one): one for one in made}
+
+
+def fitting(path: str, name: str) -> Any:
+    """Return a value for a required parameter, by its annotation."""
+    hint = annotation(path, name)
+    for kind, one in instances().items():
+        if accepted(hint, *(base for base in kind.__mro__ if base.__module__.startswith("mauvecl"))):
+            return (one,) if accepted(hint, Sequence, tuple, list) else one
+    if accepted(hint, str, Path):
+        word = WORDS.get(name, "x")
+        return (word,) if accepted(hint, tuple) else word
+    if accepted(hint, dict, Mapping):
+        return {}
+    if holds_arrays(hint) or accepted(hint, float):
+        value = example(hint)
+        return (value,) if accepted(hint, tuple, Sequence) else value
+    return 3 if accepted(hint, int) else None
+
+
+def fitting_mistakes(path: str, name: str) -> list[Any]:
+    """Return values that fit the annotation of a parameter and cannot be right."""
+    hint = annotation(path, name)
+    if anything(hint):
+        return []
+    arrays = [np.ones((2, 3)), np.full(4, np.nan), np.empty(0)] if holds_arrays(hint) else []
+    return arrays + (["no such thing"] if accepted(hint, str, Path) else [])
+
+
+#: Names of functions with a parameter that is tried. Methods need an instance of their class.
+TRIED = sorted({path for path, name in PARAMETERS if not path.startswith(IN_LOOPS) and fitting_mistakes(path, name)})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("path", TRIED)
+def test_wrong_name_or_array_raises(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    owner, _, method = path.partition(".")
+    call = thing = getattr(mauvecl, owner)
+    if method:
+        static = isinstance(inspect.getattr_static(thing, method, None), classmethod | staticmethod)
+        call = getattr(thing if static or not inspect.isclass(thing) else instances()[thing], method)
+    good = {p.name: fitting(path, p.name) for p in arguments(FUNCTIONS[path]) if p.default is p.empty}
+    for name in (name for there, name in PARAMETERS if there == path):
+        for value in fitting_mistakes(path, name):
+            try:
+                call(**good | {name: value})
+            except InputError:
+                pass
+            except RuntimeError as error:
+                assert error.kind, "a device's failure states its kind"  # type: ignore[attr-defined]  # noqa: PT017

@@ -13,35 +13,21 @@ from commands import run
 from scenes import paper
 
 import mauvecl
-from mauvecl import Engine, FlareModel, InputError, Instrument, Source, Study, expect, fit
+from mauvecl import Engine, FlareModel, Instrument, Source, Study, expect, fit
 
 #: Keywords, and the flags that ask the same.
 ASKED: dict[str, dict[str, Any]] = tomllib.loads(
     (Path(__file__).parents[1] / "data" / "keywords.toml").read_text(encoding="utf-8")
 )
-ASKED |= {
-    "several": {
-        "verb": "simulate", "flags": "--star G2V -m 7.4 --star K3V -m 3.7 --seed 3 -a 0.1,0.2",
-        "keywords": {"star": ("G2V", "K3V"), "magnitude": np.array([7.4, 3.7]), "amplitude": [10, 20] * u.percent,
-                     "seed": 3},
-    },
-    "units": {
-        "verb": "simulate", "flags": "'AU Mic' -a 24% -t 120 --flare-temperature 9000",
-        "keywords": {"star": "AU Mic", "amplitude": 24 * u.percent, "exposure": 2 * u.min,
-                     "flare_temperature": 9 * u.kK},
-    },
-    "own section": {
-        "verb": "exposure", "flags": "--star G2V -m 7 --snr 10 --at 300",
-        "keywords": {"star": "G2V", "magnitude": 7, "snr": 10, "at": 300 * u.nm},
-    },
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ASKED)
 def test_keywords_ask_what_flags_ask(name: str, tmp_path: Path) -> None:
     asked = ASKED[name]
     run(asked["verb"], *shlex.split(asked["flags"]), "--no-pictures", "-o", "answer", folder=tmp_path)
-    answer = getattr(mauvecl, asked["verb"])(**asked["keywords"])
+    # Keywords with units are an expression.
+    keywords = asked.get("keywords") or eval(asked["call"], {"np": np, "u": u})
+    answer = getattr(mauvecl, asked["verb"])(**keywords)
     assert answer.study.toml() == (tmp_path / "answer" / "study.toml").read_text()
     assert answer.tables.keys() <= {path.stem for path in (tmp_path / "answer").glob("*.ecsv")}
 
@@ -68,9 +54,6 @@ def test_studies_are_built_from_the_same_keywords() -> None:
     assert pairs.stare.gaps == ((600.0, 1800.0),)
     assert pairs.measure.skipped_nm == ((322.0, 368.0),)
     assert pairs.orbit.limits.declination_deg == (-30.0, 30.0)
-    # A name of two keys is refused, not given to one of them.
-    with pytest.raises(InputError, match="no keyword 'shape'"):
-        Study.of(shape="davenport")
 
 
 def test_too_few_realisations_are_warned_of() -> None:
@@ -83,8 +66,6 @@ def test_too_few_realisations_are_warned_of() -> None:
         with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
             answer = verb(star="G2V", **asked, realisations=10, fap=0.1, ideal=True)
         assert answer.study.run.realisations == 1000
-    with pytest.raises(InputError, match="ask for 100000000 realisations"):
-        mauvecl.map(star="G2V", **axes, realisations=10, fap=1e-6, ideal=True)
 
 
 def test_expectations_and_draws_have_the_defaults_of_the_command_line(engine: Engine) -> None:

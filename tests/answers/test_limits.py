@@ -98,20 +98,6 @@ def test_assumptions_move_the_limit_as_predicted(engine: Engine) -> None:
     assert Study.build(lossy.model_dump(), "again") == lossy
 
 
-@pytest.mark.long
-def test_progress_has_one_total_and_moves_with_each_simulation() -> None:
-    """Three limits, of which several are computed at the same time: never back, and at the end all of it."""
-    study = paper("star=[{library='G2V'}]", "flare.amplitudes=[0.24]", "run.realisations=20000", "run.fap=0.01")
-    seen: list[tuple[int, int]] = []
-    pool = mauvecl.Pool(mauvecl.LocalWorkers([None]))
-    found = mauvecl.limit(study, pool, lambda *reported: seen.append(reported))
-    parts, totals = zip(*seen, strict=True)
-    assert {parts[-1]} == {*totals}
-    assert list(parts) == sorted(parts)
-    # Each simulation and each end of a limit, its check among the simulations.
-    assert len(parts) == sum(len(one.points) + 2 for one in found.limits)
-
-
 MAGNITUDE = {"quantity": "magnitude", "start": 6.0, "stop": 10.0, "steps": 5}
 AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "log": True}
 
@@ -157,16 +143,12 @@ def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) ->
     assert (found.probability <= found.high).all()
 
 
-def sunlike(magnitude: float = 7.4, exposure_s: float = 50.0) -> Study:
-    return paper(f'star=[{{library="G2V", magnitude={magnitude}}}]', f"observation.exposure_s={exposure_s}")
-
-
 @pytest.mark.parametrize("per", ["pixel", "element"])
 @pytest.mark.parametrize("frames", [1, 2, 7, 120])
 @pytest.mark.parametrize("wavelength", [280.0, 450.0])
 def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
     """Check that the S/N of an exposure asks for that exposure, and that one frame more is a little longer."""
-    asked = sunlike(exposure_s=5.0 * frames)
+    asked = paper("star=[{library='G2V', magnitude=7.4}]", f"observation.exposure_s={5 * frames}")
     x = expectations(asked)[0]
     pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength)))
     snr = float(x.snr()[pixel] if per == "pixel" else x.snr_per_element()[x.element[pixel]])
@@ -175,15 +157,3 @@ def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
     assert same.snr_one_frame_less < snr <= same.snr * (1 + 1e-9)
     (more,) = exposure_for(asked, snr * (1 + 1e-9), wavelength, per=per).exposures
     assert more.frames == frames + 1
-
-
-def test_exposures_that_saturate_or_exceed_a_day_say_so() -> None:
-    """Longer times are sums of several exposures, although `expect` allows only one day."""
-    blinding, found = exposure_for(sunlike(-2.0), 10.0, 450.0), exposure_for(sunlike(14.5), 10.0, 550.0)
-    assert blinding.exposures[0].saturated
-    assert of_kind(blinding.messages, "saturated")
-    assert not exposure_for(sunlike(), 10.0, 400.0).exposures[0].saturated
-    (answer,) = found.exposures
-    assert answer.exposure_s > 86_400.0
-    assert answer.snr_one_frame_less < 10.0 <= answer.snr
-    assert of_kind(found.messages, "long exposure")

@@ -1,7 +1,6 @@
 """What `measure` states: simulated fits, detected flares, models that are too simple, and unknowns that are drawn."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,22 +61,7 @@ def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> No
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("amplitude", [1e-4, 0.01, 30.0])
-def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engine: Engine, tmp_path: Path) -> None:
-    """Include flares without limits on one side or both, and with saturated pixels."""
-    study = study_of("measure.fits=20", f"flare.amplitudes=[{amplitude}]", spectrum={"balmer_jump": 2.0})
-    answer = measure(study, engine)
-    assert len(answer.table) == sum(len(one.truth) for one in answer.flares)
-    # What is undefined has an empty cell.
-    for view in answer.views:
-        assert not any("nan" in cell for row in view.texts()[1] for cell in row)
-    for name, draw in answer.pictures.items():
-        draw(tmp_path / f"{name}.png")
-        assert (tmp_path / f"{name}.png").exists()
-
-
-@pytest.mark.long
-def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> None:
+def test_flares_are_measured_along_a_stare(engine: Engine) -> None:
     """Measure a cooling flare in bins and by a joint fit; pulls beyond chi-squared's 1e-9 quantiles fail."""
     events = [{"peak_s": 100.0, "amplitude": 2.0, "half_width_s": 40.0, "cooling": {"end_k": 7000.0, "fold_s": 80.0}}]
     settings = ("measure.fits=20", "measure.snr_per_bin=20", "measure.joint_fit=true", "stare.duration_s=400",
@@ -106,11 +90,7 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
     residuals = fit.fitted.drawn_dn - fit.fitted.mean_dn
     assert abs(residuals.mean()) < 6 * residuals.std() / np.sqrt(residuals.size)
     assert ((joint["low_95"] < joint["estimate"]) & (joint["estimate"] < joint["high_95"])).all()
-    answer.write(tmp_path)
-    for name, rows in (("temperatures", table), ("joint", joint)):
-        assert (tmp_path / f"{name}.ecsv").exists()
-        assert len(answer.as_json()[name]) == len(rows)
-        assert f"{name}-1" in answer.pictures
+    assert {"temperatures-1", "joint-1"} <= answer.pictures.keys()
     study = study.with_settings(["measure.joint_fit=false"])
     # A pool draws the same stare; a flare that is too faint is reported.
     assert measure(study, Pool()).tables["temperatures"]["temperature"][5] == table["temperature"][5]
@@ -124,7 +104,7 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
 
 
 @pytest.mark.long
-def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine, tmp_path: Path) -> None:
+def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine) -> None:
     """Check that the hotter blackbody is always the second, and that pictures have a column per model."""
     spectrum = {"second_temperature_k": 8000.0, "second_area": 20.0}
     settings = "measure.fits=20", "flare.amplitudes=[3.0]", "nuisances={usual=false}"
@@ -141,9 +121,7 @@ def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine, tmp
     errors = answer.flares[1].found.errors
     np.testing.assert_allclose(np.median(errors, axis=0), answer.flares[1].known.errors, rtol=0.1)
     assert any("rejects it in 100 %" in text for text in answer.messages)
-    for name, draw in answer.pictures.items():
-        draw(tmp_path / f"{name}.png")
-        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    assert all(draw() for draw in answer.pictures.values())
     alone = measure(study_of(*settings, 'measure.models=["two-temperatures"]', spectrum=spectrum), engine)
     assert [one.model for one in alone.flares] == ["two-temperatures"]
     assert list(alone.pictures) == ["fit", "pulls", "errors"]
@@ -153,6 +131,8 @@ def test_lines_and_absolute_fluxes_are_measured(engine: Engine) -> None:
     spectrum = {"balmer_jump": 2.0, "lines": {"H alpha": 0.05}, "line_fluxes": {"Mg II": 2e-11}}
     answer = measure(study_of("measure.fits=50", "nuisances={usual=false}", spectrum=spectrum), engine)
     assert [one.model for one in answer.flares] == ["blackbody", "balmer", "lines"]
+    found = answer.flares[-1].found
+    np.testing.assert_allclose(found.p_value, stats.chi2.sf(found.chi2, found.dof), rtol=1e-9)
     rows = {row["quantity"]: row for row in answer.flares[-1].rows()}
     assert rows["line Mg II"]["truth"] == 2e-11
     assert rows["line Mg II"]["perfect"] == pytest.approx(2e-11, rel=0.02)

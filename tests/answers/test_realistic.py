@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
-from refusals import refused
 
 import mauvecl
 from mauvecl import Engine, Instrument, Study, detect, limit, plan
@@ -90,6 +89,8 @@ def test_saturated_star_says_so_in_the_headline(engine: Engine) -> None:
     at_end = ASKED.with_settings(["star.0.magnitude=1", f"observation.changes={{frame_s={0.99 * safe_s}}}"])
     assert "saturate" not in detect(at_end, engine).headline
     assert saturated > 50
+    seen = mauvecl.simulate(ASKED.with_settings(["star.0.magnitude=1"]))
+    assert seen.headline.endswith(f"; {saturated} of 1643 pixels saturate.")
 
 
 OLD = "[[star]]\nlibrary = 'G2V'\nmagnitude = 7.4\n[run]\nfap = 0.01\n"
@@ -127,9 +128,6 @@ def test_study_of_version_2_needs_no_note(tmp_path: Path, recwarn: pytest.Warnin
     assert Study.read(tmp_path / "again.toml") == study
     assert study.toml().startswith("version = 2\n")
     assert not recwarn.list
-    (tmp_path / "later.toml").write_text("version = 3\n" + OLD)
-    with refused("version", "2"):
-        Study.read(tmp_path / "later.toml")
 
 
 def test_instrument_files_of_version_1_are_read_as_they_were(tmp_path: Path) -> None:
@@ -144,6 +142,3 @@ def test_instrument_files_of_version_1_are_read_as_they_were(tmp_path: Path) -> 
     with pytest.warns(UserWarning, match="is called mauve since version 2"):
         # What is written, such as a calibrated instrument that extends it, has today's name.
         assert Study().with_settings(["observation.instrument=mauve-electrons"]).observation.instrument == "mauve"
-    (tmp_path / "later.toml").write_text("version = 3\nextends = 'mauve'\n")
-    with refused("version", "2"):
-        Instrument.load(tmp_path / "later.toml")

@@ -5,6 +5,7 @@ import re
 import tomllib
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -17,22 +18,17 @@ from mauvecl import Engine, Nuisances, Processes, Sky, Source, Study, detect, ex
 from mauvecl import limit as limiting_magnitude
 from mauvecl import map as detection_map
 from mauvecl.answers.detect import unknown_table
+from mauvecl.noise import unknowns
 from mauvecl.noise.scene import prepare
-from mauvecl.study.cases import Case
-
-STRAY = "200 1\n450 3\n700 1  # DN\n"
-
-
-#: Those of the paper.
-CONVENTIONS = {"observation": {"instrument": "mauvesim"}}
 
 
 def study(**nuisances: Any) -> Study:
     """Return the G2V star of METHODS section 7 with its 2 % flare, Vega at V = 0."""
     star = {"library": "G2V", "magnitude": 7.4, "magnitude_system": "vega"}
     run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
-    unknown = {"nuisances": {"usual": False} | nuisances}
-    return Study.build({"star": [star], "flare": {"amplitudes": [0.02]}, "run": run} | CONVENTIONS | unknown, "test")
+    sections = {"star": [star], "flare": {"amplitudes": [0.02]}, "run": run}
+    sections |= {"observation": {"instrument": "mauvesim"}, "nuisances": {"usual": False} | nuisances}
+    return Study.build(sections, "test")
 
 
 @pytest.mark.parametrize(
@@ -89,7 +85,7 @@ def test_every_answer_reports_the_cost_of_unknowns(engine: Engine) -> None:
 
 def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engine: Engine) -> None:
     """Compare answers and studies of a file, of its points, of flags, and the values of the interface in Python."""
-    (tmp_path / "stray.txt").write_text(STRAY)
+    (tmp_path / "stray.txt").write_text("200 1\n450 3\n700 1  # DN\n")
     text = "[nuisances]\ndark = 0.1\n[nuisances.own.stray]\nfile = 'stray.txt'\nsd = 2.0\n"
     (tmp_path / "study.toml").write_text(text)
     asked = Study.read(tmp_path / "study.toml")
@@ -115,22 +111,21 @@ def test_own_unknowns_are_read_from_files_points_and_flags(tmp_path: Path, engin
     assert thresholds == [by_hand.threshold(0.01, "matched").value] * 2
 
 
-def test_usual_unknowns_follow_the_observation() -> None:
+def test_usual_unknowns_follow_the_observation(engine: Engine) -> None:
     """Check that they are centred on the study's temperature, and that the study's own processes stay."""
     asked = study(usual=True).with_settings(
         ["observation.temperature_c=13", "processes.jitter={uniform=[0.0, 0.01]}", "nuisances.dark=0.3"]
     )
-    processes = Case(asked).processes
-    assert (processes.detector_temperature.mean, processes.jitter.high) == (13, 0.01)
-    assert Case(study()).processes.detector_temperature is None
+    with mock.patch.object(Engine, "detect", autospec=True, side_effect=Engine.detect) as draw:
+        detect(asked, engine)
+        detect(study(), engine)
+    drawn, known = (call.kwargs["processes"] for call in draw.call_args_list)
+    assert (drawn.detector_temperature.mean, drawn.jitter.high) == (13, 0.01)
+    assert known.detector_temperature is None
     found = asked.nuisances.marginalised(expectations(asked)[0])
     assert dict(zip(found.names, found.sd, strict=True)) == {"dark": 0.3, "light": np.inf, "sky": 0.1}
     dark_sky = asked.with_changes({"sky": {"none": True}}, None)
     assert dark_sky.nuisances.marginalised(expectations(dark_sky)[0]).names == ("dark", "light")
-
-
-def usual_processes(temperature: float) -> Processes:
-    return Case(study(usual=True).with_settings([f"observation.temperature_c={temperature}"])).processes
 
 
 @pytest.mark.long
@@ -141,7 +136,7 @@ def test_priors_are_drawn_jointly_on_both_instruments() -> None:
         mauve = instrument(payload, part=True, temperature_c=temperature, output_max_nm=310.0)
         for star, exposure in itertools.product(stars, (5.0, 50.0, 600.0)):
             seen = [expect(star, mauve, exposure=exposure, sky=Sky.of_brightness(22.1))]
-            assert prepare(seen, processes=usual_processes(temperature)).joint
+            assert prepare(seen, processes=Processes(**unknowns.default_processes(temperature))).joint
 
 
 #: Draws of each scene, requested false-alarm probability, and number of scenes.
@@ -168,7 +163,7 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
         sky = Sky.of_brightness(rng.uniform(19, 23))
         exposure = float(rng.choice([5.0, 50.0]))
         quiet, flare = (expect(s, payload, exposure=exposure, sky=sky) for s in (star, star.flaring(0.1)))
-        how: dict[str, Any] = {"processes": usual_processes(temperature)}
+        how: dict[str, Any] = {"processes": Processes(**unknowns.default_processes(temperature))}
         marginal = {"statistics": statistics, "nuisances": study(usual=True).nuisances.marginalised(quiet)}
         first, fresh = twice(engine, quiet, [flare], DRAWS, seed=next(SEEDS), **marginal, **how)
         for name in statistics:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -19,19 +20,6 @@ pytestmark = pytest.mark.long
 
 #: Memory that a question may take beyond what the process has, and seconds.
 ROOM, SECONDS = 1 << 30, 30.0
-
-
-def many(examples: int):
-    """Return settings that give the same examples in every run."""
-    return settings(
-        max_examples=examples,
-        derandomize=True,
-        database=None,
-        deadline=None,
-        suppress_health_check=list(HealthCheck),
-        # The first failure will do: looking for a shorter one takes minutes.
-        phases=[Phase.generate],
-    )
 
 
 @pytest.fixture(scope="module")
@@ -101,84 +89,70 @@ VALUES = st.recursive(
 
 #: Keys of studies, also of stars that are numbered wrongly.
 EVERY = [".".join(path) for path, _ in fields() if len(path) < 3] + ["star.0.magnitude", "star.0.file", "star.-1"]
-#: A verb that reads everything and draws nothing.
-ASK = ("exposure", "--snr", "10", "--at", "300", "--no-pictures", "--quiet", "--star", "G2V", "--magnitude", "7.4")
 KEYS = st.one_of(
     st.sampled_from(EVERY), st.sampled_from(["observation.changes.temperature_c", "run.weights.x", ""]), TEXTS
 )
-
-
-@many(40)
-@given(key=KEYS, value=st.one_of(VALUES, TEXTS))
-def test_settings_never_crash(folder: Path, key: str, value: str) -> None:
-    check(folder, *ASK, "--set", f"{key}={value}")
-
-
-@many(30)
-@given(key=st.sampled_from(EVERY), value=VALUES, junk=st.one_of(st.just(b""), st.binary(max_size=20)))
-def test_studies_never_crash(folder: Path, key: str, value: str, junk: bytes) -> None:
-    study = folder / "study.toml"
-    study.write_bytes(f"{key.replace('star.0', 'star')} = {value}\n".encode() + junk)
-    check(folder, "exposure", "study.toml", "--snr", "10", "--at", "300", "--no-pictures", "--quiet")
-
-
 INSTRUMENT_KEYS = (
     "pixels", "adc_bits", "read_noise_dn", "temperature_c", "light_loss", "fibre_efficiency", "pixel_map", "extends",
     "name", "conversion_uv_per_electron", "frame_s", "sources", "nonsense",
 )  # fmt: skip
-
-
-@many(25)
-@given(key=st.sampled_from(INSTRUMENT_KEYS), value=VALUES)
-def test_instruments_never_crash(folder: Path, key: str, value: str) -> None:
-    (folder / "mine.toml").write_text(f"extends = 'mauvesim'\n{key} = {value}\n")
-    check(folder, *ASK, "--instrument", "mine.toml")
-
-
-FLAGS = st.sampled_from(
-    ["--star", "--magnitude", "--band", "--exposure", "--instrument", "--temperature", "--sky", "--target", "--time",
-     "--snr", "--at", "--per", "--output", "--realisations", "--nonsense", "--set", "--json", "study_file"]
+FLAGS = (
+    "--star", "--magnitude", "--band", "--exposure", "--instrument", "--temperature", "--sky", "--target", "--time",
+    "--snr", "--at", "--per", "--realisations", "--nonsense", "--set", "--json",
 )  # fmt: skip
-
-
-@many(40)
-@given(flag=FLAGS, value=st.one_of(NUMBERS, TEXTS))
-def test_flags_never_crash(folder: Path, flag: str, value: str) -> None:
-    if flag == "--output":
-        # Not outside the folder: what is written there would stay.
-        value = value.replace("/", "?").replace("..", "?")
-    # The operating system passes no null bytes.
-    value = value.replace("\0", "?")
-    words = (value,) if flag == "study_file" else (f"{flag}={value}",)
-    check(folder, "exposure", "--no-pictures", "--quiet", "--snr=10", "--at=300", *words)
-
-
-@many(25)
-@given(verb=st.sampled_from(["verify", "export", "realise", "library", "serve", "map", "limit", "detect"]), value=TEXTS)
-def test_verbs_never_crash(folder: Path, verb: str, value: str) -> None:
-    words = {
-        "verify": ("verify", value),
-        "export": ("export", value, f"{value}.fits", "--rows", value),
-        "realise": ("realise", "--star", value, "--frames", value, "-n", "1"),
-        "library": ("library", "add", value),
-        "serve": ("serve", "--port", value or "0"),
-        "map": ("map", "--x", value),
-        "limit": ("limit", "--of", value or "x"),
-        "detect": ("detect", "--fap", value or "x", "-o", value),
-    }[verb]
-    check(folder, *words)
-
-
-@many(20)
-@given(
-    name=st.sampled_from(
-        ["MAUVECL_DATA_DIR", "MAUVECL_CACHE_DIR", "MAUVECL_LARGEST_FILE_MIB", "MAUVECL_LARGEST_CONTENT_MIB", "COLUMNS",
-         "TERM", "NO_COLOR", "PYTHONIOENCODING", "LANG", "TMPDIR"]
+VERBS = (
+    "verify {0}", "export {0} {0}.fits --rows {0}", "realise --star {0} --frames {0} -n 1", "library add {0}",
+    "serve --port {0}", "map --x {0}", "limit --of {0}", "detect --fap {0} -o {0}", "exposure {0}",
+)  # fmt: skip
+ENVIRONMENT = ("MAUVECL_DATA_DIR", "MAUVECL_CACHE_DIR", "MAUVECL_LARGEST_FILE_MIB", "MAUVECL_LARGEST_CONTENT_MIB",
+               "COLUMNS", "TERM", "NO_COLOR", "PYTHONIOENCODING", "LANG", "TMPDIR")  # fmt: skip
+#: A verb that reads everything and draws nothing.
+ASK = ("exposure", "--snr", "10", "--at", "300", "--no-pictures", "--quiet")
+STAR = (*ASK, "--star", "G2V", "--magnitude", "7.4")
+WORD = st.one_of(NUMBERS, TEXTS)
+#: Number of examples, strategies of their parts, and the words and the content of `mine.toml` that these make.
+KINDS: dict[str, tuple[int, tuple[st.SearchStrategy[Any], ...], Callable[..., tuple[tuple[str, ...], bytes]]]] = {
+    "setting": (40, (KEYS, st.one_of(VALUES, TEXTS)), lambda key, value: ((*STAR, "--set", f"{key}={value}"), b"")),
+    "study": (
+        30, (st.sampled_from(EVERY), VALUES, st.one_of(st.just(b""), st.binary(max_size=20))),
+        lambda key, value, junk: (
+            ("exposure", "mine.toml", *ASK[1:]), f"{key.replace('star.0', 'star')} = {value}\n".encode() + junk
+        ),
     ),
-    value=TEXTS.filter(lambda text: "\0" not in text),
-)  # fmt: skip
-def test_environments_never_crash(folder: Path, name: str, value: str) -> None:
-    check(folder, "library", **{name: value})
+    "instrument": (
+        25, (st.sampled_from(INSTRUMENT_KEYS), VALUES),
+        lambda key, value: (
+            (*STAR, "--instrument", "mine.toml"), f"extends = 'mauvesim'\n{key} = {value}\n".encode()
+        ),
+    ),
+    "flag": (35, (st.sampled_from(FLAGS), WORD), lambda flag, value: ((*ASK, f"{flag}={value}"), b"")),
+    # Not outside the folder: what is written there would stay.
+    "output": (5, (WORD,), lambda value: ((*ASK, f"--output={value.replace('/', '?').replace('..', '?')}"), b"")),
+    "verb": (
+        30, (st.sampled_from(VERBS), TEXTS),
+        lambda verb, value: (tuple(part.format(value) for part in verb.split()), b""),
+    ),
+    "environment": (20, (st.sampled_from(ENVIRONMENT), TEXTS), lambda name, value: (("library", name, value), b"")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_generated_inputs_never_crash(kind: str, folder: Path) -> None:
+    count, parts, asked = KINDS[kind]
+
+    # The same examples in every run; the first failure will do: looking for a shorter one takes minutes.
+    @settings(max_examples=count, derandomize=True, database=None, deadline=None, phases=[Phase.generate],
+              suppress_health_check=list(HealthCheck))  # fmt: skip
+    @given(st.tuples(*parts))
+    def ask(given: tuple[Any, ...]) -> None:
+        words, content = asked(*given)
+        (folder / "mine.toml").write_bytes(content)
+        # The operating system passes no null bytes.
+        words = tuple(word.replace("\0", "?") for word in words)
+        environment = {words[1]: words[2]} if kind == "environment" else {}
+        check(folder, *words[: 1 if environment else None], **environment)
+
+    ask()
 
 
 def test_check_detects_an_unexpected_error(folder: Path) -> None:

@@ -46,6 +46,9 @@ def place(intact: Path, tmp_path: Path) -> Path:
     mapping = (tmp_path / "wcs.toml").read_text().replace('wavelength = "wcs"', 'wavelength_file = "nm.csv"')
     (tmp_path / "named.toml").write_text(f'{mapping}wavelength_unit = "Angstrom"\n')
     Table({"nm": np.linspace(2505.0, 6505.0, 6)}).write(tmp_path / "nm.csv", format="ascii.csv")
+    curve = Table({"wavelength": [150.0, 1100.0], "value": [0.5, 0.5]}, units={"wavelength": "nm"})
+    curve.write(tmp_path / "curve.ecsv")
+    (tmp_path / "curve.toml").write_text("extends = 'mauvesim'\nfibre_efficiency = 'curve.ecsv'\n")
     names = [path.name for path in sorted((tmp_path / "spectra").glob("*.fits"))]
     Table({"file": names, "T": np.arange(len(names)) * 20.0}).write(tmp_path / "times.csv")
     (tmp_path / "listed.toml").write_text(

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import sys
 import tomllib
+from collections.abc import Callable
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
@@ -141,16 +142,21 @@ def test_every_value_of_the_record_is_verified(out: Path) -> None:
     assert json.loads(place.read_text(encoding="utf-8"))["record_digest"] != record["record_digest"]
 
 
+def on_writing(happens: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let something happen when a file is written, by its name."""
+    monkeypatch.setattr(os, "fsync", lambda handle: happens(Path(f"/proc/self/fd/{handle}").readlink().name))
+
+
 def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Simulate a disk that is full after `step` files; return the names of the files that were tried."""
     tried: list[str] = []
 
-    def fsync(handle: int) -> None:
-        tried.append(Path(f"/proc/self/fd/{handle}").readlink().name)
+    def fill(name: str) -> None:
+        tried.append(name)
         if len(tried) > step:
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", fsync)
+    on_writing(fill, monkeypatch)
     return tried
 
 
@@ -190,25 +196,12 @@ def test_each_file_is_whole_or_missing_if_the_disk_fills(tmp_path: Path, monkeyp
         assert shown.partition("Wrote")[0] == plain.partition("Wrote")[0]
 
 
-def test_full_file_system_keeps_earlier_files(small_disk: Path) -> None:
-    asked = (*words("simulate"), "--no-pictures", "--output", "out")
-    run(*asked, folder=small_disk)
-    before = {p.name: p.read_bytes() for p in (small_disk / "out").iterdir()}
-    (small_disk / "filler").write_bytes(bytes(os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_bsize))
-    code, shown, reported = ended(*asked, "--exposure", "10", folder=small_disk)
-    assert code == 2
-    assert "observation-1.ecsv" in reported
-    assert "No space left on device" in reported
-    assert "One observation each" in shown
-    assert {p.name: p.read_bytes() for p in (small_disk / "out").iterdir()} == before
-
-
 def test_interruption_while_writing_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fsync(handle: int) -> None:
-        if ".fits" in Path(f"/proc/self/fd/{handle}").readlink().name:
+    def interrupt(name: str) -> None:
+        if ".fits" in name:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(os, "fsync", fsync)
+    on_writing(interrupt, monkeypatch)
     code, _, reported = ended(*words("simulate"), "--no-pictures", "--output", "out", folder=tmp_path)
     assert code == 130
     assert reported == (
@@ -219,19 +212,19 @@ def test_interruption_while_writing_is_reported(tmp_path: Path, monkeypatch: pyt
 
 
 def test_output_folder_is_locked_while_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    refused: list[bool] = []
+    asked, refused = (*words("exposure"), "--no-pictures", "--output", "out"), []
 
-    def fsync(handle: int) -> None:
+    def ask_again(name: str) -> None:
         with monkeypatch.context() as patch:
-            patch.setattr(os, "fsync", lambda handle: None)
-            code, _, reported = ended(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
+            on_writing(lambda name: None, patch)
+            code, _, reported = ended(*asked, folder=tmp_path)
         refused.append(code == 2 and "another" in reported)
 
-    monkeypatch.setattr(os, "fsync", fsync)
-    run(*words("detect"), "--no-pictures", "--output", "out", folder=tmp_path)
-    assert refused == [True] * 6
+    on_writing(ask_again, monkeypatch)
+    run(*asked, folder=tmp_path)
+    assert refused == [True] * 3
     monkeypatch.undo()
-    run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
+    run(*asked, folder=tmp_path)
 
 
 def test_files_of_the_previous_run_are_removed(tmp_path: Path) -> None:
@@ -248,13 +241,12 @@ def test_files_of_the_previous_run_are_removed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("record", ["", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}'])
 def test_foreign_record_removes_nothing(record: str, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "run.json").write_text(record)
-    (out / "a").write_text("mine")
-    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "out").mkdir()
+    texts = {"out/run.json": record, "out/a": "mine", "mine": "mine"}
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
     run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
-    assert (out / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
+    assert (tmp_path / "out" / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
 
 
 @pytest.mark.parametrize(("setting", "stated"), SETTINGS.items())

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import forked, printed, python
+from processes import printed, python
 
 pytestmark = pytest.mark.long
 #: Script that draws on the default device and prints the level and the counts' digest, or the error.
@@ -46,7 +46,7 @@ ACTS = {
 
 
 def run(cache: Path | str, before: str = "", **environment: str) -> dict[str, str]:
-    return printed(forked(RUN.format(before=before), cache=cache, **environment))
+    return printed(python(RUN.format(before=before), cache=cache, **environment).stdout)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> S
 
 
 MAGNITUDES = {"quantity": "magnitude", "values": [6.0, 9.0]}
-EXPOSURES = {"quantity": "exposure", "values": [5.0, 50.0]}
+EXPOSURES = {"quantity": "exposure", "values": ["5 s", 50.0]}
 TWO = {"second_temperature_k": 4000.0, "second_area": 1.0}
 LINES = {"lines": {"H alpha": 0.1}}
 #: Two values of each quantity that a sweep may have, and what it changes in an observation of a G2V star and its flare.

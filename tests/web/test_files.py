@@ -39,6 +39,8 @@ check_commands = tool("check_commands")
 FILE = "uploaded file"
 DATA = Path(__file__).parents[1] / "data" / "web"
 FIELDS = tomllib.loads((DATA / "fields.toml").read_text(encoding="utf-8"))
+#: Expressions of uploads that are refused.
+UPLOADS = tomllib.loads((DATA / "uploads.toml").read_text(encoding="utf-8"))
 SHOWN = {tab: {*names.split()} for tab, names in tomllib.loads((DATA / "shown.toml").read_text()).items()}
 
 
@@ -101,9 +103,6 @@ async def test_hidden_fields_change_nothing_and_others_do(talk: Talk, words: dic
                 assert above or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
 
 
-# Tables are those of the command line
-
-
 #: For each table of a tab: verb with flags, and file.
 COMMANDS = {
     (tab, name): command.rsplit(" ", 1)
@@ -111,6 +110,11 @@ COMMANDS = {
     for name, command in tables.items()
 }
 PAIRS = b"200 1\n400 3\n700 1\n"
+
+
+def made(content: str) -> Any:
+    """Return the content of an upload by its expression."""
+    return eval(content, globals() | {"bz2": bz2, "lzma": lzma, "struct": struct})
 
 
 def star_file() -> bytes:
@@ -247,9 +251,6 @@ def test_bibtex_cites_what_the_citation_file_cites(server: Server) -> None:
         assert f"{{{value}}}" in text
 
 
-# Spectra of the visitor's
-
-
 #: Few draws: threshold and probability of both ways are of equal draws.
 FEW = {"realisations": "10000", "fap": "0.05"}
 DIRECT = (
@@ -356,26 +357,11 @@ async def test_neighbours_of_the_page_are_those_of_the_command_line(talk: Talk, 
     assert round(Study.read(tmp_path / "study.toml").star[0].near().stars[0].separation_arcsec, 3) == 10.8  # type: ignore[union-attr]
 
 
-# Uploads that cannot be used
-
-
-WIDE = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: w, datatype: float64}\n# meta:\n#   a0: &a0 [x, x, x, x, x, x, x]\n"
-ALIASES = "".join(f"#   a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}'])}]\n" for i in range(1, 9))
-BOMBS: dict[str, Callable[[], bytes]] = {
-    "bzip2 of zeros": lambda: bz2.compress(bytes(2**28)),
-    "gzip twice": lambda: gzip.compress(gzip.compress(bytes(2**28))),
-    "xz of zeros": lambda: lzma.compress(bytes(2**27), preset=0),
-    "YAML aliases": lambda: f"{WIDE}{ALIASES}w\n1\n".encode(),
-    "deep YAML": lambda: b"# %ECSV 1.0\n# ---\n# meta: " + b"[" * 200_000 + b"\n",
-    "XML entities": lambda: b'<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><VOTABLE>&a;</VOTABLE>',
-}
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("bomb", BOMBS)
+@pytest.mark.parametrize("bomb", UPLOADS["bombs"])
 async def test_decompression_bombs_are_refused_early(talk: Talk, server: Server, bomb: str) -> None:
     before, memory = server.spent(readers=True), server.memory()
-    lacks = (await talk.upload(BOMBS[bomb](), name="star.fits"))["lacks"]
+    lacks = (await talk.upload(made(UPLOADS["bombs"][bomb]), name="star.fits"))["lacks"]
     assert says_what_is_accepted(lacks)
     assert "\n" not in lacks
     # Processor time is the same on a busy machine: 3 s with the start of Python.
@@ -383,29 +369,16 @@ async def test_decompression_bombs_are_refused_early(talk: Talk, server: Server,
     assert server.memory() - memory < 100.0
 
 
-#: Uploads that are refused: field, content, words of the sentence.
-UNUSABLE: list[tuple[str, bytes, str]] = [
-    ("star", b"", ""),
-    ("star", b"200 1\n300 2 3\n", ""),
-    ("star", b"SIMPLE  = " * 300, ""),
-    ("star", b"200 1e-12\n300 <script>\n", "is not numeric"),
-    *[("own_unknown", content, "") for content in (
-        b"", b"200 1\n", b"200 1 2\n300 1 2\n", b"300 1\n200 1\n", b"\xff\xfe", b"a b\nc d\n", b"1 1\n2 nan\n",
-        rows_of(np.arange(1.0, 4002.0), np.ones(4001)),
-    )],
-]  # fmt: skip
-
-
 @pytest.mark.long
 async def test_unusable_spectra_leave_no_answer(talk: Talk) -> None:
     """Whatever was there before; a message on a file names the fields of this file, and what they advise works."""
     angstrom = rows_of(np.arange(1700.0, 10_001.0, 10), np.full(831, 1e-12))
     asked = {"star": "uploaded star", "own_unknown": "uploaded spectrum"}
-    for field, content, reported in UNUSABLE:
+    for field, content, reported in UPLOADS["spectra"]:
         good = star_file() if field == "star" else PAIRS
         assert (await talk.upload(good, field))["entered"] == asked[field]
         assert "answer" in await talk.answer(link(**{field: asked[field]}))
-        why = (await talk.upload(content, field, "my ![star](http://x/y.png).txt"))["lacks"]
+        why = (await talk.upload(made(content), field, "my ![star](http://x/y.png).txt"))["lacks"]
         assert reported in why
         assert says_what_is_accepted(why)
         faults = await talk.faults(link(**{field: asked[field]}))
@@ -433,9 +406,6 @@ async def test_unusable_spectra_leave_no_answer(talk: Talk) -> None:
             reported = await talk.answer(same, tab)
             assert "answer" not in reported
             assert "must be brighter than uploaded star without the flare" in reported["faults"]["flare_quiescent"]
-
-
-# Frames of the visitor's
 
 
 MAPPING = b'time = "minute"\ntime_unit = "min"\nflux = "rate"\nerror = "sd"\n'
@@ -495,19 +465,10 @@ async def test_quality_bits_are_chosen_as_on_the_command_line(talk: Talk) -> Non
     assert "NoSuchBit" in str(told["faults"]) + str(told.get("refused"))
 
 
-UNREADABLE: list[tuple[bytes, bytes | None, str]] = [
-    (light_curve(), None, "mapping"),
-    (b"minute,rate\n1,2\n", MAPPING, "sd"),
-    (light_curve(), b"time = [", "TOML"),
-    (b"\x89PNG\r\n", None, "text in UTF-8"),
-    (light_curve(), b'time = "minute"\nflux = "/etc/passwd"\n', "rate"),
-    (light_curve(), MAPPING + b'wavelength_file = "/etc/passwd"\n', "passwd"),
-]
-
-
-@pytest.mark.parametrize("number", long_but(range(len(UNREADABLE)), 0))
+@pytest.mark.parametrize("number", long_but(range(len(UPLOADS["frames"])), 0))
 async def test_unusable_frames_end_in_a_sentence(talk: Talk, number: int) -> None:
-    frames, mapping, words = UNREADABLE[number]
+    *contents, words = UPLOADS["frames"][number]
+    frames, mapping = map(made, contents)
     await given_frames(talk, frames, mapping)
     reported = await talk.answer(link(**OWN | {"mapping": FILE if mapping else ""}), "analyse")
     assert reported["faults"].keys() == {"frames"}, reported
@@ -531,11 +492,8 @@ async def test_names_of_files_are_plain(talk: Talk, tmp_path: Path) -> None:
     assert "at most 16 MiB" in (await talk.upload(bytes(2**24 + 1), "frames", "large"))["lacks"]
 
 
-# Standards of the visitor's
-
-
 #: The star of the file is half a magnitude fainter in it than it was observed.
-STUDY = (DATA / "standards.toml").read_text(encoding="utf-8")
+STUDY = (DATA / "standards.toml").read_bytes()
 STANDARDS = link(observations=FILE)
 
 
@@ -543,7 +501,7 @@ def standards() -> dict[str, bytes]:
     """Return the files of observations of a star and of no light, by name."""
     star = Source.from_library("B3V").at_magnitude(5.0)
     files = {
-        "standards.toml": STUDY.encode(), "frames.toml": (INPUTS / "raw.toml").read_bytes(),
+        "standards.toml": STUDY, "frames.toml": (INPUTS / "raw.toml").read_bytes(),
         "b3v.txt": rows_of(star.wavelength_nm, star.flux_flam),
     }  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
@@ -594,46 +552,10 @@ async def test_uploaded_standards_are_fitted_as_on_the_command_line(talk: Talk, 
     np.testing.assert_allclose(shipped.throughput(nm), Instrument.load(own).throughput(nm), rtol=1e-12)
 
 
-#: Changes of a sound archive's files, and the name that the refusal gives.
-BROKEN: list[tuple[dict[str, bytes | None], str]] = [
-    ({"dark.fits": None}, "dark.fits"),
-    ({"standards.toml": None}, ""),
-    ({"second.toml": STUDY.encode()}, ""),
-    ({"standards.toml": b"[calibrate\n"}, ""),
-    ({"other/frames.toml": b""}, ""),
-    ({"standards.toml": b"[calibrate]\nobservations = 3\n"}, ""),
-    ({"b3v.fits": b"nothing of the kind"}, "b3v.fits"),
-    ({"b3v.txt": b"nothing of the kind"}, "numbers"),
-    ({"standards.toml": f"[sky]\nnone = true\n{STUDY}".encode()}, "sky"),
-    ({"standards.toml": STUDY.encode() * 40}, ""),
-    ({"standards.toml": STUDY.encode() + b"\nodd = 1\n"}, "odd"),
-    ({"standards.toml": b"a = " + b"[" * 10_000}, ""),
-    ({"standards.toml": b".".join([b"a"] * 50_000) + b" = 1"}, "parts"),
-    ({"standards.toml": STUDY.encode() + b"#" * 2**18}, ""),
-]
-NUMBERS = zipped({"a.csv": b"1" * 999})
-ARCHIVES = {
-    "no archive": b"no archive",
-    "many files": zipped({f"{k}.txt": b"" for k in range(41)}),
-    "large file": zipped({"zeros": bytes(2**26 + 1)}),
-    "parent folder": zipped({"../b3v.fits": b"1"}),
-    "only a parent": zipped({"nights/..": b"1"}),
-    "absolute": zipped({"/etc/b3v.fits": b"1"}),
-    "drive": zipped({"C:\\b3v.fits": b"1"}),
-    "long name": zipped({"a" * 101: b"1"}),
-    "line break": zipped({"a\nb": b"1"}),
-    "cut off": NUMBERS[:-40],
-    "two names": NUMBERS.replace(b"a.csv", b"b.csv", 1),
-    "checksum": zipped({"a.csv": bytes(range(256))}, zipfile.ZIP_STORED).replace(b"\x10\x11", b"\x11\x10"),
-    "unbounded packing": zipped({"a.csv": b"1" * 999}, zipfile.ZIP_LZMA),
-    "too small sizes": zipped({"zeros": bytes(2**25)}).replace(struct.pack("<I", 2**25), struct.pack("<I", 9)),
-}
-
-
 async def test_missing_broken_and_unbounded_archives_are_refused(talk: Talk, server: Server) -> None:
     contents = standards()
-    for change, value in BROKEN:
-        chosen = {name: one for name, one in (contents | change).items() if one is not None}
+    for name, content, value in UPLOADS["archived"]:
+        chosen = {name: one for name, one in (contents | {name: made(content)}).items() if one is not None}
         told = await talk.upload(zipped(chosen), "observations", "standards.zip")
         if "lacks" not in told:
             # Frames and spectra are read with the answer.
@@ -643,8 +565,8 @@ async def test_missing_broken_and_unbounded_archives_are_refused(talk: Talk, ser
         assert value in told["lacks"], told
         assert says_what_is_accepted(told["lacks"])
     memory = server.memory()
-    for name, content in ARCHIVES.items():
-        told = await talk.upload(content, "observations", "standards.zip")
+    for name, content in UPLOADS["archives"].items():
+        told = await talk.upload(made(content), "observations", "standards.zip")
         assert says_what_is_accepted(told["lacks"]), name
         assert "its file again" in (await talk.faults(STANDARDS, "calibrate"))["observations"]
     assert server.memory() - memory < 30.0

@@ -41,9 +41,6 @@ def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     found.kill()
 
 
-# Who is let in
-
-
 async def test_foreign_hosts_and_origins_are_refused(talk: Talk, server: Server) -> None:
     port = server.port
     for foreign in ("evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", "127.0.0.1:1"):
@@ -126,9 +123,6 @@ def test_connections_are_bounded_and_half_open_or_unused_ones_end(strict: Server
         assert await unused.ended() == (4000, "not used for a long time")
 
     strict.visited(work)
-
-
-# What is asked
 
 
 NONSENSE = [
@@ -219,9 +213,6 @@ async def test_first_load_is_small_and_compressed(talk: Talk, server: Server, wo
             await AsyncHTTPClient().fetch(request)
     assert len(seen) > 20, "scripts import others"
     assert total / 1e6 < 0.6
-
-
-# What is computed, and for whom
 
 
 KINDS = ("detection", "map", "limit", "measure", "change", "periods", "completeness", "visible", "plan")
