@@ -20,7 +20,7 @@ from mauvecl.host.stars.bands import photons
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.study.analyses import fitted_models
+from mauvecl.study.questions import fitted_models
 
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances

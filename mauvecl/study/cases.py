@@ -378,10 +378,7 @@ class Case:
         return self.with_sections(observation=self.study.observation.model_copy(update=exposure))
 
     def flare_electrons(self, temperatures_k: NDArray[np.float64] | tuple[float, ...]) -> NDArray[np.float64]:
-        """Return the electrons that flares of unit amplitude add to an exposure, shape (n_temperature, n_pixel).
-
-        Raises InputError if some lines of the flare do not scale with its amplitude.
-        """
+        """Return the electrons that flares of unit amplitude add to an exposure, shape (n_temperature, n_pixel)."""
         from mauvecl.host.stars.flare import check_scales
 
         check_scales(self.study.flare.light())

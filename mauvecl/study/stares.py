@@ -40,8 +40,7 @@ def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Cours
     """Return the course of a process of exposures in a stare, what it changes, and its standard deviation and mean.
 
     The stare's quiescent level is measured in the stare itself, so the mean is a known factor on light or sky, or shift
-    of the temperature in deg C; the standard deviation is relative to it, or in deg C. Raises InputError unless the
-    prior is normal and cut far from its mean.
+    of the temperature in deg C; the standard deviation is relative to it, or in deg C.
     """
     if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
         raise InputError(
@@ -60,7 +59,7 @@ def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Cours
 
 
 def stare_of(study: Study, instrument: Instrument) -> Stare:
-    """Return the stare of a study. Raises InputError if the stare cannot draw one of the study's processes."""
+    """Return the stare of a study."""
     q = study.stare
     priors = [_stare_prior(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations]
     spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
@@ -168,10 +167,7 @@ def energy_of(
 
 
 def events_of(study: Study, source: Source) -> list[Event]:
-    """Return the flares of a study's star: `events`, or one per energy or amplitude, evenly spaced over the stare.
-
-    Raises InputError if an energy is given for a star of unknown distance and radius.
-    """
+    """Return the flares of a study's star: `events`, or one per energy or amplitude, evenly spaced over the stare."""
     choices: Sequence[EventChoice] = study.events
     if not choices:
         q = study.stare

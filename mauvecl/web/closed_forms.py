@@ -19,8 +19,8 @@ from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.exposure.expectation import entirely_saturated
 from mauvecl.schema.columns import chance_range, chance_text
 from mauvecl.schema.errors import InputError
-from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
+from mauvecl.study.questions import SPECTRUM
 from mauvecl.study.study import Study, set_key
 from mauvecl.web.fields import ASKED_UNDER, FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
 from mauvecl.web.uploads import VisitorFile, write_spectrum
@@ -70,7 +70,7 @@ class FieldValues:
     def case(self, folder: Path) -> Case:
         """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
-        The visitor's files are written to the folder for the study to find. Raises InputError for incompatible values.
+        The visitor's files are written to the folder for the study to find.
         """
         uploaded = self.uploaded
         # An uploaded spectrum is not read from its file at every change.
@@ -159,8 +159,7 @@ class ClosedForms:
     ) -> ClosedForms:
         """Answer a question; `folder` holds the visitor's files for the study, and `given` their contents.
 
-        Without the chance a star may be too bright for the chance of detection. Raises InputError for incompatible
-        values.
+        Without the chance a star may be too bright for the chance of detection.
         """
         case = question.case(folder)
         if question.as_bright_as_observed:

@@ -30,7 +30,7 @@ from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import built
-from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
+from mauvecl.study.questions import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN, read_points
 from mauvecl.web.sandboxed_reader import read_limited
 
@@ -72,8 +72,23 @@ class Observations:
 
     @classmethod
     def of(cls, name: str, content: bytes) -> Observations:
-        """Keep an archive of observations; raises InputError if it lacks a file."""
-        return cls(printable(name, MOST_NAME), content, observations_in(unpacked(content)))
+        """Keep an archive, which must hold one study with observations, and all files that it names."""
+        files = unpacked(content)
+        studies = [rows for file, text in files.items() if file.endswith(".toml") and (rows := _observed(file, text))]
+        if len(studies) != 1:
+            has = f"but holds {len(studies)}"
+            raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], {has}")
+        (rows,) = studies
+        if len(rows) > MOST_FILES:
+            raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
+        for row in rows:
+            for key in PATHS:
+                if isinstance(row.get(key), str):
+                    row[key] = file = PureWindowsPath(row[key]).name
+                    if file not in files:
+                        raise refusal(f"the archive needs {shortened(file)}, but holds {', '.join(sorted(files))}")
+        observations = built(CalibrateQuestion, {"observations": rows}, "the archive").observations
+        return cls(printable(name, MOST_NAME), content, observations)
 
     def written(self, folder: Path) -> list[dict[str, Any]]:
         """Write the files below a folder, once, and return the observations with their paths."""
@@ -83,11 +98,7 @@ class Observations:
 
 
 def unpacked(content: bytes) -> dict[str, bytes]:
-    """Return the files of a zip archive by their names without folders.
-
-    Hidden files, which some systems add, are left out. Raises InputError if the content is not a zip archive, is
-    damaged, encrypted or too large, or contains a name that is not a plain one in a folder of the archive.
-    """
+    """Return the files of a zip archive by their names without folders, but hidden ones, which some systems add."""
     remedy = "give a TOML file and the files that it names, in a sound zip archive without a password"
     with parsing("the archive", remedy), zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = dict[zipfile.ZipInfo, str]()
@@ -117,27 +128,7 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     return files
 
 
-def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation, ...]:
-    """Return the observations that a study among files lists, with the names of their files.
-
-    Raises InputError unless exactly one file is such a study, and the archive contains all files that it names.
-    """
-    studies = [rows for name, file in files.items() if name.endswith(".toml") and (rows := _observations(name, file))]
-    if len(studies) != 1:
-        raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}")
-    (rows,) = studies
-    if len(rows) > MOST_FILES:
-        raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
-    for row in rows:
-        for key in PATHS:
-            if isinstance(row.get(key), str):
-                row[key] = name = PureWindowsPath(row[key]).name
-                if name not in files:
-                    raise refusal(f"the archive needs {shortened(name)}, but holds {', '.join(sorted(files))}")
-    return built(CalibrateQuestion, {"observations": rows}, "the archive").observations
-
-
-def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
+def _observed(name: str, content: bytes) -> list[dict[str, Any]]:
     """Return the rows of a file's table of observations; empty if it has none."""
     if len(content) > MOST_TOML_BYTES:
         raise refusal(f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB")
@@ -184,11 +175,7 @@ MOST_PAIRS_BYTES = 2**18
 def _spectrum(
     kind: type[Spectrum], reader: Callable[..., Spectrum], called: str, name: str, content: bytes, **options: Any
 ) -> Spectrum:
-    """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content.
-
-    Raises InputError if it holds no usable spectrum. Called on a thread of its own; any other exception is reported to
-    the visitor too.
-    """
+    """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content."""
     spectrum = read_limited(kind, reader, {"upload": content}, **options)
     if spectrum.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
