@@ -227,11 +227,7 @@ class ClosedForms:
         """Messages for the visitor, the most severe first."""
         nuisances = self.study.nuisances
         cost = unknown_cost("this flare", self.quiet, self.flare, nuisances, self.study.run.comparison())
-        return [
-            *collect_messages([self.quiet, self.flare]),
-            *marginal_lines(nuisances),
-            *cost_lines([cost], nuisances),
-        ]
+        return [*collect_messages([self.quiet, self.flare]), *marginal_lines(nuisances), *cost_lines([cost], nuisances)]
 
     @property
     def words(self) -> str:

@@ -11,21 +11,7 @@ from mauvecl.answers.closed_forms import Cost, spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
 from mauvecl.answers.signal import simulate
-from mauvecl.charts.chart import (
-    SATURATED,
-    WAVELENGTH,
-    Area,
-    Axis,
-    Bars,
-    Chart,
-    ChartData,
-    Custom,
-    Dots,
-    Line,
-    Listed,
-    Own,
-    Rule,
-)
+from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Bars, Chart, ChartData, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.charts.detection import roc_columns
 from mauvecl.charts.limits import BUDGET, budget_series
 from mauvecl.detection.requests import statistic_label
@@ -34,7 +20,7 @@ from mauvecl.schema.columns import View, chance_text, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.observation import NuisanceChoice
 from mauvecl.web.closed_forms import Answers, short
-from mauvecl.web.figures import strips
+from mauvecl.web.figures import SATURATED, strips
 from mauvecl.web.tab import Tab
 
 if TYPE_CHECKING:

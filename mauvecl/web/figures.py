@@ -27,12 +27,13 @@ from mauvecl.charts.chart import (
     Targets,
 )
 from mauvecl.host.arrays import true_runs
+from mauvecl.host.stars.flare import EmissionLine
 
 #: Wavelengths that are shown, nm.
 SHOWN_NM = (195.0, 705.0)
-#: Spectral lines, nm in vacuum (NIST Atomic Spectra Database, version 5): Mg II h and k, Ca II H and K, H alpha. The
-#: Balmer jump is 4 / R_H, with Rydberg's constant for hydrogen.
-MARKS = {"Mg II": (279.63, 280.35), "Ca II": (393.48, 396.96), "Balmer jump": (364.7,), "H alpha": (656.46,)}
+#: Spectral lines, and the Balmer jump at 4 / R_H with Rydberg's constant for hydrogen, nm in vacuum.
+MARKS = {name: EmissionLine.named(name).wavelengths_nm for name in ("Mg II", "Ca II", "H alpha")}
+MARKS["Balmer jump"] = (364.7,)
 #: Marks that are hidden by default.
 MORE_MARKS = ("H alpha",)
 
@@ -245,6 +246,10 @@ class Canvas:
                     text_font="system-ui", text_font_size="10px", text_color=colour, text_alpha=0.8, **how,
                 )
             )  # fmt: skip
+
+
+#: Pixels that saturate, whose data `strips` returns.
+SATURATED = Strips("saturated", "own", show="if any", alpha=0.18, hatched=True)
 
 
 def strips(wavelength_nm: Any, flags: Any) -> tuple[Any, Any]:

@@ -271,7 +271,7 @@ MAPPED = {"time": "Time", "flux": "Flux", "error": "Error", "quality": "Quality"
 TIME_UNITS = ("s", "min", "h", "d", "jd", "mjd", "bjd", "btjd", "bkjd")
 #: Assets that visitors may try in place of a file of their own, by field, with what they are.
 EXAMPLES: Mapping[str, tuple[str, str]] = {
-    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)"),
+    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)")
 }
 
 
