@@ -282,15 +282,15 @@ class CommandWithHelp(TyperCommand):
 
 def text_of(text: str | None) -> str:
     """Return a help text with examples on separate lines of at most 80 columns, which can be pasted."""
+
+    def broken(command: re.Match[str]) -> str:
+        # Lines end in a backslash before a flag.
+        glued = re.sub(r" (?!-)", "\0", command[0])
+        lines = textwrap.wrap(glued, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+        return "\b\n" + " \\\n".join(lines).replace("\0", " ")
+
     text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
-    return re.sub(r"(?m)^mauvecl .*$", lambda match: "\b\n" + _broken(match[0]), text)
-
-
-def _broken(command: str) -> str:
-    """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
-    glued = re.sub(r" (?!-)", "\0", command)
-    lines = textwrap.wrap(glued, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
-    return " \\\n".join(lines).replace("\0", " ")
+    return re.sub(r"(?m)^mauvecl .*$", broken, text)
 
 
 #: Functions of the commands without a study.

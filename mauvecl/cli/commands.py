@@ -42,8 +42,11 @@ MOST_SPECTRA = 1e16
 MOST_REALISATIONS = 2**63 - 1
 
 
-def question_values(study: Study, *, detects: bool) -> None:
-    """Raise InputError for values that a later step would reject; a verb that `detects` needs flares and thresholds."""
+def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
+    """Raise InputError for values that a later step would reject, or that would keep a hundred cores busy for a year.
+
+    A verb that `detects` needs flares and thresholds; `insist` starts one that `draws` however long it takes.
+    """
     from mauvecl.detection.names import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, named_star
@@ -57,25 +60,16 @@ def question_values(study: Study, *, detects: bool) -> None:
             read_bytes(without_columns(star.file)[0], "spectrum file")
         known_band(star.band)
     instrument_path(study.observation.instrument, Path())
-    if not detects:
-        return
-    run = study.run
-    known_band(study.flare.band)
-    for name in run.statistics:
-        check_statistic(name)
-    check_fap(run.fap, run.realisations, run.tails)
-
-
-def question_time(study: Study, *, insist: bool) -> None:
-    """Raise InputError for a study that no device could finish; `insist` skips this check.
-
-    More realisations than the index can count always raise it.
-    """
-    count = study.run.realisations
-    if count > MOST_REALISATIONS:
+    run, count = study.run, study.run.realisations
+    if detects:
+        known_band(study.flare.band)
+        for name in run.statistics:
+            check_statistic(name)
+        check_fap(run.fap, count, run.tails)
+    if draws and count > MOST_REALISATIONS:
         raise InputError.of("realisations", count, f"at most {MOST_REALISATIONS}: the index has 63 bits")
     spectra = count * len(study.star) * study.sweep.size * (1 + len(study.flare.amplitudes))
-    if spectra >= MOST_SPECTRA and not insist:
+    if draws and spectra >= MOST_SPECTRA and not insist:
         raise InputError(
             f"realisations = {count:.3g} take {spectra / MOST_SPECTRA:.2g} years on a hundred cores; give fewer, "
             "or --insist to start anyway",
@@ -150,8 +144,15 @@ class Session(flags.Options):
         """Keep finished parts of the work in the output folder, and report interruptions."""
         from mauvecl.runs.checkpoint import Checkpoint
 
+        def kept() -> str:
+            if not checkpoint.kept:
+                return "nothing was written, and nothing is half written"
+            parts = f"{checkpoint.kept} part{'s' if checkpoint.kept > 1 else ''} of the work"
+            where = f"kept in {str(checkpoint.folder)!r}"
+            return f"{parts} {where}, and the same command with --resume continues from there"
+
         checkpoint = Checkpoint(self.folder, self.verb, self.study, resume=self.resume, restart=self.restart, held=True)
-        with report_interrupts(lambda: self._kept(checkpoint)), checkpoint:
+        with report_interrupts(kept), checkpoint:
             self.say(checkpoint.messages)
             yield checkpoint
             if checkpoint.damaged:
@@ -176,13 +177,6 @@ class Session(flags.Options):
     def metered(self, unit: str) -> Meter:
         """Return the progress in a unit, for a `with` block."""
         return Meter(quiet=self.quiet or self.as_json, unit=unit)
-
-    def _kept(self, checkpoint: Checkpoint) -> str:
-        parts_kept = checkpoint.kept
-        if not parts_kept:
-            return "nothing was written, and nothing is half written"
-        parts = f"{parts_kept} part{'s' if parts_kept > 1 else ''} of the work"
-        return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
@@ -221,7 +215,14 @@ class Session(flags.Options):
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""
-        with report_interrupts(self._written):
+
+        def written() -> str:
+            whole = ", ".join(path.name for path in self.files) or "nothing"
+            again = " with --resume" if self._checkpoint is not None and self._checkpoint.kept else ""
+            whole += f" written to {str(self.folder)!r}, each file whole"
+            return f"{whole}, and the same command{again} writes all of them"
+
+        with report_interrupts(written):
             self._leave_all(answer)
         # A note on sampled thresholds is left out where the answer has its own.
         told = of_kind(self.notes, "sampled") if of_kind(answer.messages, "sampled") else []
@@ -266,13 +267,6 @@ class Session(flags.Options):
         self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, **how))
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
-
-    def _written(self) -> str:
-        """Describe what an interruption leaves while files are written."""
-        whole = ", ".join(path.name for path in self.files) or "nothing"
-        parts_kept = None if self._checkpoint is None else self._checkpoint.kept
-        again = "the same command with --resume" if parts_kept else "the same command"
-        return f"{whole} written to {str(self.folder)!r}, each file whole, and {again} writes all of them"
 
     def print_json(self, content: dict[str, Any]) -> None:
         """Print the answer as JSON."""
@@ -396,9 +390,8 @@ class Command:
             values["given"] = given
         own = None if study_file is None else Study.read(study_file)
         study, messages = self.verb.study_of(given, keywords, own, "command line")
-        question_values(study, detects={"fap", "realisations"} <= keywords.keys())
-        if self.draws:
-            question_time(study, insist=how["insist"])
+        detects = {"fap", "realisations"} <= keywords.keys()
+        question_values(study, detects=detects, draws=self.draws, insist=how.get("insist", False))
         with Session(self.verb.name, study, draws=self.draws, notes=messages, **how) as session:
             self.run(session, **values)
 

@@ -457,16 +457,6 @@ class Keyword(NamedTuple):
         return self.flag.parameter
 
     @property
-    def section(self) -> str:
-        """Section of the key."""
-        return self.path.rpartition(".")[0]
-
-    @property
-    def key(self) -> str:
-        """Key without its section."""
-        return self.path.rpartition(".")[2]
-
-    @property
     def kind(self) -> Any:
         """Type of the value on the command line."""
         return self.flag.kind or plain_kind(self.field.annotation)
@@ -506,7 +496,7 @@ def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: 
     others = {"paper": "instrument", "ideal": "with_unknowns"}
     known = [*keywords, *(name for name, needed in others.items() if needed in keywords)]
     for name in given.keys() - known:
-        keys = [keyword for keyword, of in keywords.items() if of.key == name]
+        keys = [keyword for keyword, of in keywords.items() if of.path.rpartition(".")[2] == name]
         close = keys or get_close_matches(name, known, n=3) or known
         raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(close)}")
     values = {name: keyword.listed(given.get(name)) for name, keyword in keywords.items()}
@@ -536,12 +526,13 @@ def changes_of(
     changes: dict[str, dict[str, Any]] = {}
     flags: dict[str, str] = {}
     for name, keyword in keywords.items():
-        if given[name] is None or keyword.section == "star" or name == "nuisance":
+        section, _, key = keyword.path.rpartition(".")
+        if given[name] is None or section == "star" or name == "nuisance":
             continue
         other = flags.setdefault(keyword.path, name)
         if other != name:
             raise InputError(f"give either `{other}` or `{name}`: both set {keyword.path}", key=other)
-        changes.setdefault(keyword.section, {})[keyword.key] = keyword.value(given[name])
+        changes.setdefault(section, {})[key] = keyword.value(given[name])
     if spreads := given.get("nuisance"):
         # Texts such as dark=0.1, or with the name of a file, stray.txt=free.
         expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
@@ -563,8 +554,9 @@ def stars_of(
     if "star" not in given:
         return None
     names, magnitudes = given["star"], given["magnitude"]
-    described = [name for name, each in keywords.items() if each.section == "star" and given[name] is not None]
-    changed = {keywords[name].key: given[name] for name in described if name not in ("star", "magnitude")}
+    described = [name for name, of in keywords.items() if of.path.startswith("star.") and given[name] is not None]
+    others = [name for name in described if name not in ("star", "magnitude")]
+    changed = {keywords[name].path.removeprefix("star."): given[name] for name in others}
     of_files = [key for key in changed if key in FILE_KEYS]
     if not (names or magnitudes or changed):
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case, Loader, collect_messages
 from mauvecl.study.questions import SPECTRUM
 from mauvecl.study.study import Study, set_key
-from mauvecl.web.fields import ASKED_UNDER, FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
+from mauvecl.web.fields import ASKED_UNDER, FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, sentence, star_words
 from mauvecl.web.uploads import VisitorFile, write_spectrum
 
 if TYPE_CHECKING:
@@ -62,11 +63,6 @@ class FieldValues:
         """The star, as part of a sentence."""
         return "your own star" if self.uploaded is not None else star_words(self.star)
 
-    @property
-    def as_bright_as_observed(self) -> bool:
-        """True if the visitor's file gives the brightness of the flare, and not the amplitude."""
-        return "flare_file" in self.uploads and bool(self.values["as_observed"])
-
     def case(self, folder: Path) -> Case:
         """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
@@ -76,7 +72,7 @@ class FieldValues:
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
         case = Case(Study.build(self._data(folder), "page"), loader=loader)
-        return case.at_observed_brightness() if self.as_bright_as_observed else case
+        return case.at_observed_brightness() if case.study.flare.spectrum.as_observed else case
 
     def _data(self, folder: Path) -> dict[str, Any]:
         """Return the question as the data of a study, whose files are written to a folder."""
@@ -162,10 +158,9 @@ class ClosedForms:
         Without the chance a star may be too bright for the chance of detection.
         """
         case = question.case(folder)
-        if question.as_bright_as_observed:
-            values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
-            question = replace(question, values=values)
-        closed = cls(question, case, given or {})
+        # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.
+        values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
+        closed = cls(replace(question, values=values), case, given or {})
         if chance:
             _ = closed.odds
         return closed
@@ -340,15 +335,12 @@ def solved(closed: ClosedForms) -> str:
 
 def other_payloads(closed: ClosedForms) -> str:
     """Return a sentence on the chances with other payloads than the question's."""
-    clauses, payloads = [], FIELDS["instrument"].read
-    assert isinstance(payloads, Choice)
-    for name in payloads.options:
+    clauses = []
+    for name in FIELDS["instrument"].choices:
         if name != closed.question.instrument:
-            shown = []
+            shown = dict.fromkeys(UNKNOWN, "no number")
             for unknown in UNKNOWN:
-                try:
-                    shown.append(chance_text(closed.assuming(unknown, instrument=name).chance))
-                except InputError:
-                    shown.append("no number")
-            clauses.append(f"Chances with {name}: {' and '.join(shown)}.")
+                with contextlib.suppress(InputError):
+                    shown[unknown] = chance_text(closed.assuming(unknown, instrument=name).chance)
+            clauses.append(f"Chances with {name}: {' and '.join(shown.values())}.")
     return " ".join(clauses)

@@ -90,7 +90,7 @@ class Job:
     #: Whether realisations are drawn. Such a job is cancelled between two tiles, others anywhere by an exception.
     drawing: bool = True
     unit: str = ""  # of the progress; realisations of the pool if empty
-    _cancelled: threading.Event = field(default_factory=threading.Event)
+    _cancelled: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _thread: int | None = None
     _pool: Pool | None = None
@@ -106,9 +106,10 @@ class Job:
             with self._lock:
                 self._thread = threading.get_ident()
         try:
-            self._check()
             self._started = time.monotonic()
-            self._pool = Pool(LocalWorkers(make=_engine), progress=lambda done, total: self._check())
+            self._pool = Pool(LocalWorkers(make=_engine))
+            if self._cancelled:
+                raise Cancelled
             return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
         except Stopped as error:
             raise Cancelled from error
@@ -123,20 +124,13 @@ class Job:
 
     def _count(self, done: int, total: int) -> None:
         self._counted = done, total
-        if self.drawing:
-            self._check()
-
-    def _check(self) -> None:
-        if self._cancelled.is_set():
-            raise Cancelled
 
     def cancel(self) -> None:
         """Cancel between tiles, outside of draws, or before the start."""
         with self._lock:
-            again = self._cancelled.is_set()
-            self._cancelled.set()
-            if self._thread is not None and not again:
+            if self._thread is not None and not self._cancelled:
                 _set_pending(ctypes.c_ulong(self._thread), ctypes.py_object(Cancelled))
+            self._cancelled = True
         # Work that waits for fits in other threads is not interrupted: fits end between two of their draws.
         if self._pool is not None:
             self._pool.stop()
@@ -159,8 +153,6 @@ class Job:
 
 
 log = logging.getLogger(__name__)
-
-
 #: Seconds between two looks at a simulation.
 LOOK_S = 0.25
 #: Number of threads, besides the event loop, that make closed forms, pictures and files for all visitors.
@@ -384,8 +376,8 @@ class Visitor(WebSocketHandler):
 
     # Draws and simulations
 
-    def _ask_draw(self, asked: dict[str, Any]) -> None:
-        """Draw one exposure with the flare."""
+    async def _ask_draw(self, asked: dict[str, Any]) -> None:
+        """Draw one exposure with the flare, in place of one that is being drawn."""
         state, tab = self.state(asked["link"]), tab_of(asked)
         key = self._key(state, tab.reads), tab.chance
         closed: ClosedForms | None = RESULTS.get(self, "closed", key)
@@ -394,18 +386,14 @@ class Visitor(WebSocketHandler):
         if self._drawing is not None:
             self._drawing.cancel()
         how = closed.case.draw_options | {"seed": closed.study.run.seed}
-        self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
-
-        async def draw(job: Job) -> None:
-            try:
-                drawn = await asyncio.wrap_future(job.future)
-            except (Exception, asyncio.CancelledError):
-                # Another draw took its place, or a simulation reports what is wrong.
-                return
-            if RESULTS.get(self, "closed", key) is closed:
-                self.send(n=asked["n"], **shown(tab, closed, self.answers(state) | {"draw": drawn}))
-
-        self._begin(draw(self._drawing))
+        job = self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
+        try:
+            drawn = await asyncio.wrap_future(job.future)
+        except (Exception, asyncio.CancelledError):
+            # Another draw took its place, or a simulation reports what is wrong.
+            return
+        if RESULTS.get(self, "closed", key) is closed:
+            self.send(n=asked["n"], **shown(tab, closed, self.answers(state) | {"draw": drawn}))
 
     async def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
