@@ -46,11 +46,14 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     The answer varies the quantities `varied` in addition to those that the study sweeps.
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
+    orbit, limits = study.orbit.tle, study.orbit.limits
+    least = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
+    kept = ", ".join(f"{name} {value:g} deg" for name, value in least.items() if value is not None)
     words: dict[str, Callable[[], str]] = {
         "instrument": lambda: _instrument(study, swept, along_orbit="orbit" in uses and study.plan.along_orbit),
         "sky": lambda: "sky as swept" if "sky" in swept else study.sky.describe(),
         "flare": lambda: _flare(study, swept),
-        "orbit": lambda: _orbit(study),
+        "orbit": lambda: f"orbit of {orbit.name if orbit else 'embedded elements'}; least angles: {kept or 'none'}",
         "unknowns": lambda: _unknowns(study, uses),
         "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
         "seed": lambda: f"seed {study.run.seed}",
@@ -84,14 +87,6 @@ def _flare(study: Study, swept: set[str]) -> str:
     geometry = "added to the star" if f.geometry == "added" else replaces
     size = "as bright as observed" if f.spectrum.as_observed else f"amplitudes in the {f.band} band"
     return f"flares {temperature}, {geometry}, {size}"
-
-
-def _orbit(study: Study) -> str:
-    limits = study.orbit.limits
-    least = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
-    kept = [f"{name} {value:g} deg" for name, value in least.items() if value is not None]
-    source = "embedded elements" if study.orbit.tle is None else study.orbit.tle.name
-    return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"
 
 
 def _given_unknowns(study: Study) -> dict[Use, dict[str, str]]:
@@ -165,8 +160,6 @@ def full_label(name: str, at: Mapping[str, float | str]) -> str:
     return ", ".join([name, *parts])
 
 
-#: Sections of a study on which no expectation depends.
-WITHOUT_LIGHT = frozenset({"nuisances"})
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
 MAX_SOURCES = 16
 
@@ -246,11 +239,6 @@ class Case:
         """The instrument, with the study's changes and detector temperature."""
         return self.loader.instrument(self.study.observation)
 
-    @property
-    def sky(self) -> Sky:
-        """The sky behind the star."""
-        return self.loader.sky(self.study.sky)
-
     @cached_property
     def quiet(self) -> Expectation:
         """Expectation of the star without a flare."""
@@ -297,8 +285,8 @@ class Case:
         from mauvecl.host.exposure.expectation import expect
 
         o = self.study.observation
-        how: dict[str, Any] = {"exposure": o.exposure_s, "sky": self.sky, "order": o.order, "signal": o.signal}
-        how["neighbours"] = self.neighbours
+        how: dict[str, Any] = {"exposure": o.exposure_s, "order": o.order, "signal": o.signal}
+        how |= {"sky": self.loader.sky(self.study.sky), "neighbours": self.neighbours}
         return [expect(source, self.instrument, **how) for source in sources]
 
     def unknowns(self, quiet: Expectation | None = None) -> Nuisances | None:
@@ -354,7 +342,8 @@ class Case:
     def with_sections(self, **sections: Any) -> Self:
         """Return the case with other sections of the study, such as ``flare``."""
         case = replace(self, study=self.study.model_copy(update=sections))
-        if sections.keys() <= WITHOUT_LIGHT:
+        if sections.keys() == {"nuisances"}:
+            # No expectation depends on them.
             vars(case).update({name: vars(self)[name] for name in ("quiet", "flares") if name in vars(self)})
         return case
 

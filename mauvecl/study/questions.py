@@ -21,6 +21,7 @@ from mauvecl.schema.section import (
     check_needs,
     check_one,
     fields_of,
+    given_keys,
     read_axis,
     read_frames,
     read_ranges,
@@ -29,6 +30,7 @@ from mauvecl.schema.section import (
 )
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star, unit_of_file
+from mauvecl.study.stare import SIZES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -282,7 +284,7 @@ def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice
     """Raise InputError if a swept quantity has no effect on the stare."""
     fixed = {
         "exposure": True,
-        "amplitude": all(event.sizes for event in events) if events else bool(stare.energies_erg),
+        "amplitude": all(given_keys(event, SIZES) for event in events) if events else bool(stare.energies_erg),
         "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
     }
     for axis in sweep.axes:

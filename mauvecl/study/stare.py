@@ -23,7 +23,7 @@ from mauvecl.noise.unknowns import Changing, NuisanceName
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section, check_one, given_keys, read_ranges, setting
+from mauvecl.schema.section import Section, check_one, read_ranges, setting
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
@@ -127,11 +127,6 @@ class EventChoice(Section):
     def _check_values(self) -> None:
         check_one(self, "an event", *SIZES)
         check_one(self, "an event", "shape", "shape_file")
-
-    @property
-    def sizes(self) -> list[str]:
-        """Keys of the given sizes, at most one."""
-        return given_keys(self, SIZES)
 
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
+from scipy.interpolate import PchipInterpolator
 
-from mauvecl.answers.closed_forms import InterpolatedForm, cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.closed_forms import cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limit_search import LimitSearch
 from mauvecl.detection.distributions import Gaussian, Mixture
 from mauvecl.detection.requests import STATISTICS
@@ -28,6 +30,7 @@ from mauvecl.web.uploads import VisitorFile, write_spectrum
 
 if TYPE_CHECKING:
     from mauvecl.answers.detect import DetectAnswer
+    from mauvecl.detection.distributions import Form
     from mauvecl.detection.statistics import DetectionForms
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
@@ -132,6 +135,27 @@ class FieldValues:
         value = value if page_field.scale == 1.0 else value / page_field.scale
         # A single flare.
         return [value] if page_field.path[-1] == "amplitudes" else value
+
+
+class InterpolatedForm:
+    """Closed form that is exact at some points and interpolated in the probit between them."""
+
+    def __init__(self, form: Form) -> None:
+        self.mean, self.std = form.mean, form.std
+        at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
+        beyond = np.array([form.sf(value) for value in at])
+        # Probabilities that round to 0 or 1 have no finite probit.
+        inside = (beyond > 1e-12) & (beyond < 1 - 1e-12)
+        self._probit = PchipInterpolator(at[inside], special.ndtri(beyond[inside]), extrapolate=True)
+        self._inverse = PchipInterpolator(-special.ndtri(beyond[inside]), at[inside], extrapolate=True)
+
+    def sf(self, value: Float) -> Float:
+        """Return the probabilities of exceeding values."""
+        return np.asarray(special.ndtr(self._probit(value)))
+
+    def isf(self, probability: Float) -> Float:
+        """Return the values that are exceeded with given probabilities."""
+        return np.asarray(self._inverse(-special.ndtri(probability)))
 
 
 #: Answers that are simulated, by name: of one question.

@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from bokeh import models
 from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.plotting import figure
 
-from mauvecl.charts.chart import (
-    Area,
-    Axis,
-    Bars,
-    Chart,
-    Contours,
-    Custom,
-    Dots,
-    Line,
-    Listed,
-    Own,
-    Rule,
-    Series,
-    Strips,
-    Targets,
-)
+from mauvecl.charts.chart import Area, Bars, Contours, Custom, Dots, Line, Listed, Own, Rule, Strips, Targets
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars.flare import EmissionLine
+
+if TYPE_CHECKING:
+    from mauvecl.charts.chart import Axis, Chart, Series
 
 #: Wavelengths that are shown, nm.
 SHOWN_NM = (195.0, 705.0)

@@ -111,11 +111,10 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
             forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
     part, spread, cut, skewness = PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1])
-    off = (cut - np.exp(part)) / np.exp(spread)
-    shape = 4 / np.maximum(skewness, 1e-4) ** 2
-    gamma = special.gammaincc(shape, np.maximum(shape + np.sqrt(shape) * off, 0.0))
     # At low skewness the distribution is normal.
-    return *fine, np.where(skewness > 1e-4, gamma, special.ndtr(-off))
+    shape = 4 / np.maximum(skewness, 1e-4) ** 2
+    off = np.sqrt(shape) * (cut - np.exp(part)) / np.exp(spread)
+    return *fine, special.gammaincc(shape, np.maximum(shape + off, 0.0))
 
 
 @Chart(

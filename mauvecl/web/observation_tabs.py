@@ -11,6 +11,7 @@ from bokeh.palettes import interp_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
+from mauvecl.charts import spectra
 from mauvecl.charts.chart import (
     WAVELENGTH,
     Axis,
@@ -27,16 +28,6 @@ from mauvecl.charts.chart import (
     Targets,
 )
 from mauvecl.charts.light_curves import SCATTER, scatter_series
-from mauvecl.charts.spectra import (
-    BIN,
-    THROUGHPUT,
-    TRANSFER,
-    along_magnitude,
-    residual_series,
-    shown_name,
-    throughput_series,
-    transfer_series,
-)
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.columns import with_error
 from mauvecl.schema.errors import InputError
@@ -224,16 +215,16 @@ ANALYSE = Tab(
 NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
 
 
-@THROUGHPUT.data("calibrate", NO_OBSERVATIONS)
+@spectra.THROUGHPUT.data("calibrate", NO_OBSERVATIONS)
 def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the fitted throughput with its 95 % band, and the nominal one."""
     ratio = answer.throughput_table["ratio"]
     text = f"{answer.notice} It is {ratio.min():.3g} to {ratio.max():.3g} times the nominal one."
-    return ChartData(text, throughput_series(answer))
+    return ChartData(text, spectra.throughput_series(answer))
 
 
 @Chart(
-    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {BIN} pixels (sigma)"),
+    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {spectra.BIN} pixels (sigma)"),
     (
         Targets("residual", tips=("residual (sigma)",)),
         Rule("2 sigma", "threshold", "above", along="y", at=2.0),
@@ -242,20 +233,20 @@ def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 ).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
 def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the residuals of each star."""
-    rows = residual_series(answer)
+    rows = spectra.residual_series(answer)
     words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
     text = f"Root mean square, 1 for noise alone: {words}; p = {answer.throughput.p_value:.2g}."
     return ChartData(text, {"residual": rows})
 
 
-@TRANSFER.data("calibrate", NO_OBSERVATIONS)
+@spectra.TRANSFER.data("calibrate", NO_OBSERVATIONS)
 def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the measured over the fitted variance."""
     t = answer.transfer
     text = f"Gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise {t.read_noise_dn:.3g} DN."
     if "gain" in t.assumed:
         text = "The frames do not determine the gain: it is nominal."
-    return ChartData(text, transfer_series(answer)[0])
+    return ChartData(text, spectra.transfer_series(answer)[0])
 
 
 def read_observations(question: FieldValues) -> dict[str, Any]:
@@ -301,9 +292,9 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
         lines, words, own = [], list[str](), list[float]()
         for row in here:
             change, scale = row.change.name, units[row.change.unit]
-            lines += along_magnitude(answer, [change], scale)
+            lines += spectra.along_magnitude(answer, [change], scale)
             hidden = np.isinf(row.smallest.one)
-            words.append(f"{shown_name(change)} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
+            words.append(f"{spectra.shown_name(change)} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
             own += [] if hidden else [scale * row.smallest.one]
         text = (
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
@@ -355,9 +346,9 @@ def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
     x, y = (values.ravel() for values in np.meshgrid(r.periods_d, r.amplitudes))
     wide, high = (np.sqrt(points[1] / points[0]) for points in (r.periods_d, r.amplitudes))
     share = row.shares("value").ravel()
+    each = [(row.error, row.change) for row in answer.periods]
     errors = "; ".join(
-        f"{shown_name(row.change.name)} {row.error * (1 if row.change.unit else 100):.3g} {row.change.unit or '%'}"
-        for row in answer.periods
+        f"{spectra.shown_name(of.name)} {error * (1 if of.unit else 100):.3g} {of.unit or '%'}" for error, of in each
     )
     text = (
         f"{r.time_d.size} visits within {np.ptp(r.time_d):.0f} days recover {100 * np.mean(share):.0f} % of the "
