@@ -86,7 +86,7 @@ class FieldValues:
                 set_key(data, [*page_field.path], value, name)
         star = {"library": values["star"]}
         if self.uploaded is not None:
-            star = {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
+            star = {"file": write_spectrum(self.uploaded, folder, SPECTRA["star"])}
         data["star"] = [data["star"] | star]
         if values["sky"] == "none":
             data["sky"] = {"none": True}
@@ -126,12 +126,11 @@ class FieldValues:
         if value is None or not conditions.get(name, True):
             return None
         if page_field.kind == "upload":
-            written = value.written(folder)
-            return str(written) if isinstance(written, Path) else written
+            return value.written(folder)
         if page_field.kind == "file":
-            return str(write_spectrum(value, folder, SPECTRA[name]))
+            return write_spectrum(value, folder, SPECTRA[name])
         if page_field.kind == "table":
-            return str(VisitorFile("neighbours.csv", value.encode()).written(folder))
+            return VisitorFile("neighbours.csv", value.encode()).written(folder)
         value = value if page_field.scale == 1.0 else value / page_field.scale
         # A single flare.
         return [value] if page_field.path[-1] == "amplitudes" else value

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from mauvecl.answers.measure import MeasuredFlare
     from mauvecl.answers.measurements import ExpectedMeasurement
-    from mauvecl.detection.statistics import DetectionForms
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.web.closed_forms import ClosedForms
     from mauvecl.web.figures import Canvas
@@ -55,11 +54,6 @@ KEPT = Shelf(2**26)
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours", "uploaded"}
 
 
-def odds(closed: ClosedForms, magnitude: float, rises: Float) -> list[DetectionForms]:
-    """Return `ClosedForms.at` a magnitude."""
-    return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
-
-
 def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -> T:
     """Return a map or curve, which is kept for the values of the question, and `more`, on which it depends."""
     question = closed.question
@@ -76,7 +70,7 @@ def _curve(closed: ClosedForms) -> tuple[Float, Float]:
     """Return magnitudes and probabilities, with more points where these change."""
 
     def exact(magnitudes: Float) -> list[float]:
-        each = (odds(closed, magnitude, np.ones(1)) for magnitude in magnitudes)
+        each = (closed.at(light, np.ones(1)) for light in 10 ** (-0.4 * (magnitudes - closed.question.magnitude)))
         return [forms[0].probability if forms else 0.0 for forms in each]
 
     x = np.linspace(*MAGNITUDES, FIRST)
@@ -103,8 +97,8 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
     # A saturated star has no detectable flare.
     forms = np.zeros((4, rows, columns))
     forms[0], forms[2] = -30.0, 3.0
-    for i, magnitude in enumerate(x):
-        for j, outcome in enumerate(odds(closed, magnitude, 10**y / closed.question.amplitude_percent)):
+    for i, light in enumerate(10 ** (-0.4 * (x - closed.question.magnitude))):
+        for j, outcome in enumerate(closed.at(light, 10**y / closed.question.amplitude_percent)):
             unit, seen = outcome.null.std, outcome.flaring
             part = max((seen.mean - outcome.null.mean) / unit, 1e-9)
             cut = (outcome.threshold - outcome.null.mean) / unit

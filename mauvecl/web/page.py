@@ -194,30 +194,23 @@ class State:
             }
         self.entered = {name: field.first for name, field in ENTRIES.items()}
         self._values, self._invalid = dict(FIRST), dict[str, str]()
-        for name in ENTRIES:
+        for name, field in ENTRIES.items():
+            if name not in given:
+                continue
+            text = given[name]
+            self.entered[name] = text[: field.characters]
             try:
-                if name in given:
-                    self._values[name] = self._read(name, given[name])
+                if len(text) > field.characters:
+                    raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
+                self._values[name] = field.read(text)
+                if name in UPLOADS and text == UPLOADS[name].entered and name not in self.uploads:
+                    raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
             except InputError as error:
                 self._invalid[name] = sentence(error)
         for name, field in SEEN.items():
             if name in self._invalid:
                 self.entered[name] = field.first
                 self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
-
-    def _read(self, name: str, text: str) -> Any:
-        """Enter a text, and return its value."""
-        field = ENTRIES[name]
-        self.entered[name] = text[: field.characters]
-        if len(text) > field.characters:
-            raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
-        value = field.read(text)
-        if self._holds_file(name) and name not in self.uploads:
-            raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
-        return value
-
-    def _holds_file(self, name: str) -> bool:
-        return name in UPLOADS and self.entered[name] == UPLOADS[name].entered
 
     def faults_of(self, names: Collection[str]) -> dict[str, str]:
         """Return the error messages of some fields, with those of values that cannot be together."""
@@ -248,9 +241,8 @@ class State:
             all_of_them = "; ".join(f"{ENTRIES[name].label}: {why}" for name, why in faults.items())
             raise InputError(all_of_them, key=next(iter(faults)))
         values = {name: (self._values if name in names else FIRST)[name] for name in FIELDS}
-        return FieldValues(
-            values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
-        )
+        holding = [name for name in UPLOADS if name in names and self.entered[name] == UPLOADS[name].entered]
+        return FieldValues(values, {name: self.uploads[name] for name in holding})
 
 
 def known(state: State) -> dict[str, Any]:

@@ -332,7 +332,7 @@ def _words() -> dict[str, Any]:
         },
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
         "uploads": {
-            name: {"entered": upload.entered, "options": list(upload.options.values()), "most": upload.most}
+            name: {"entered": upload.entered, "options": upload.fields, "most": upload.most}
             for name, upload in UPLOADS.items()
         },
         "withFile": fields.WITH_FILE,

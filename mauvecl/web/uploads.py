@@ -13,7 +13,7 @@ import threading
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
@@ -146,7 +146,7 @@ def _observed(name: str, content: bytes) -> list[dict[str, Any]]:
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
-def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:
+def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> str:
     """Write an uploaded spectrum to a file of this name without loss, once per spectrum, and return its path."""
     from astropy.table import Table
 
@@ -159,7 +159,7 @@ def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Pa
         return {name: text.getvalue().encode()}
 
     content = name.encode() + source.wavelength_nm.tobytes() + source.flux_flam.tobytes()
-    return content_folder(folder, content, files) / name
+    return str(content_folder(folder, content, files) / name)
 
 
 #: Largest size of an upload, bytes, and largest number of points of its spectrum.
@@ -205,15 +205,10 @@ class VisitorFile:
         plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", re.split(r"[/\\]", name)[-1])[-80:].strip(".-")
         return cls(plain or "file", content)
 
-    def written(self, folder: Path) -> Path:
+    def written(self, folder: Path) -> str:
         """Write the file below a folder, once, and return its path."""
         content = self.name.encode() + self.content
-        return content_folder(folder, content, lambda: {self.name: self.content}) / self.name
-
-
-def _options(*names: str) -> dict[str, str]:
-    """Return fields that say how a file is read, by the reader's names, which are those of their keys."""
-    return {FIELDS[name].path[-1]: name for name in names}
+        return str(content_folder(folder, content, lambda: {self.name: self.content}) / self.name)
 
 
 @dataclass(frozen=True)
@@ -223,7 +218,12 @@ class Upload:
     reader: Callable[..., Any]  # of its name and content, and of options by name
     entered: str = UPLOADED_FILE  # text of the field that stands for the file
     most: int = MOST_UPLOADED  # largest number of bytes
-    options: Mapping[str, str] = field(default_factory=dict)  # see `_options`
+    fields: tuple[str, ...] = ()  # fields that say how it is read
+
+    @property
+    def options(self) -> dict[str, str]:
+        """Its `fields` by the reader's names, which are those of their keys."""
+        return {FIELDS[name].path[-1]: name for name in self.fields}
 
     def read(self, name: str, content: bytes, values: Mapping[str, Any]) -> Any:
         """Read an untrusted file with the values of fields; raises InputError if it is too large or unusable."""
@@ -238,18 +238,16 @@ class Upload:
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
     "star": Upload(
-        partial(_spectrum, Source, Source.read, UPLOADED),
-        UPLOADED,
-        options=_options("wavelength_unit", "flux_unit", "extend"),
+        partial(_spectrum, Source, Source.read, UPLOADED), UPLOADED, fields=("wavelength_unit", "flux_unit", "extend")
     ),
-    "flare_file": Upload(_flare, options=_options("flare_wavelength_unit", "flare_flux_unit", "continue_at_k")),
+    "flare_file": Upload(_flare, fields=("flare_wavelength_unit", "flare_flux_unit", "continue_at_k")),
     "flare_quiescent": Upload(
         partial(_spectrum, ReadSpectrum, read_spectrum, "uploaded star without the flare"),
-        options=_options("flare_wavelength_unit", "flare_flux_unit"),
+        fields=("flare_wavelength_unit", "flare_flux_unit"),
     ),
     "change_file": Upload(
         partial(_spectrum, Source, Source.read, "added spectrum"),
-        options=_options("change_wavelength_unit", "change_flux_unit", "change_extend"),
+        fields=("change_wavelength_unit", "change_flux_unit", "change_extend"),
     ),
     "own_unknown": Upload(
         lambda name, content: read_points(as_text(content, shortened(name)), shortened(name)),

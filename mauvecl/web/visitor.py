@@ -438,21 +438,21 @@ class Visitor(WebSocketHandler):
     def _content(self, asked: dict[str, Any], content: bytes) -> None:
         """Read an uploaded file in a thread; its field is empty until then."""
         field, name, state = asked["field"], str(asked.get("name")), self.state(asked["link"])
-        upload, names = UPLOADS[field], tuple(UPLOADS[field].options.values())
-        self._coming = None
+        self._coming, upload = None, UPLOADS[field]
         UPLOADED.drop(self, "upload", field)
-        options = tuple(state.entered[name] for name in names)
+        options = tuple(state.entered[name] for name in upload.fields)
         self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
 
         async def read() -> None:
             reply: dict[str, Any] = {"n": asked["n"], "field": field}
             try:
-                work = READER.submit(lambda: upload.read(name, content, state.question(names).values))
+                work = READER.submit(lambda: upload.read(name, content, state.question(upload.fields).values))
                 UPLOADED.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
                 reply["entered"] = upload.entered
             except InputError as error:
                 reply["lacks"] = sentence(error, upload.options)
-                reply["remedies"] = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
+                given = remedies(error, upload.options)
+                reply["remedies"] = [remedy for remedy in given if remedy[0] in upload.fields]
             except Exception as error:
                 log.exception("an upload failed")
                 reply["lacks"] = f"upload {shortened(name)} cannot be read ({type(error).__name__}); give another"
