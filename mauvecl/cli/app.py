@@ -244,9 +244,8 @@ def serve(
     try:
         serve(address, number, show=show, allow_origin=allow_origin or ())
     except OSError as error:
-        raise InputError(
-            f"port {port} of {shortened(address)} cannot be used ({error.strerror}); give another --port", key="port"
-        ) from error
+        fault = f"port {port} of {shortened(address)} cannot be used ({error.strerror}); give another --port"
+        raise InputError(fault, key="port") from error
 
 
 #: Heading of the flags that set no key of a study.

@@ -231,9 +231,8 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
         target.target(orbit.simbad) for target in plan.targets
     ]
     if not targets:
-        raise InputError(
-            "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets"
-        )
+        fault = "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`"
+        raise InputError(fault, key="orbit.targets")
     check_different([target.name for target in targets], "the target", "orbit.targets")
     return targets
 

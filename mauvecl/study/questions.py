@@ -174,10 +174,8 @@ class Axis(Section):
     def _check_values(self) -> None:
         spaced = (self.start, self.stop, self.steps)
         if (self.values is None) == (None in spaced) or (self.values is not None and spaced != (None, None, None)):
-            raise InputError(
-                f"the axis {self.quantity!r} needs either values or start, stop and steps, but has neither or both",
-                key="values",
-            )
+            fault = f"the axis {self.quantity!r} needs either values or start, stop and steps, but has neither or both"
+            raise InputError(fault, key="values")
         if self.values is not None and len(self.values) == 0:
             raise InputError(f"the axis {self.quantity!r} needs at least one value, but has none", key="values")
         quantity = QUANTITIES[self.quantity]
@@ -194,10 +192,8 @@ class Axis(Section):
         if not self.log:
             return tuple(start + (stop - start) * s for s in share)
         if min(start, stop) <= 0:
-            raise InputError(
-                f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from {start:g} to {stop:g}",
-                key="start",
-            )
+            fault = f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from {start:g} to {stop:g}"
+            raise InputError(fault, key="start")
         return tuple(start * (stop / start) ** s for s in share)
 
 
@@ -219,9 +215,8 @@ class MapQuestion(Section):
 
     def _check_values(self) -> None:
         if self.y.quantity == ("magnitude" if self.x is None else self.x.quantity):
-            raise InputError(
-                f"the axes of the map must be two different quantities, but both are {self.y.quantity!r}", key="y"
-            )
+            fault = f"the axes of the map must be two different quantities, but both are {self.y.quantity!r}"
+            raise InputError(fault, key="y")
 
     @property
     def axes(self) -> tuple[Axis, Axis]:
@@ -254,9 +249,8 @@ class Sweep(Section):
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
             counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())
-            raise InputError(
-                f"the sweep is a list, whose axes must have equally many values, but it has {counts}", key="axes"
-            )
+            fault = f"the sweep is a list, whose axes must have equally many values, but it has {counts}"
+            raise InputError(fault, key="axes")
         if self.size > MAX_CELLS:
             raise InputError(f"the sweep must have at most {MAX_CELLS} combinations, but has {self.size}", key="axes")
 

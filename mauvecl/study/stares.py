@@ -94,15 +94,12 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
 
     q, o = study.stare, study.orbit
     if q.gaps or q.orbit_gap_s or q.thermal is not None:
-        raise InputError(
-            "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit",
-            key="stare.along_orbit",
-        )
+        fault = "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit"
+        raise InputError(fault, key="stare.along_orbit")
     targets = targets_of(study.orbit, study.plan)
     if len(targets) != 1:
-        raise InputError(
-            f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}", key="stare.along_orbit"
-        )
+        fault = f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}"
+        raise InputError(fault, key="stare.along_orbit")
     return stare_along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes).stare
 
 
@@ -204,9 +201,8 @@ def _event(study: Study, choice: EventChoice) -> Event:
     half = study.stare.half_width_s if choice.half_width_s is None else choice.half_width_s
     kelvin = flare.temperature_k if choice.temperature_k is None else choice.temperature_k
     if cooling is not None and flare.spectrum.file is not None:
-        raise InputError(
-            "events.cooling needs a flare that has a temperature, but its spectrum is from a file", key="events.cooling"
-        )
+        fault = "events.cooling needs a flare that has a temperature, but its spectrum is from a file"
+        raise InputError(fault, key="events.cooling")
     temperature = kelvin if cooling is None else Cooling(kelvin, cooling.end_k, cooling.fold_s)
     amplitude = flare.amplitudes[0] if choice.amplitude is None else choice.amplitude
     if choice.peak is not None:

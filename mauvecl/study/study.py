@@ -562,9 +562,8 @@ def stars_of(
         return None
     if not (names or own):
         # Those of the default study are not meant.
-        raise InputError(
-            f"`{described[0]}` needs a star, such as `star='M3V'`; `mauvecl library` lists them", key="star"
-        )
+        fault = f"`{described[0]}` needs a star, such as `star='M3V'`; `mauvecl library` lists them"
+        raise InputError(fault, key="star")
     if names:
         # A name of an existing file is a file; other names are searched for in the library.
         each = [star for name in names for star in ([name] if is_there(name) else map(str.strip, name.split(",")))]
@@ -574,9 +573,8 @@ def stars_of(
     if magnitudes:
         if len(magnitudes) not in (1, len(data)):
             of = "one star" if len(data) == 1 else f"{len(data)} stars"
-            raise InputError(
-                f"there are {len(magnitudes)} magnitudes for {of}; give one for all or one each", key="magnitude"
-            )
+            fault = f"there are {len(magnitudes)} magnitudes for {of}; give one for all or one each"
+            raise InputError(fault, key="magnitude")
         for entry, value in zip(data, magnitudes * (len(data) if len(magnitudes) == 1 else 1), strict=True):
             entry["magnitude"] = value
     if of_files and not any("file" in entry for entry in data):

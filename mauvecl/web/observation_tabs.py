@@ -258,10 +258,8 @@ def read_observations(question: FieldValues) -> dict[str, Any]:
         mapping = files[str(row.mapping)] if row.mapping else None
         frames.append(read_frames_of(files[str(row.frames)], mapping))
         if sum(some.flux.size for some in frames) > MOST_VALUES:
-            raise InputError(
-                f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line",
-                key="observations",
-            )
+            fault = f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line"
+            raise InputError(fault, key="observations")
         if row.spectrum is None:
             stars.append(row.source())
             continue

@@ -79,9 +79,8 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
         except subprocess.TimeoutExpired as error:
             raise InputError(f"the upload takes more than {SECONDS} s to read; give {smaller}", key="upload") from error
         except OSError as error:
-            raise InputError(
-                f"the upload cannot be read now ({error.strerror}): try again later", key="upload"
-            ) from error
+            fault = f"the upload cannot be read now ({error.strerror}): try again later"
+            raise InputError(fault, key="upload") from error
     if done.returncode == 0:
         return done.stdout
     reasons = {

@@ -229,9 +229,8 @@ class Upload:
         """Read an untrusted file with the values of fields; raises InputError if it is too large or unusable."""
         if len(content) > self.most:
             size = len(content) / 2**20
-            raise InputError(
-                f"the upload has {size:.1f} MiB, but may have at most {self.most / 2**20:g} MiB", key="upload"
-            )
+            fault = f"the upload has {size:.1f} MiB, but may have at most {self.most / 2**20:g} MiB"
+            raise InputError(fault, key="upload")
         return self.reader(name, content, **{option: values[name] for option, name in self.options.items()})
 
 
