@@ -152,11 +152,8 @@ def amplitude_column(get: str | Callable[[Any], Any] = "amplitude", description:
 
 def full_label(name: str, at: Mapping[str, float | str]) -> str:
     """Return a star's label with the swept values that the label does not contain, for plots."""
-    parts = [
-        f"{quantity.replace('_', ' ')} {value:g}{QUANTITIES[quantity].suffix}"
-        for quantity, value in at.items()
-        if quantity not in ("magnitude", "star") and not isinstance(value, str)
-    ]
+    others = {key: value for key, value in at.items() if key not in ("magnitude", "star")}
+    parts = (f"{key.replace('_', ' ')} {value:g}{QUANTITIES[key].suffix}" for key, value in others.items())
     return ", ".join([name, *parts])
 
 
@@ -272,13 +269,8 @@ class Case:
     def flaring(self, amplitude: float, temperature_k: float | None = None) -> Source:
         """Return the star with a flare, by default of the study's temperature."""
         f = self.study.flare
-        return self.source.flaring(
-            amplitude,
-            spectrum=f.light(temperature_k),
-            band=f.band,
-            geometry=f.geometry,
-            photosphere_temperature=f.photosphere_temperature_k,
-        )
+        how: dict[str, Any] = {"geometry": f.geometry, "photosphere_temperature": f.photosphere_temperature_k}
+        return self.source.flaring(amplitude, spectrum=f.light(temperature_k), band=f.band, **how)
 
     def expect(self, *sources: Source) -> list[Expectation]:
         """Compute the expectations of sources for the instrument, sky and exposure."""
@@ -351,12 +343,10 @@ class Case:
         """Return the case with the amplitude at which the flare has the flux of its file at the telescope."""
         from mauvecl.host.stars.flare import added_light, check_scales
 
-        flare, star = self.study.flare, self.source
-        check_scales(flare.light())
-        photosphere_k = flare.photosphere_temperature_k
-        light = added_light(
-            star.wavelength_nm, star.flux_flam, flare.light(), flare.band, flare.geometry, photosphere_k
-        )
+        flare, star, observed = self.study.flare, self.source, self.study.flare.light()
+        check_scales(observed)
+        how = flare.band, flare.geometry, flare.photosphere_temperature_k
+        light = added_light(star.wavelength_nm, star.flux_flam, observed, *how)
         scaled = flare.spectrum.model_copy(update={"as_observed": False})
         return self.with_sections(flare=flare.model_copy(update={"amplitudes": (1.0 / light.hot,), "spectrum": scaled}))
 

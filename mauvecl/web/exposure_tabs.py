@@ -348,12 +348,11 @@ def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
 def table_of_costs(closed: ClosedForms, answers: Answers) -> View:
     """Return the S/N of the flare with each unknown, and the chance to detect it."""
     rows, fap = costs(closed), closed.question.fap
-    table = [
-        {"unknown": row.of, "plain": row.plain, "marginalised": row.marginal,
-         "detected": float(power(row.marginal, fap))}
-        for row in (Cost("nothing: everything is known", *[rows[0].known] * 3), *rows)
-    ]  # fmt: skip
-    return View("", [column for column in COLUMNS if column.name in table[0]], table)
+    known = Cost("nothing: everything is known", *[rows[0].known] * 3)
+    cells = [(row.of, row.plain, row.marginal, float(power(row.marginal, fap))) for row in (known, *rows)]
+    names = ("unknown", "plain", "marginalised", "detected")
+    table = [dict(zip(names, row, strict=True)) for row in cells]
+    return View("", [column for column in COLUMNS if column.name in names], table)
 
 
 UNKNOWN = Tab(

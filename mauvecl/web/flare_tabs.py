@@ -389,19 +389,15 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
         near = (since > -NEAR[0]) & (since < NEAR[1])
         for name, fit in (("true", stare_fit.joint.true), ("joint", stare_fit.joint.fitted)):
             series[name] = stare.middle_s[near], fit.kelvin[near]
-        measurement = stare_fit.joint.found
-        each = zip(
-            measurement.names[:4], measurement.units, measurement.estimates[0], measurement.errors[0], strict=False
-        )
+        found = stare_fit.joint.found
+        each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
         words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
     if stare_fit.unmeasured:
         words.append(stare_fit.unmeasured)
     elif stare_fit.drawn is not None:
-        bins = stare_fit.drawn
-        x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
-        ends = (
-            np.where(np.isfinite(end), end, kelvin) for end in (bins.found.low[-1, :, 0], bins.found.high[-1, :, 0])
-        )
+        bins, found = stare_fit.drawn, stare_fit.drawn.found
+        x, kelvin = (bins.start_s + bins.end_s) / 2, found.estimates[:, 0]
+        ends = (np.where(np.isfinite(end), end, kelvin) for end in (found.low[-1, :, 0], found.high[-1, :, 0]))
         series |= {"estimates": (x, kelvin), "bins": (x, *ends)}
         two = not isinstance(next(iter(expected(closed).values())).fitted, FlareModel)
         words.append(f"{x.size} bins of frames{', each fitted with one temperature' if two else ''}")
@@ -412,11 +408,11 @@ def measured(closed: ClosedForms, answers: Answers) -> View:
     """Return the errors of each quantity, and the counts of simulated fits."""
     each, fits = expected(closed), simulated(answers)
     first, *_ = each.values()
-    errors = zip(*(measurement.ahead.errors for measurement in each.values()), strict=True)
-    table = [
-        {"quantity": name, "unit": unit, "truth": truth, **dict(zip(each, own, strict=True))}
-        for name, unit, truth, own in zip(first.ahead.names, first.ahead.units, first.truth, errors, strict=True)
-    ]
+
+    rows = zip(
+        first.ahead.names, first.ahead.units, first.truth, *(of.ahead.errors for of in each.values()), strict=True
+    )
+    table = [dict(zip(("quantity", "unit", "truth", *each), row, strict=True)) for row in rows]
     if fits is not None:
         table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
     verb = {column.name: column for column in COLUMNS}
@@ -472,10 +468,8 @@ def shares(closed: ClosedForms, answers: Answers) -> ChartData:
     injected, parts = answers["completeness"].stars[0].injected, []
     for k, width in enumerate(injected.half_widths_s):
         x, share = 100 * injected.sizes, injected.completeness[k]
-        series |= {
-            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
-            f"line {k}": (x, share),
-        }
+        series[f"line {k}"] = x, share
+        series[f"band {k}"] = x, injected.completeness_low[k], injected.completeness_high[k]
         seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
         parts.append(f"{chance_text(seen)} of those of half-width {short(width)} s")
     peak = f"{closed.question.amplitude_percent:g} %"

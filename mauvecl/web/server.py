@@ -234,10 +234,8 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
         make(address, port, allow_origin)
         warm()
         if not local(address):
-            print(
-                f"mauvecl: the page has no users and no passwords: whoever reaches {netloc(address, port)} may use it.",
-                file=sys.stderr,
-            )
+            text = f"the page has no users and no passwords: whoever reaches {netloc(address, port)} may use it."
+            print(f"mauvecl: {text}", file=sys.stderr)
         url = f"http://{netloc(address, port)}/"
         print(f"mauvecl serves at {url}; Ctrl-C ends it.", flush=True)
         PeriodicCallback(close_unused, 1000 * SWEEP_S).start()
