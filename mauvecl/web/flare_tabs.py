@@ -408,10 +408,8 @@ def measured(closed: ClosedForms, answers: Answers) -> View:
     """Return the errors of each quantity, and the counts of simulated fits."""
     each, fits = expected(closed), simulated(answers)
     first, *_ = each.values()
-
-    rows = zip(
-        first.ahead.names, first.ahead.units, first.truth, *(of.ahead.errors for of in each.values()), strict=True
-    )
+    errors = [measurement.ahead.errors for measurement in each.values()]
+    rows = zip(first.ahead.names, first.ahead.units, first.truth, *errors, strict=True)
     table = [dict(zip(("quantity", "unit", "truth", *each), row, strict=True)) for row in rows]
     if fits is not None:
         table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
