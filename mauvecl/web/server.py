@@ -257,8 +257,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
         logger.handlers, logger.propagate = [], True
         logger.setLevel(logging.WARNING)
     # Threads share two pools of glibc's malloc, since each pool keeps what its threads have freed; -8 is M_ARENA_MAX.
-    if (change := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        change(-8, 2)
+    getattr(ctypes.CDLL(None), "mallopt", lambda *_: None)(-8, 2)
     asyncio.run(run())
 
 

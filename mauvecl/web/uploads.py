@@ -11,7 +11,7 @@ import sys
 import tempfile
 import threading
 import zipfile
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -343,18 +343,14 @@ RESULTS, UPLOAD_SHELF = Shelf(MOST_RESULTS), Shelf(MOST_UPLOADS)
 
 def size_of(value: object) -> int:
     """Return the approximate size of a value and of what it refers to, bytes."""
-    seen: set[int] = set()
-    waiting: list[Any] = [value]
-    size = 0
+    # The oldest first, so that the top is counted before the details.
+    seen, waiting, size = set[int](), deque[Any]([value]), 0
     while waiting and len(seen) < MOST_OBJECTS:
-        # The oldest first, so that the top is counted before the details.
-        level, waiting = waiting, []
-        for item in level:
-            if id(item) in seen or isinstance(item, PROGRAM):
-                continue
+        item = waiting.popleft()
+        if id(item) not in seen and not isinstance(item, PROGRAM):
             seen.add(id(item))
             size += sys.getsizeof(item, 0)
             waiting += gc.get_referents(item)
-            if isinstance(item, np.ndarray) and item.base is not None:
+            if isinstance(item, np.ndarray):
                 waiting.append(item.base)
     return size

@@ -76,9 +76,7 @@ def _engine(device: str | None, progress: Callable[[int, int], None]) -> Engine:
 def release_memory() -> None:
     """Free what simulations leave: arrays in reference cycles, which Python finds late, and pages that malloc keeps."""
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+    getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: pad)(0)
 
 
 @dataclass(eq=False)
