@@ -95,10 +95,8 @@ class FieldValues:
         if "change_file" in self.uploads and SPECTRUM not in values["changes"]:
             data["change"]["of"] = (*values["changes"], SPECTRUM)
         points = self.uploads.get("own_unknown", values["own_unknown"])
-        data["nuisances"] = {
-            "usual": values["unknown"] == REALISTIC,
-            "own": {"own": {"points": points}} if points else {},
-        }
+        own = {"own": {"points": points}} if points else {}
+        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": own}
         number, tails = values["realisations"]
         statistics = list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]]))
         data["run"] |= {"realisations": number, "tails": tails, "statistics": statistics}
@@ -250,12 +248,10 @@ class ClosedForms:
     @property
     def words(self) -> str:
         """Question in words, as part of a sentence."""
-        q, x = self.question, self.quiet
+        q, x, light = self.question, self.quiet, self.study.flare.light().describe()
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
-        return (
-            f"a {q.amplitude_percent:g} % flare ({self.study.flare.light().describe()}) on {q.star_in_words} of "
-            f"{q.band} = {q.magnitude:g}, in {x.exposure_s:g} s ({frames})"
-        )
+        star = f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
+        return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
     def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:
         """Return the closed forms for factors on the light and on the amplitude, of shape (n_rise,).
