@@ -12,22 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from pydantic import Field, model_validator
 
 from mauvecl.host.stars.library import ALIASES
+from mauvecl.schema import section
 from mauvecl.schema.errors import InputError, shown
 from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, first
 from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Probability, Wavelength
-from mauvecl.schema.section import (
-    Section,
-    check_different,
-    check_needs,
-    check_one,
-    fields_of,
-    given_keys,
-    read_axis,
-    read_frames,
-    read_ranges,
-    read_words,
-    setting,
-)
+from mauvecl.schema.section import Section, read_axis, setting
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star, unit_of_file
 from mauvecl.study.stare import SIZES
@@ -42,8 +31,8 @@ if TYPE_CHECKING:
 #: Quantities that vary, by name, with the unit and range of their fields.
 QUANTITIES = {
     one.name: replace(one, path=path, unit=(first(field, Unit) or Unit("")).name, range=first(field, Range))
-    for name, section in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
-    for path, field in fields_of(section, (name,))
+    for name, kind in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
+    for path, field in section.fields_of(kind, (name,))
     if (one := first(field, Quantity)) is not None
 }
 if TYPE_CHECKING:
@@ -74,7 +63,7 @@ class CampaignQuestion(Section):
     )
 
     def _check_values(self) -> None:
-        check_needs(self, "the campaign", ("step", "fap", "alarms"), "frames")
+        section.check_needs(self, "the campaign", ("step", "fap", "alarms"), "frames")
 
 
 class SignalQuestion(Section):
@@ -96,7 +85,7 @@ class BulkQuestion(Section):
     ] = setting(
         "stack",
         "Stored frames",
-        flag=Flag("--frames", kind=str, read=read_frames),
+        flag=Flag("--frames", kind=str, read=section.read_frames),
         choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9",
     )
     components: bool = setting(False, "Also store the mean of star, sky and noise of each pixel", flag="--components")
@@ -245,7 +234,7 @@ class Sweep(Section):
     )
 
     def _check_values(self) -> None:
-        check_different([axis.quantity for axis in self.axes], "the sweep's quantity", "axes")
+        section.check_different([axis.quantity for axis in self.axes], "the sweep's quantity", "axes")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
             counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())
@@ -278,7 +267,7 @@ def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice
     """Raise InputError if a swept quantity has no effect on the stare."""
     fixed = {
         "exposure": True,
-        "amplitude": all(given_keys(event, SIZES) for event in events) if events else bool(stare.energies_erg),
+        "amplitude": all(section.given_keys(event, SIZES) for event in events) if events else bool(stare.energies_erg),
         "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
     }
     for axis in sweep.axes:
@@ -302,7 +291,7 @@ class CalibrationObservation(Section):
     temperature_c: DetectorTemperature | None = setting(None, "Detector temperature, where the frames do not state it")
 
     def _check_values(self) -> None:
-        check_one(self, "an observation", "spectrum", "library")
+        section.check_one(self, "an observation", "spectrum", "library")
         if self.magnitude is not None and self.library is None and self.spectrum is None:
             raise InputError("a magnitude needs the library or spectrum of the star as well", key="magnitude")
 
@@ -372,7 +361,7 @@ class ChangeQuestion(Section):
         DEFAULT_CHANGES,
         "Change",
         min_length=1,
-        flag=Flag("--change", kind=list[str], read=read_words),
+        flag=Flag("--change", kind=list[str], read=section.read_words),
         choices="a line such as Mg II, balmer jump, colour, a band in nm such as 200-320, or spectrum",
         label="Changes",
         hint="What changes, with commas: lines such as Mg II or 656.5 (nm), balmer jump, colour, and bands such as "
@@ -461,7 +450,7 @@ class ChangeQuestion(Section):
         if self.file is None:
             if SPECTRUM in self.of:
                 raise InputError("the change 'spectrum' needs a file: give `change.file`", key="change.file")
-            check_needs(self, "the change", ("wavelength_unit", "flux_unit", "extend"), "file")
+            section.check_needs(self, "the change", ("wavelength_unit", "flux_unit", "extend"), "file")
         elif SPECTRUM not in self.of:
             raise InputError("change.file needs the change 'spectrum' in change.of as well", key="change.file")
 
@@ -517,10 +506,10 @@ class MeasureQuestion(Section):
     """Models that are fitted to simulated exposures."""
 
     models: tuple[FittedModel, ...] = setting(
-        (), "Fitted model", flag=Flag("--model", read=read_words), usual="the flare's, and simpler ones"
+        (), "Fitted model", flag=Flag("--model", read=section.read_words), usual="the flare's, and simpler ones"
     )
     lines: tuple[str, ...] = setting(
-        (), "Line that the model 'lines' fits", flag=Flag("--fit-line", read=read_words), usual="the flare's"
+        (), "Line that the model 'lines' fits", flag=Flag("--fit-line", read=section.read_words), usual="the flare's"
     )
     fits: Annotated[int, Range(1, 1_000_000)] = setting(1000, "Simulated exposures of each flare", flag="--fits")
     bands_nm: tuple[tuple[Wavelength, Wavelength], ...] = setting(
@@ -532,7 +521,7 @@ class MeasureQuestion(Section):
         flag=Flag(
             "--skip",
             kind=list[str],
-            read=partial(read_ranges, expected="two wavelengths in nm, such as 322:368", unit="nm"),
+            read=partial(section.read_ranges, expected="two wavelengths in nm, such as 322:368", unit="nm"),
         ),
         label="Leave out wavelengths",
         hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",

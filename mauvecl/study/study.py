@@ -27,22 +27,10 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found, number
 from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
+from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
 from mauvecl.study.plan import OrbitQuestion, PlanQuestion, PlanTarget
-from mauvecl.study.questions import (
-    QUANTITIES,
-    Axis,
-    BulkQuestion,
-    CalibrateQuestion,
-    CampaignQuestion,
-    ChangeQuestion,
-    DataChoice,
-    LimitQuestion,
-    MapQuestion,
-    MeasureQuestion,
-    SignalQuestion,
-    Sweep,
-)
+from mauvecl.study.questions import QUANTITIES, Axis, Sweep
 from mauvecl.study.star import FILE_KEYS, Flare, Star
 from mauvecl.study.stare import EventChoice, InjectionQuestion, SearchChoice, StareQuestion
 
@@ -190,11 +178,11 @@ class Study(Section):
     processes: Processes = NONE
     nuisances: NuisanceChoice = NuisanceChoice()
     run: Run = Run()
-    campaign: CampaignQuestion = CampaignQuestion()
-    signal: SignalQuestion = SignalQuestion()
-    limit: LimitQuestion = LimitQuestion()
-    map: MapQuestion = MapQuestion()
-    bulk: BulkQuestion = BulkQuestion()
+    campaign: questions.CampaignQuestion = questions.CampaignQuestion()
+    signal: questions.SignalQuestion = questions.SignalQuestion()
+    limit: questions.LimitQuestion = questions.LimitQuestion()
+    map: questions.MapQuestion = questions.MapQuestion()
+    bulk: questions.BulkQuestion = questions.BulkQuestion()
     sweep: Sweep = Sweep()
     unknowns: Unknowns = Unknowns()
     stare: StareQuestion = StareQuestion()
@@ -203,10 +191,10 @@ class Study(Section):
     injections: InjectionQuestion = InjectionQuestion()
     orbit: OrbitQuestion = OrbitQuestion()
     plan: PlanQuestion = PlanQuestion()
-    measure: MeasureQuestion = MeasureQuestion()
-    data: DataChoice = DataChoice()
-    calibrate: CalibrateQuestion = CalibrateQuestion()
-    change: ChangeQuestion = ChangeQuestion()
+    measure: questions.MeasureQuestion = questions.MeasureQuestion()
+    data: questions.DataChoice = questions.DataChoice()
+    calibrate: questions.CalibrateQuestion = questions.CalibrateQuestion()
+    change: questions.ChangeQuestion = questions.ChangeQuestion()
 
     def _check_values(self) -> None:
         own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
