@@ -11,22 +11,8 @@ from bokeh.palettes import interp_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
-from mauvecl.charts import spectra
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Axis,
-    Chart,
-    ChartData,
-    Contours,
-    Custom,
-    Dots,
-    Line,
-    Listed,
-    Own,
-    Rule,
-    Strips,
-    Targets,
-)
+from mauvecl.charts import chart, spectra
+from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, ChartData, Custom, Dots, Line, Own, Rule, Strips, Targets
 from mauvecl.charts.light_curves import SCATTER, scatter_series
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.columns import with_error
@@ -128,9 +114,9 @@ def _image(canvas: Canvas, source: ColumnDataSource) -> None:
     "dynamic", "Dynamic spectrum", Axis("time from the first frame (min)"), Axis("wavelength (nm)"),
     (
         Custom("dynamic", columns=("image", "x", "y", "dw", "dh"), draw=_image),
-        Contours("events", "star", "marks", show="if any", width=5),
-        Listed("brighter than the median", RED, form="bar"),
-        Listed("fainter", BLUE, form="bar"),
+        chart.Contours("events", "star", "marks", show="if any", width=5),
+        chart.Listed("brighter than the median", RED, form="bar"),
+        chart.Listed("fainter", BLUE, form="bar"),
     ),
 ).data()  # fmt: skip
 def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
@@ -301,8 +287,8 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
         return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
 
     axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
-    chart = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
-    return chart.data("change", "Change computes which differences between visits are detected.")(along)
+    changes = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
+    return changes.data("change", "Change computes which differences between visits are detected.")(along)
 
 
 CHANGE = Tab(
