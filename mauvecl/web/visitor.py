@@ -37,8 +37,7 @@ from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import SIMULATIONS, TABS, State, card, known, reads_of
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, as_file, commands_and_programs, simulate, study_file
-from mauvecl.web.uploads import RESULTS, UPLOADS
-from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
+from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
 
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
@@ -215,7 +214,7 @@ class Visitor(WebSocketHandler):
             if job is not None:
                 job.cancel()
         self._home.cleanup()
-        for shelf in (RESULTS, UPLOADED):
+        for shelf in (RESULTS, UPLOAD_SHELF):
             shelf.drop(self)
         Visitor.has_left = True
 
@@ -264,7 +263,7 @@ class Visitor(WebSocketHandler):
 
     def state(self, link: str) -> State:
         """Enter the values of a link."""
-        return State(link, UPLOADED.of(self, "upload"))
+        return State(link, UPLOAD_SHELF.of(self, "upload"))
 
     def _ask_answer(self, asked: dict[str, Any]) -> None:
         """Send the answer and a tab's pictures; a later question replaces a waiting one."""
@@ -437,7 +436,7 @@ class Visitor(WebSocketHandler):
         """Read an uploaded file in a thread; its field is empty until then."""
         field, name, state = asked["field"], str(asked.get("name")), self.state(asked["link"])
         self._coming, upload = None, UPLOADS[field]
-        UPLOADED.drop(self, "upload", field)
+        UPLOAD_SHELF.drop(self, "upload", field)
         options = tuple(state.entered[name] for name in upload.fields)
         self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
 
@@ -445,7 +444,7 @@ class Visitor(WebSocketHandler):
             reply: dict[str, Any] = {"n": asked["n"], "field": field}
             try:
                 work = READER.submit(lambda: upload.read(name, content, state.question(upload.fields).values))
-                UPLOADED.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
+                UPLOAD_SHELF.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
                 reply["entered"] = upload.entered
             except InputError as error:
                 reply["lacks"] = sentence(error, upload.options)
@@ -460,7 +459,7 @@ class Visitor(WebSocketHandler):
 
     async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
-        file, names = UPLOADED.get(self, "upload", "frames"), tuple[str, ...]()
+        file, names = UPLOAD_SHELF.get(self, "upload", "frames"), tuple[str, ...]()
         if file is not None:
             work = READER.submit(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content})
             names = (await asyncio.wrap_future(work)).names
