@@ -28,7 +28,6 @@ from mauvecl.web.uploads import Shelf
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
-    from mauvecl.answers.measure import MeasuredFlare
     from mauvecl.answers.measurements import ExpectedMeasurement
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.web.closed_forms import ClosedForms
@@ -279,11 +278,6 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
     return measurements
 
 
-def simulated(answers: Answers) -> MeasuredFlare | None:
-    """Return the simulated fits of the flare's own model, if there are any."""
-    return answers["measure"].flares[-1] if "measure" in answers else None
-
-
 @Chart(
     "errors", "Error of the temperature for smaller and larger flares", Axis("flare amplitude (%)", log=True),
     Axis("error of the temperature (%)", log=True, limits=(0.1, 1000)),
@@ -333,9 +327,9 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
     true, without_noise = all_known.truth[:2], all_known.perfect.estimates[0, :2]
     best = true if np.isfinite(true).all() else without_noise
     series: dict[str, Any] = {"own": ([best[0]], [100 * best[1]])}
-    fits = simulated(answers)
-    if fits is not None:
-        some = fits.found.estimates[:MOST_DOTS]
+    if "measure" in answers:
+        # The last fits are those of the flare's own model.
+        some = answers["measure"].flares[-1].found.estimates[:MOST_DOTS]
         series["fits"] = some[:, 0], 100 * some[:, 1]
     one_temperature = isinstance(all_known.fitted, FlareModel)
     for name, measurement in (("known", all_known), ("free", free)):
@@ -406,17 +400,18 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
 
 def measured(closed: ClosedForms, answers: Answers) -> View:
     """Return the errors of each quantity, and the counts of simulated fits."""
-    each, fits = expected(closed), simulated(answers)
+    each = expected(closed)
     first, *_ = each.values()
     errors = [measurement.ahead.errors for measurement in each.values()]
     rows = zip(first.ahead.names, first.ahead.units, first.truth, *errors, strict=True)
     table = [dict(zip(("quantity", "unit", "truth", *each), row, strict=True)) for row in rows]
-    if fits is not None:
-        table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
     verb = {column.name: column for column in COLUMNS}
     of_error = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
     columns = [verb["quantity"], verb["unit"], verb["truth"], *of_error]
-    columns += [] if fits is None else [verb["scatter"], verb["coverage_95"]]
+    if "measure" in answers:
+        counts = records(answers["measure"].flares[-1].rows())
+        table = [row | counted for row, counted in zip(table, counts, strict=True)]
+        columns += [verb["scatter"], verb["coverage_95"]]
     return View("", columns, table)
 
 
