@@ -57,7 +57,9 @@ def devices(
 
 def selftest(
     device: flags.DeviceFlag = None,
-    output: Annotated[Path | None, flags.output_option("nowhere")] = None,
+    output: Annotated[
+        Path | None, flags.option("--output", "-o", metavar="PATH", text="Where to write [nowhere].")
+    ] = None,
     as_json: flags.JsonFlag = False,
     quiet: flags.QuietFlag = False,
 ) -> None:
@@ -248,10 +250,6 @@ def serve(
         raise InputError(fault, key="port") from error
 
 
-#: Heading of the flags that set no key of a study.
-OUTPUT = "Output and devices"
-
-
 class CommandWithHelp(TyperCommand):
     """Command whose `--help` shows its common flags, and `--help-all` all of them in groups."""
 
@@ -267,7 +265,8 @@ class CommandWithHelp(TyperCommand):
             if one.param_type_name == "argument":
                 heading = "Arguments"
             elif shows_all:
-                heading = getattr(one, "rich_help_panel", None) or OUTPUT
+                # Flags that set no key of a study have no panel.
+                heading = getattr(one, "rich_help_panel", None) or "Output and devices"
             elif self.common:
                 heading = "Common flags"
             else:

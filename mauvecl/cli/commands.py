@@ -396,7 +396,8 @@ class Command:
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
         """Return the options of the session, with their defaults."""
-        output = flags.output_option(self.writes or f"the folder mauvecl-{self.verb.name}")
+        usual = self.writes or f"the folder mauvecl-{self.verb.name}"
+        output = flags.option("--output", "-o", metavar="PATH", text=f"Where to write [{usual}].")
         workers = flags.WORKERS if self.draws else flags.RESUMING if self.resumes else ()
         names = ("as_json", "quiet", "wide", *(["pictures"] if self.pictures else []), *workers)
         kinds = get_type_hints(flags.Options, include_extras=True)

@@ -23,11 +23,6 @@ def option(*names: str, text: str, **how: Any) -> Any:
     return typer.Option(*names, help=text, show_default=False, **how)
 
 
-def output_option(usual: str) -> Any:
-    """Return the option of the output, with its default."""
-    return option("--output", "-o", metavar="PATH", text=f"Where to write [{usual}].")
-
-
 DeviceFlag = Annotated[str | None, option(metavar="TEXT", text="OpenCL device: number or part of its name [PoCL].")]
 JsonFlag = Annotated[bool, option("--json", text="Print JSON and nothing else.")]
 QuietFlag = Annotated[bool, option("--quiet", "-q", text="Print no progress and no file names.")]
