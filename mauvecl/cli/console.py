@@ -243,23 +243,17 @@ class Meter:
         self._last, self._total = done, total
         if self._quiet or now - self._started < PATIENCE_S or now - self._shown < (0.2 if self._changes else 10.0):
             return
-        self._shown = now
-        line = self._line(done, total)
-        print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
-
-    def _line(self, done: int, total: int) -> str:
-        """Return the progress in words; the remaining time is estimated once enough work is done."""
-        standing = None if self.standing is None else self.standing()
+        self._shown, left, standing = now, "time left unknown", None if self.standing is None else self.standing()
         # Parts from a checkpoint took no time.
-        resumed = standing.resumed if standing is not None and self._unit == "realisations" else 0
-        rate = (done - resumed) / max(time.monotonic() - self._started, 1e-9)
-        left = "time left unknown"
-        if done - resumed >= TOLD_FROM * total:
+        counted = done - (standing.resumed if standing is not None and self._unit == "realisations" else 0)
+        rate = counted / max(now - self._started, 1e-9)
+        if counted >= TOLD_FROM * total:
             seconds = (total - done) / rate
             unit, size = next((row for row in UNITS if seconds > 3 * row[1]), ("s", 1.0))
             left = f"{seconds / size:.0f} {unit} left"
         again = f", {standing.retries} parts counted again" if standing is not None and standing.retries else ""
-        return f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{again}"
+        line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{again}"
+        print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
 
 
 def _console(**how: Any) -> Console:

@@ -23,7 +23,7 @@ from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import Tab
-from mauvecl.web.uploads import Shelf
+from mauvecl.web.uploads import RESULTS
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
@@ -47,8 +47,6 @@ LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}
 FIRST, HALVINGS, CHANGE = 9, 5, 0.1
 
 
-#: Maps and curves of all visitors, without the closed forms, which take tens of MB.
-KEPT = Shelf(2**26)
 #: Fields on which a map does not depend; an upload is identified by its content.
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours", "uploaded"}
 
@@ -58,10 +56,11 @@ def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -
     question = closed.question
     values = (value for name, value in question.values.items() if name not in FREE)
     key = (*values, question.uploaded and question.uploaded.digest, *more)
-    found: T | None = KEPT.get(None, make.__name__, key)
+    # Of all visitors, without the closed forms, which take tens of MB.
+    found: T | None = RESULTS.get(None, make.__name__, key)
     if found is None:
         found = make(closed)
-        KEPT.keep(None, make.__name__, key, found, 32)
+        RESULTS.keep(None, make.__name__, key, found, 32)
     return found
 
 
