@@ -466,14 +466,6 @@ class Keyword(NamedTuple):
             return given
         return self.flag.read(given, self.name)
 
-    def listed(self, given: Any) -> Any:
-        """Return a list for a single value of a keyword of several values."""
-        if not self.many or given is None or isinstance(given, Mapping):
-            return given
-        # Neither a sequence nor an array.
-        single = isinstance(given, str | Path) or getattr(given, "ndim", 1) == 0 or not hasattr(given, "__len__")
-        return [given] if single else list(given)
-
 
 def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
     """Return the value of each keyword, None where it is not given, and of ``paper``.
@@ -487,7 +479,12 @@ def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: 
         keys = [keyword for keyword, of in keywords.items() if of.path.rpartition(".")[2] == name]
         close = keys or get_close_matches(name, known, n=3) or known
         raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(close)}")
-    values = {name: keyword.listed(given.get(name)) for name, keyword in keywords.items()}
+    values = {name: given.get(name) for name in keywords}
+    for name, value in values.items():
+        if keywords[name].many and value is not None and not isinstance(value, Mapping):
+            # Neither a sequence nor an array.
+            single = isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")
+            values[name] = [value] if single else list(value)
     if given.get("ideal"):
         values["with_unknowns"] = False
     return values | {"paper": given.get("paper")}
