@@ -62,14 +62,13 @@ class Canvas:
         self.legend: list[tuple[str, str, str, str]] = []
         if chart.x.kind == "wavelength":
             self._mark()
-        own = [item for item in chart.series if isinstance(item, Own)]
         # A line for each scenario that can be pinned is drawn as the series that it repeats.
         pins = [
             replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
                     tips=(), listed=False)
             for k, (colour, dash) in enumerate(PINS[theme]) for item in chart.series if item.key == chart.pins
         ]  # fmt: skip
-        for series in (*(item for item in chart.series if item not in own), *pins, *own):
+        for series in sorted((*chart.series, *pins), key=lambda item: isinstance(item, Own)):
             self._add(series)
 
     def _frame(self, x: Axis, y: Axis) -> Any:
@@ -145,9 +144,8 @@ class Canvas:
             return
         if isinstance(series, Targets):
             for k, colour in enumerate(TARGETS):
-                self._add(
-                    Line(f"target {k + 1}", colour, f"{series.key} {k}", width=2, dash=series.dash, tips=series.tips)
-                )
+                look = {"width": 2, "dash": series.dash, "tips": series.tips}
+                self._add(Line(f"target {k + 1}", colour, f"{series.key} {k}", **look))
             return
         source = models.ColumnDataSource({column: [] for column in series.columns}, name=series.key)
         if isinstance(series, Custom):
