@@ -14,8 +14,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import special
-from scipy.interpolate import PchipInterpolator
 
 from mauvecl.detection import MIN_IN_TAIL
 from mauvecl.detection.distributions import CONFIDENCE_SD
@@ -29,7 +27,6 @@ from mauvecl.study.cases import Case
 from mauvecl.study.observation import KNOWN, NuisanceChoice
 
 if TYPE_CHECKING:
-    from mauvecl.detection.distributions import Form
     from mauvecl.detection.statistics import Statistic
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.study import Study
@@ -282,24 +279,3 @@ def describe_shares(shares: Mapping[str, float]) -> str:
     first = First(shares.items(), MAX_NAMED, "unknowns")
     note = f" ({first.note})" if first.note else ""
     return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
-
-
-class InterpolatedForm:
-    """Closed form that is exact at some points and interpolated in the probit between them."""
-
-    def __init__(self, form: Form) -> None:
-        self.mean, self.std = form.mean, form.std
-        at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
-        beyond = np.array([form.sf(value) for value in at])
-        # Probabilities that round to 0 or 1 have no finite probit.
-        inside = (beyond > 1e-12) & (beyond < 1 - 1e-12)
-        self._probit = PchipInterpolator(at[inside], special.ndtri(beyond[inside]), extrapolate=True)
-        self._inverse = PchipInterpolator(-special.ndtri(beyond[inside]), at[inside], extrapolate=True)
-
-    def sf(self, value: Float) -> Float:
-        """Return the probabilities of exceeding values."""
-        return np.asarray(special.ndtr(self._probit(value)))
-
-    def isf(self, probability: Float) -> Float:
-        """Return the values that are exceeded with given probabilities."""
-        return np.asarray(self._inverse(-special.ndtri(probability)))

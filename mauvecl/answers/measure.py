@@ -31,9 +31,8 @@ from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
-from mauvecl.study.analyses import fitted_models
 from mauvecl.study.cases import Case, Use, amplitude_column, cases, collect_messages
-from mauvecl.study.questions import check_sweep
+from mauvecl.study.questions import check_sweep, fitted_models
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

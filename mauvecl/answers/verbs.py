@@ -11,8 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 if TYPE_CHECKING:
-    from mauvecl.study.keywords import Keyword
-    from mauvecl.study.study import Study
+    from mauvecl.study.study import Keyword, Study
 
 #: Function that is called as ``progress(done, total)``; it may raise to stop the work.
 Progress = Callable[[int, int], None] | None
@@ -97,8 +96,7 @@ class Verb:
         `given` has the value of each keyword, or None, and also ``paper``, and ``setting``, texts of any keys. They
         change the study or, without one, the verb's default; `where` names their origin in messages.
         """
-        from mauvecl.study.keywords import changes_of, stars_of
-        from mauvecl.study.study import Study
+        from mauvecl.study.study import Study, changes_of, stars_of
 
         own = study is not None
         if study is None:
@@ -422,8 +420,7 @@ def by_keywords(parts: str) -> Callable[[Callable[..., Answered]], Question[Answ
         def ask(study: Any = None, *arguments: Any, **keywords: Any) -> Any:
             own = {key: keywords.pop(key) for key in tuple(keywords) if key in checks}
             if study is None or keywords:
-                from mauvecl.study.keywords import values_of
-                from mauvecl.study.study import keys_of
+                from mauvecl.study.study import keys_of, values_of
 
                 verb, where = VERBS[function.__name__], f"{function.__name__}()"
                 known, given = {entry.name: entry for entry in keys_of(verb.keys)}, study and checks["study"](study)

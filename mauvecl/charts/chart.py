@@ -164,10 +164,6 @@ class Custom(Series):
     draw: Callable[[Any, Any], None] | None = None
 
 
-#: Pixels that saturate.
-SATURATED = Strips("saturated", "own", show="if any", alpha=0.18, hatched=True)
-
-
 @dataclass(frozen=True)
 class ChartData:
     """Data of a chart."""

@@ -57,7 +57,9 @@ def devices(
 
 def selftest(
     device: flags.DeviceFlag = None,
-    output: Annotated[Path | None, flags.output_option("nowhere")] = None,
+    output: Annotated[
+        Path | None, flags.option("--output", "-o", metavar="PATH", text="Where to write [nowhere].")
+    ] = None,
     as_json: flags.JsonFlag = False,
     quiet: flags.QuietFlag = False,
 ) -> None:
@@ -244,13 +246,8 @@ def serve(
     try:
         serve(address, number, show=show, allow_origin=allow_origin or ())
     except OSError as error:
-        raise InputError(
-            f"port {port} of {shortened(address)} cannot be used ({error.strerror}); give another --port", key="port"
-        ) from error
-
-
-#: Heading of the flags that set no key of a study.
-OUTPUT = "Output and devices"
+        fault = f"port {port} of {shortened(address)} cannot be used ({error.strerror}); give another --port"
+        raise InputError(fault, key="port") from error
 
 
 class CommandWithHelp(TyperCommand):
@@ -268,7 +265,8 @@ class CommandWithHelp(TyperCommand):
             if one.param_type_name == "argument":
                 heading = "Arguments"
             elif shows_all:
-                heading = getattr(one, "rich_help_panel", None) or OUTPUT
+                # Flags that set no key of a study have no panel.
+                heading = getattr(one, "rich_help_panel", None) or "Output and devices"
             elif self.common:
                 heading = "Common flags"
             else:
@@ -282,15 +280,15 @@ class CommandWithHelp(TyperCommand):
 
 def text_of(text: str | None) -> str:
     """Return a help text with examples on separate lines of at most 80 columns, which can be pasted."""
+
+    def broken(command: re.Match[str]) -> str:
+        # Lines end in a backslash before a flag.
+        glued = re.sub(r" (?!-)", "\0", command[0])
+        lines = textwrap.wrap(glued, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+        return "\b\n" + " \\\n".join(lines).replace("\0", " ")
+
     text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
-    return re.sub(r"(?m)^mauvecl .*$", lambda match: "\b\n" + _broken(match[0]), text)
-
-
-def _broken(command: str) -> str:
-    """Divide a command longer than 72 characters into lines that end in a backslash before a flag."""
-    glued = re.sub(r" (?!-)", "\0", command)
-    lines = textwrap.wrap(glued, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
-    return " \\\n".join(lines).replace("\0", " ")
+    return re.sub(r"(?m)^mauvecl .*$", broken, text)
 
 
 #: Functions of the commands without a study.

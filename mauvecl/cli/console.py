@@ -26,7 +26,6 @@ from mauvecl.schema.errors import SUBJECT, InputError, printable
 if TYPE_CHECKING:
     import typer
     from rich.console import Console
-    from rich.table import Table
 
     from mauvecl.runs.pool import PoolProgress
 
@@ -59,26 +58,25 @@ PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
 #: The running command line, whose flags messages name.
 _app: typer.Typer | None = None
 #: Output folder of the verb, once known, to which tracebacks are written.
-_folder: Path | None = None
-
-
-def writes_to(folder: Path) -> None:
-    """Set the folder into which an unforeseen failure writes its traceback."""
-    global _folder
-    _folder = folder
+folder: Path | None = None
 
 
 def guarded(app: typer.Typer) -> int:
     """Run the command line, and return its exit code."""
-    global _app, _folder
-    _app, _folder = app, None
+    global _app, folder
+    _app, folder = app, None
     out = sys.stdout
+
+    def warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        # The kind of warnings of other packages tells more than their text.
+        _say(f"note: {message}" + ("" if category is UserWarning else f" ({category.__name__})"), 0)
+
     for stream in (sys.stdout, sys.stderr):
         # Names may contain any character; those that the terminal's encoding lacks are written as escapes.
         if (change := getattr(stream, "reconfigure", None)) is not None:
             change(errors="backslashreplace")
     with warnings.catch_warnings():
-        warnings.showwarning = _warn
+        warnings.showwarning = warn
         try:
             code = app(standalone_mode=False)
             if code == INTERRUPTED:
@@ -153,11 +151,6 @@ def _say(text: str, code: int, *, whole: bool = False) -> int:
     return code
 
 
-def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Print a warning on one line, with its kind unless it is one of mauvecl's own."""
-    _say(f"note: {message}" + ("" if category is UserWarning else f" ({category.__name__})"), 0)
-
-
 def _flushed(code: int) -> int:
     """Flush standard output; return the exit code, or that of a failure to write."""
     try:
@@ -192,10 +185,10 @@ def _write_traceback(error: Exception) -> Path | str:
     versions = f"mauvecl {VERSION}, Python {platform.python_version()}, {platform.platform()}"
     steps = "".join(traceback.format_exception(error, limit=-60))
     text = "\n".join([versions, f"command: {sys.argv!r}"[:20_000], steps])
-    for folder in filter(None, (_folder, Path(tempfile.gettempdir()))):
+    for place in filter(None, (folder, Path(tempfile.gettempdir()))):
         with contextlib.suppress(OSError):
             # A random name, which nobody can have created before.
-            handle, name = tempfile.mkstemp(prefix=f"mauvecl-fault-{now}-", suffix=".txt", dir=folder)
+            handle, name = tempfile.mkstemp(prefix=f"mauvecl-fault-{now}-", suffix=".txt", dir=place)
             with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
                 file.write(text)
             return Path(name)
@@ -233,9 +226,7 @@ class Meter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._clear()
-
-    def _clear(self) -> None:
+        """Clear the line."""
         if self._changes and self._shown > self._started:
             print(CLEARED, end="", file=sys.stderr, flush=True)
 
@@ -247,28 +238,22 @@ class Meter:
             return
         if done <= self._last:
             # Start of the next star's work.
-            self._clear()
+            self.__exit__()
             self._started = self._shown = now
         self._last, self._total = done, total
         if self._quiet or now - self._started < PATIENCE_S or now - self._shown < (0.2 if self._changes else 10.0):
             return
-        self._shown = now
-        line = self._line(done, total)
-        print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
-
-    def _line(self, done: int, total: int) -> str:
-        """Return the progress in words; the remaining time is estimated once enough work is done."""
-        standing = None if self.standing is None else self.standing()
+        self._shown, left, standing = now, "time left unknown", None if self.standing is None else self.standing()
         # Parts from a checkpoint took no time.
-        resumed = standing.resumed if standing is not None and self._unit == "realisations" else 0
-        rate = (done - resumed) / max(time.monotonic() - self._started, 1e-9)
-        left = "time left unknown"
-        if done - resumed >= TOLD_FROM * total:
+        counted = done - (standing.resumed if standing is not None and self._unit == "realisations" else 0)
+        rate = counted / max(now - self._started, 1e-9)
+        if counted >= TOLD_FROM * total:
             seconds = (total - done) / rate
             unit, size = next((row for row in UNITS if seconds > 3 * row[1]), ("s", 1.0))
             left = f"{seconds / size:.0f} {unit} left"
         again = f", {standing.retries} parts counted again" if standing is not None and standing.retries else ""
-        return f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{again}"
+        line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{again}"
+        print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
 
 
 def _console(**how: Any) -> Console:
@@ -279,18 +264,14 @@ def _console(**how: Any) -> Console:
 
 
 def show(lines: Sequence[str]) -> None:
-    """Print plain lines on standard output, broken between words on a terminal."""
+    """Print plain lines on standard output; on a terminal they are broken between words, and continued indented."""
     console = _console(soft_wrap=True)
     for line in lines:
-        console.print(_broken(line, console.width) if console.is_terminal else line)
-
-
-def _broken(line: str, width: int) -> str:
-    """Break a line between words, and indent what follows where it is indented; longer words remain whole."""
-    indent = " " * (len(line) - len(line.lstrip()))
-    return textwrap.fill(
-        line, max(width, len(indent) + 1), subsequent_indent=2 * indent, break_long_words=False, break_on_hyphens=False
-    )
+        if console.is_terminal:
+            indent = " " * (len(line) - len(line.lstrip()))
+            how: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
+            line = textwrap.fill(line, max(console.width, len(indent) + 1), subsequent_indent=2 * indent, **how)
+        console.print(line)
 
 
 #: A column of a printed table: its heading and its cells.
@@ -303,6 +284,9 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     Unless `wide`, a table that is too wide is printed without the columns of details, and first columns whose values
     all rows share stand in the title. A `wide` table in a pipe is as wide as it needs to be.
     """
+    from rich import box
+    from rich.table import Table
+
     if view.table is None:
         show([view.title])
         return False
@@ -322,27 +306,20 @@ def show_view(view: View, *, wide: bool = True) -> bool:
             columns = columns[shared:]
     show([title])
     for part in _parts(columns, room):
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading, *cells in part:
+            numeric = bool(cells) and all(cell[:1] in "0123456789-+.<>=" for cell in cells)
+            table.add_column(heading, justify="right" if numeric else "left", no_wrap=True)
+        for row in zip(*(cells for _, *cells in part), strict=True):
+            table.add_row(*row)
         # A column that exceeds the terminal is printed completely.
-        _console(width=max(room, _width(part))).print(_table(part))
+        _console(width=max(room, _width(part))).print(table)
     return left_out
 
 
 def _printed(view: View, hidden: Collection[str] = ()) -> list[Printed]:
     headings, cells = without_empty(*view.texts(hidden))
     return list(map(list, zip(headings, *cells, strict=True)))
-
-
-def _table(columns: Sequence[Printed]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading, *cells in columns:
-        numeric = bool(cells) and all(cell[:1] in "0123456789-+.<>=" for cell in cells)
-        table.add_column(heading, justify="right" if numeric else "left", no_wrap=True)
-    for row in zip(*(cells for _, *cells in columns), strict=True):
-        table.add_row(*row)
-    return table
 
 
 def _width(columns: Sequence[Printed]) -> int:
@@ -404,18 +381,18 @@ def _flags(name: str, *, off: bool = False) -> list[str]:
 
 def with_flags(text: str) -> str:
     """Return a message with flags instead of the remedies in backticks."""
-    return _REMEDY.sub(_as_flag, text) if "`" in text else text
 
+    def as_flag(match: re.Match[str]) -> str:
+        value: Any = match["value"]
+        off = value in ("false", "False")
+        flags = _flags(match["name"], off=off)
+        if not flags:
+            return match[0]
+        with contextlib.suppress(ValueError, SyntaxError):
+            value = None if value is None else ast.literal_eval(value)
+        return flags[0] if value is None or value is True or off else f"{flags[0]} {shlex.quote(str(value))}"
 
-def _as_flag(match: re.Match[str]) -> str:
-    value: Any = match["value"]
-    off = value in ("false", "False")
-    flags = _flags(match["name"], off=off)
-    if not flags:
-        return match[0]
-    with contextlib.suppress(ValueError, SyntaxError):
-        value = None if value is None else ast.literal_eval(value)
-    return flags[0] if value is None or value is True or off else f"{flags[0]} {shlex.quote(str(value))}"
+    return _REMEDY.sub(as_flag, text)
 
 
 def name_flag(error: InputError) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from glob import escape, glob
 from pathlib import Path
@@ -15,17 +15,12 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Help, Range, Unit, as_typed, first, whole
 
 if TYPE_CHECKING:
-    from mauvecl.study.keywords import Keyword
+    from mauvecl.study.study import Keyword
 
 
 def option(*names: str, text: str, **how: Any) -> Any:
     """Return an option without its default in the help text."""
     return typer.Option(*names, help=text, show_default=False, **how)
-
-
-def output_option(usual: str) -> Any:
-    """Return the option of the output, with its default."""
-    return option("--output", "-o", metavar="PATH", text=f"Where to write [{usual}].")
 
 
 DeviceFlag = Annotated[str | None, option(metavar="TEXT", text="OpenCL device: number or part of its name [PoCL].")]
@@ -91,36 +86,11 @@ WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
 def study_option(keyword: Keyword, defaults: Mapping[str, Any]) -> Any:
-    """Return the annotation of a flag of the study's key for typer.
+    """Return the annotation of a flag of the study's key for typer: description, accepted words, unit and default.
 
     Typer leaves numbers as text, which the study converts, so that messages have one style. `defaults` holds defaults
     of a verb that differ from the study's, by key.
     """
-    metavar = {str: "TEXT", Path: "FILE", float: "NUMBER", int: "INTEGER"}.get(keyword.each)
-    kind = keyword.kind
-    if keyword.each in (float, int):
-        kind, metavar = (list[str], f"{metavar},...") if keyword.many else (str, metavar)
-    made = option(
-        *keyword.flag.names,
-        text=_help(keyword, defaults),
-        rich_help_panel=keyword.path.partition(".")[0].capitalize(),
-        autocompletion=COMPLETIONS.get(keyword.path),
-        metavar=metavar,
-    )
-    return Annotated[kind | None, made]
-
-
-def option_of(key: str) -> Any:
-    """Return the option of a key's flag, for a verb without a study."""
-    # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
-    from mauvecl.study.study import keys_of
-
-    (keyword,) = keys_of((key,))
-    return get_args(study_option(keyword, {}))[1]
-
-
-def _help(keyword: Keyword, defaults: Mapping[str, Any]) -> str:
-    """Return the help text: description, accepted words, unit, explanation and default."""
     path, field, flag = keyword
     help = flag.help or first(field, Help) or Help("")
     unit = None if flag.help else first(field, Unit)
@@ -133,7 +103,27 @@ def _help(keyword: Keyword, defaults: Mapping[str, Any]) -> str:
         default = help.default
     else:
         default = as_typed(field.get_default(call_default_factory=True))
-    return text + (f" [{default}]" if default else "") + "."
+    metavar = {str: "TEXT", Path: "FILE", float: "NUMBER", int: "INTEGER"}.get(keyword.each)
+    kind = keyword.kind
+    if keyword.each in (float, int):
+        kind, metavar = (list[str], f"{metavar},...") if keyword.many else (str, metavar)
+    made = option(
+        *flag.names,
+        text=text + (f" [{default}]" if default else "") + ".",
+        rich_help_panel=path.partition(".")[0].capitalize(),
+        autocompletion=COMPLETIONS.get(path),
+        metavar=metavar,
+    )
+    return Annotated[kind | None, made]
+
+
+def option_of(key: str) -> Any:
+    """Return the option of a key's flag, for a verb without a study."""
+    # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
+    from mauvecl.study.study import keys_of
+
+    (keyword,) = keys_of((key,))
+    return get_args(study_option(keyword, {}))[1]
 
 
 def _words(annotation: Any) -> str:
@@ -149,7 +139,7 @@ def is_star(given: Path) -> bool:
     """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
     from mauvecl.host.stars.library import resolve
     from mauvecl.host.tables.files import as_text, read_bytes, toml
-    from mauvecl.study.keywords import is_there
+    from mauvecl.study.study import is_there
 
     text = str(given)
     if given.suffix.lower() == ".toml" or given.is_dir():
@@ -223,19 +213,19 @@ def complete_star(incomplete: str) -> list[str]:
     # Shells take a blank for the end of a word; names are known without blanks.
     names = [name.replace(" ", "") for name in all_names() if name not in EXAMPLES]
     names += [star.name for star in kept() if " " not in star.name]
-    return [f"{before}{comma}{word}" for word in (*_continued(last, names), *_files(last))]
+    return [f"{before}{comma}{word}" for word in _continued(last, names)]
 
 
 def complete_study(incomplete: str) -> list[str]:
     """Return files, and once something is typed names of stars, which may stand in place of a study."""
-    return complete_star(incomplete) if incomplete else _files(incomplete)
+    return complete_star(incomplete) if incomplete else _continued("", ())
 
 
 def complete_instrument(incomplete: str) -> list[str]:
     """Return names of instruments, and TOML files."""
     from mauvecl.host.instrument import shipped_names
 
-    return [*_continued(incomplete, shipped_names()), *_files(incomplete, (".toml",))]
+    return _continued(incomplete, shipped_names(), ".toml")
 
 
 #: Functions that complete values, by the keys of flags. Shells complete files by themselves where nothing else is
@@ -246,13 +236,9 @@ COMPLETIONS = {
 }  # fmt: skip
 
 
-def _continued(typed: str, names: Iterable[str]) -> list[str]:
-    """Return the names that begin with a text in any case, with the text as it was typed."""
-    return [typed + name[len(typed) :] for name in names if name.casefold().startswith(typed.casefold())]
-
-
-def _files(typed: str, endings: Sequence[str] = ()) -> list[str]:
-    """Return the files and folders that begin with a text."""
+def _continued(typed: str, names: Iterable[str], ending: str = "") -> list[str]:
+    """Return names that begin with a text in any case, as it was typed, and folders and files with this ending."""
+    words = [typed + name[len(typed) :] for name in names if name.casefold().startswith(typed.casefold())]
     found = sorted(glob(escape(typed) + "*"))
     folders = [f"{path}/" for path in found if Path(path).is_dir()]
-    return [*folders, *(p for p in found if not Path(p).is_dir() and (not endings or p.endswith(tuple(endings))))]
+    return [*words, *folders, *(path for path in found if not Path(path).is_dir() and path.endswith(ending))]

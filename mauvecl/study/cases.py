@@ -45,11 +45,14 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     The answer varies the quantities `varied` in addition to those that the study sweeps.
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
+    orbit, limits = study.orbit.tle, study.orbit.limits
+    least = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
+    kept = ", ".join(f"{name} {value:g} deg" for name, value in least.items() if value is not None)
     words: dict[str, Callable[[], str]] = {
         "instrument": lambda: _instrument(study, swept, along_orbit="orbit" in uses and study.plan.along_orbit),
         "sky": lambda: "sky as swept" if "sky" in swept else study.sky.describe(),
         "flare": lambda: _flare(study, swept),
-        "orbit": lambda: _orbit(study),
+        "orbit": lambda: f"orbit of {orbit.name if orbit else 'embedded elements'}; least angles: {kept or 'none'}",
         "unknowns": lambda: _unknowns(study, uses),
         "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
         "seed": lambda: f"seed {study.run.seed}",
@@ -83,14 +86,6 @@ def _flare(study: Study, swept: set[str]) -> str:
     geometry = "added to the star" if f.geometry == "added" else replaces
     size = "as bright as observed" if f.spectrum.as_observed else f"amplitudes in the {f.band} band"
     return f"flares {temperature}, {geometry}, {size}"
-
-
-def _orbit(study: Study) -> str:
-    limits = study.orbit.limits
-    least = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
-    kept = [f"{name} {value:g} deg" for name, value in least.items() if value is not None]
-    source = "embedded elements" if study.orbit.tle is None else study.orbit.tle.name
-    return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"
 
 
 def _given_unknowns(study: Study) -> dict[Use, dict[str, str]]:
@@ -156,16 +151,11 @@ def amplitude_column(get: str | Callable[[Any], Any] = "amplitude", description:
 
 def full_label(name: str, at: Mapping[str, float | str]) -> str:
     """Return a star's label with the swept values that the label does not contain, for plots."""
-    parts = [
-        f"{quantity.replace('_', ' ')} {value:g}{QUANTITIES[quantity].suffix}"
-        for quantity, value in at.items()
-        if quantity not in ("magnitude", "star") and not isinstance(value, str)
-    ]
+    others = {key: value for key, value in at.items() if key not in ("magnitude", "star")}
+    parts = (f"{key.replace('_', ' ')} {value:g}{QUANTITIES[key].suffix}" for key, value in others.items())
     return ", ".join([name, *parts])
 
 
-#: Sections of a study on which no expectation depends.
-WITHOUT_LIGHT = frozenset({"nuisances"})
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
 MAX_SOURCES = 16
 
@@ -245,11 +235,6 @@ class Case:
         """The instrument, with the study's changes and detector temperature."""
         return self.loader.instrument(self.study.observation)
 
-    @property
-    def sky(self) -> Sky:
-        """The sky behind the star."""
-        return self.loader.sky(self.study.sky)
-
     @cached_property
     def quiet(self) -> Expectation:
         """Expectation of the star without a flare."""
@@ -283,21 +268,16 @@ class Case:
     def flaring(self, amplitude: float, temperature_k: float | None = None) -> Source:
         """Return the star with a flare, by default of the study's temperature."""
         f = self.study.flare
-        return self.source.flaring(
-            amplitude,
-            spectrum=f.light(temperature_k),
-            band=f.band,
-            geometry=f.geometry,
-            photosphere_temperature=f.photosphere_temperature_k,
-        )
+        how: dict[str, Any] = {"geometry": f.geometry, "photosphere_temperature": f.photosphere_temperature_k}
+        return self.source.flaring(amplitude, spectrum=f.light(temperature_k), band=f.band, **how)
 
     def expect(self, *sources: Source) -> list[Expectation]:
         """Compute the expectations of sources for the instrument, sky and exposure."""
         from mauvecl.host.exposure.expectation import expect
 
         o = self.study.observation
-        how: dict[str, Any] = {"exposure": o.exposure_s, "sky": self.sky, "order": o.order, "signal": o.signal}
-        how["neighbours"] = self.neighbours
+        how: dict[str, Any] = {"exposure": o.exposure_s, "order": o.order, "signal": o.signal}
+        how |= {"sky": self.loader.sky(self.study.sky), "neighbours": self.neighbours}
         return [expect(source, self.instrument, **how) for source in sources]
 
     def unknowns(self, quiet: Expectation | None = None) -> Nuisances | None:
@@ -353,7 +333,8 @@ class Case:
     def with_sections(self, **sections: Any) -> Self:
         """Return the case with other sections of the study, such as ``flare``."""
         case = replace(self, study=self.study.model_copy(update=sections))
-        if sections.keys() <= WITHOUT_LIGHT:
+        if sections.keys() == {"nuisances"}:
+            # No expectation depends on them.
             vars(case).update({name: vars(self)[name] for name in ("quiet", "flares") if name in vars(self)})
         return case
 
@@ -361,12 +342,10 @@ class Case:
         """Return the case with the amplitude at which the flare has the flux of its file at the telescope."""
         from mauvecl.host.stars.flare import added_light, check_scales
 
-        flare, star = self.study.flare, self.source
-        check_scales(flare.light())
-        photosphere_k = flare.photosphere_temperature_k
-        light = added_light(
-            star.wavelength_nm, star.flux_flam, flare.light(), flare.band, flare.geometry, photosphere_k
-        )
+        flare, star, observed = self.study.flare, self.source, self.study.flare.light()
+        check_scales(observed)
+        how = flare.band, flare.geometry, flare.photosphere_temperature_k
+        light = added_light(star.wavelength_nm, star.flux_flam, observed, *how)
         scaled = flare.spectrum.model_copy(update={"as_observed": False})
         return self.with_sections(flare=flare.model_copy(update={"amplitudes": (1.0 / light.hot,), "spectrum": scaled}))
 
@@ -377,10 +356,7 @@ class Case:
         return self.with_sections(observation=self.study.observation.model_copy(update=exposure))
 
     def flare_electrons(self, temperatures_k: NDArray[np.float64] | tuple[float, ...]) -> NDArray[np.float64]:
-        """Return the electrons that flares of unit amplitude add to an exposure, shape (n_temperature, n_pixel).
-
-        Raises InputError if some lines of the flare do not scale with its amplitude.
-        """
+        """Return the electrons that flares of unit amplitude add to an exposure, shape (n_temperature, n_pixel)."""
         from mauvecl.host.stars.flare import check_scales
 
         check_scales(self.study.flare.light())

@@ -10,18 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import field_validator, model_validator
 
 from mauvecl.host.orbit import Limits
-from mauvecl.host.tables.names import (
-    BANDS,
-    DECLINATIONS,
-    RIGHT_ASCENSIONS,
-    SEXAGESIMAL,
-    SPECTRAL_TYPES,
-    STARS,
-    band_in_name,
-    divided_unit,
-    is_missing_position,
-    key_of,
-)
+from mauvecl.host.tables import names
 from mauvecl.schema import physical
 from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, first
@@ -242,9 +231,8 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
         target.target(orbit.simbad) for target in plan.targets
     ]
     if not targets:
-        raise InputError(
-            "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets"
-        )
+        fault = "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`"
+        raise InputError(fault, key="orbit.targets")
     check_different([target.name for target in targets], "the target", "orbit.targets")
     return targets
 
@@ -259,7 +247,8 @@ def read_targets(path: str | Path) -> list[dict[str, Any]]:
 
 #: Names of columns of targets, in any case, by the keys of `PlanTarget`; keys themselves are names as well.
 TARGET_COLUMNS = {
-    "name": (*STARS, "hostname"), "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
+    "name": (*names.STARS, "hostname"), "ra": names.RIGHT_ASCENSIONS, "dec": names.DECLINATIONS,
+    "spectral_type": names.SPECTRAL_TYPES,
     "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "sy_vmag", "mag"),
     "distance_pc": ("distance", "dist", "d_pc", "dist_pc", "sy_dist"),
     "parallax": ("parallax", "plx", "plx_value", "parallax_mas", "plx_mas"),
@@ -290,7 +279,7 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
         raise InputError(f"{named} has the column {shortened(path)}, but must not name files", key=path)
     for key in ("distance_pc", "mass_msun", "age_myr"):
         held = columns[key]
-        if held is not None and key_of(held) in ("distance", "dist", "mass", "age") and not rows.unit(held):
+        if held is not None and names.key_of(held) in ("distance", "dist", "mass", "age") and not rows.unit(held):
             # A distance in an unknown unit is none.
             columns[key] = None
     if not 1 <= rows.n <= MAX_TARGETS:
@@ -308,7 +297,7 @@ def _target(
     for key, field in PlanTarget.model_fields.items():
         column = columns.get(key)
         text = rows.text(column, row)
-        if column is None or not text or (key == "coordinates" and is_missing_position(text)):
+        if column is None or not text or (key == "coordinates" and names.is_missing_position(text)):
             continue
         unit = first(field, Unit)
         # A text that is no number is refused with the key's own sentence.
@@ -325,7 +314,7 @@ def _target(
         if folder is not None and isinstance(target.get(key), str):
             target[key] = folder / target[key]
     alone = [key for key in ("mass_msun", "age_myr") if key in target]
-    if len(alone) == 1 and (held := columns[alone[0]]) is not None and key_of(held) != alone[0]:
+    if len(alone) == 1 and (held := columns[alone[0]]) is not None and names.key_of(held) != alone[0]:
         # Catalogues have the mass of most stars and the age of few.
         del target[alone[0]]
         unused += (held,)
@@ -337,9 +326,11 @@ def _target(
 
 def _check_band(rows: Rows, column: str | None, row: int) -> None:
     """Raise InputError if a magnitude of no stated band in its name has another than V in brackets or in a column."""
-    if column is None or key_of(divided_unit(column)[0]) not in ("mag", "magnitude") or not rows.text(column, row):
+    if column is None or not rows.text(column, row):
         return
-    bands = (band_in_name(column), rows.text(rows.first(BANDS), row))
+    if names.key_of(names.divided_unit(column)[0]) not in ("mag", "magnitude"):
+        return
+    bands = (names.band_in_name(column), rows.text(rows.first(names.BANDS), row))
     if odd := next((band for band in bands if band and not re.fullmatch(r"(?i)(?:johnson[\s_]*)?v", band)), None):
         raise rows.error(f"row {row + 1} has {column} in the band {shortened(odd)}; give a magnitude in V", column)
 
@@ -358,7 +349,7 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
         raise InputError(f"{rows.named}: row {row + 1} needs either coordinates, or both ra and dec", key="coordinates")
     if ra is not None and dec is not None and given:
         east, north = (rows.degrees(name, row, right_ascension=name == ra) for name in (ra, dec))
-        again = rows.first(SEXAGESIMAL)
+        again = rows.first(names.SEXAGESIMAL)
         other = None if again in (None, ra) else rows.degrees(again, row, right_ascension=True)
         if other is not None and east is not None and abs((other - east + 180) % 360 - 180) > 0.1:
             fault = f"row {row + 1} has {ra} = {rows.text(ra, row)} and {again} = {rows.text(again, row)}, which differ"
@@ -368,7 +359,7 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
         for column in filter(None, (ra, columns["coordinates"])):
             text = str(rows.table[column][row])
             # The cell says that a coordinate, or a pair of them, is not a number, instead of being empty.
-            if text.strip().lower() == "nan" or is_missing_position(text):
+            if text.strip().lower() == "nan" or names.is_missing_position(text):
                 fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
                 remedy = "give its coordinates, or a name of the list"
                 raise rows.error(f"{fault} is not in the embedded list; {remedy}", column)

@@ -364,10 +364,8 @@ class FlareLight(Section):
         """Return a copy with another value of one key; raises InputError if the key has no effect."""
         (key,) = path
         if key == "line_scale" and not (self.lines or self.line_fluxes):
-            raise InputError(
-                f"line_scale = {value} has no effect on a flare without lines; give lines in flare.spectrum.lines",
-                key="line_scale",
-            )
+            fault = f"line_scale = {value} has no effect on a flare without lines; give lines in flare.spectrum.lines"
+            raise InputError(fault, key="line_scale")
         return type(self)(**(self.model_dump() | {key: value}))
 
 

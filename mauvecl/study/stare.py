@@ -6,24 +6,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from mauvecl.flares.settings import (
-    DAYS,
-    HALF_WIDTHS_S,
-    ORBIT_S,
-    RANK,
-    SHAPE_NAMES,
-    WINDOW_S,
-    CoolingLaw,
-    Curve,
-    Per,
-    ShapeName,
-)
+from mauvecl.flares import settings
+from mauvecl.flares.settings import HALF_WIDTHS_S, SHAPE_NAMES, WINDOW_S, CoolingLaw, Curve, Per, ShapeName
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import Changing, NuisanceName
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.schema.section import Section, check_one, given_keys, read_ranges, setting
+from mauvecl.schema.section import Section, check_one, read_ranges, setting
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
@@ -49,7 +39,7 @@ class StareQuestion(Section):
             "--gap", kind=list[str], read=partial(read_ranges, expected="two times in s, such as 1000:2000", unit="s")
         ),
     )
-    orbit_s: Duration = setting(ORBIT_S, "Orbital period")
+    orbit_s: Duration = setting(settings.ORBIT_S, "Orbital period")
     orbit_gap_s: Annotated[float, Unit("s"), Range(0)] = setting(
         0.0, "Gap at the end of every orbit", flag="--orbit-gap"
     )
@@ -128,11 +118,6 @@ class EventChoice(Section):
         check_one(self, "an event", *SIZES)
         check_one(self, "an event", "shape", "shape_file")
 
-    @property
-    def sizes(self) -> list[str]:
-        """Keys of the given sizes, at most one."""
-        return given_keys(self, SIZES)
-
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
 CYCLE_ORBITS = 3.0
@@ -143,7 +128,7 @@ class SearchChoice(Section):
 
     shape: ShapeName = setting("davenport2014", "Shape of flares", flag="--shape", choices=SHAPE_NAMES)
     half_widths_s: tuple[Duration, ...] = setting(HALF_WIDTHS_S, "Half-widths of the template bank", min_length=1)
-    sums: Annotated[int, Range(1, 8)] = setting(RANK, "Largest number of weighted sums per frame")
+    sums: Annotated[int, Range(1, 8)] = setting(settings.RANK, "Largest number of weighted sums per frame")
     offset: bool = setting(True, "Whether to marginalise over the offset of the baseline")
     slope: bool = setting(True, "Whether to marginalise over the slope of the baseline")
     cycle: bool | None = setting(
@@ -185,7 +170,7 @@ class SearchChoice(Section):
     @property
     def rate(self) -> float:
         """False alarms per star-day."""
-        return self.false_alarms / DAYS[self.per]
+        return self.false_alarms / settings.DAYS[self.per]
 
     @property
     def rate_text(self) -> str:

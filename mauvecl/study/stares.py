@@ -40,8 +40,7 @@ def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Cours
     """Return the course of a process of exposures in a stare, what it changes, and its standard deviation and mean.
 
     The stare's quiescent level is measured in the stare itself, so the mean is a known factor on light or sky, or shift
-    of the temperature in deg C; the standard deviation is relative to it, or in deg C. Raises InputError unless the
-    prior is normal and cut far from its mean.
+    of the temperature in deg C; the standard deviation is relative to it, or in deg C.
     """
     if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
         raise InputError(
@@ -60,7 +59,7 @@ def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Cours
 
 
 def stare_of(study: Study, instrument: Instrument) -> Stare:
-    """Return the stare of a study. Raises InputError if the stare cannot draw one of the study's processes."""
+    """Return the stare of a study."""
     q = study.stare
     priors = [_stare_prior(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations]
     spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
@@ -95,15 +94,12 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
 
     q, o = study.stare, study.orbit
     if q.gaps or q.orbit_gap_s or q.thermal is not None:
-        raise InputError(
-            "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit",
-            key="stare.along_orbit",
-        )
+        fault = "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit"
+        raise InputError(fault, key="stare.along_orbit")
     targets = targets_of(study.orbit, study.plan)
     if len(targets) != 1:
-        raise InputError(
-            f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}", key="stare.along_orbit"
-        )
+        fault = f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}"
+        raise InputError(fault, key="stare.along_orbit")
     return stare_along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes).stare
 
 
@@ -166,10 +162,7 @@ def energy_of(study: Study, source: Source, event: Event, kind: Kind, temperatur
 
 
 def events_of(study: Study, source: Source) -> list[Event]:
-    """Return the flares of a study's star: `events`, or one per energy or amplitude, evenly spaced over the stare.
-
-    Raises InputError if an energy is given for a star of unknown distance and radius.
-    """
+    """Return the flares of a study's star: `events`, or one per energy or amplitude, evenly spaced over the stare."""
     choices: Sequence[EventChoice] = study.events
     if not choices:
         q = study.stare
@@ -206,9 +199,8 @@ def _event(study: Study, choice: EventChoice) -> Event:
     half = study.stare.half_width_s if choice.half_width_s is None else choice.half_width_s
     kelvin = flare.temperature_k if choice.temperature_k is None else choice.temperature_k
     if cooling is not None and flare.spectrum.file is not None:
-        raise InputError(
-            "events.cooling needs a flare that has a temperature, but its spectrum is from a file", key="events.cooling"
-        )
+        fault = "events.cooling needs a flare that has a temperature, but its spectrum is from a file"
+        raise InputError(fault, key="events.cooling")
     temperature = kelvin if cooling is None else Cooling(kelvin, cooling.end_k, cooling.fold_s)
     amplitude = flare.amplitudes[0] if choice.amplitude is None else choice.amplitude
     if choice.peak is not None:

@@ -1,4 +1,4 @@
-"""Studies: the sections of a TOML file, its text, and the keys of all fields."""
+"""Studies: the sections of a TOML file, its text, and the keywords under which Python and flags give their keys."""
 
 from __future__ import annotations
 
@@ -8,37 +8,30 @@ import tomllib
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field
 
 from mauvecl.detection import DEFAULT_STATISTICS, countable, least_countable
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.orbit import Limits
+from mauvecl.host.stars.library import resolve
 from mauvecl.host.tables import files
-from mauvecl.noise.unknowns import NONE, Processes
+from mauvecl.noise.unknowns import NONE, NUISANCES, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import AnyUnit, Flag, Help, found, number
-from mauvecl.schema.section import Section, built, fields_of, setting
-from mauvecl.study.analyses import CalibrateQuestion, ChangeQuestion, DataChoice, MeasureQuestion
-from mauvecl.study.keywords import Keyword, changes_of, stars_of, values_of
+from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
+from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
 from mauvecl.study.plan import OrbitQuestion, PlanQuestion, PlanTarget
-from mauvecl.study.questions import (
-    QUANTITIES,
-    Axis,
-    BulkQuestion,
-    CampaignQuestion,
-    LimitQuestion,
-    MapQuestion,
-    SignalQuestion,
-    Sweep,
-)
-from mauvecl.study.star import Flare, Star
+from mauvecl.study.questions import QUANTITIES, Axis, Sweep
+from mauvecl.study.star import FILE_KEYS, Flare, Star
 from mauvecl.study.stare import EventChoice, InjectionQuestion, SearchChoice, StareQuestion
 
 if TYPE_CHECKING:
@@ -107,7 +100,6 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
     """Locate the files that the study of an answer's table gives by name and digest, in place.
 
     Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
-    Raises InputError if no file with the name and digest is found.
     """
     study = table.parent / "study.toml"
     for section in tables_in(data):
@@ -186,11 +178,11 @@ class Study(Section):
     processes: Processes = NONE
     nuisances: NuisanceChoice = NuisanceChoice()
     run: Run = Run()
-    campaign: CampaignQuestion = CampaignQuestion()
-    signal: SignalQuestion = SignalQuestion()
-    limit: LimitQuestion = LimitQuestion()
-    map: MapQuestion = MapQuestion()
-    bulk: BulkQuestion = BulkQuestion()
+    campaign: questions.CampaignQuestion = questions.CampaignQuestion()
+    signal: questions.SignalQuestion = questions.SignalQuestion()
+    limit: questions.LimitQuestion = questions.LimitQuestion()
+    map: questions.MapQuestion = questions.MapQuestion()
+    bulk: questions.BulkQuestion = questions.BulkQuestion()
     sweep: Sweep = Sweep()
     unknowns: Unknowns = Unknowns()
     stare: StareQuestion = StareQuestion()
@@ -199,10 +191,10 @@ class Study(Section):
     injections: InjectionQuestion = InjectionQuestion()
     orbit: OrbitQuestion = OrbitQuestion()
     plan: PlanQuestion = PlanQuestion()
-    measure: MeasureQuestion = MeasureQuestion()
-    data: DataChoice = DataChoice()
-    calibrate: CalibrateQuestion = CalibrateQuestion()
-    change: ChangeQuestion = ChangeQuestion()
+    measure: questions.MeasureQuestion = questions.MeasureQuestion()
+    data: questions.DataChoice = questions.DataChoice()
+    calibrate: questions.CalibrateQuestion = questions.CalibrateQuestion()
+    change: questions.ChangeQuestion = questions.ChangeQuestion()
 
     def _check_values(self) -> None:
         own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
@@ -438,3 +430,155 @@ def keys_of(wanted: tuple[str, ...] = ("",)) -> tuple[Keyword, ...]:
     each = [[entry for entry in every if f"{entry.path}.".startswith(f"{name}." if name else "")] for name in wanted]
     assert all(each), wanted
     return tuple(chain.from_iterable(each))
+
+
+class Keyword(NamedTuple):
+    """Keyword of a verb's function, or flag of its command, with the key of the study that it sets."""
+
+    path: str
+    field: FieldInfo
+    flag: Flag
+
+    @property
+    def name(self) -> str:
+        """Name in Python, and of the parameter of a command."""
+        return self.flag.parameter
+
+    @property
+    def kind(self) -> Any:
+        """Type of the value on the command line."""
+        return self.flag.kind or plain_kind(self.field.annotation)
+
+    @property
+    def many(self) -> bool:
+        """True if it has several values."""
+        return get_origin(self.kind) is list
+
+    @property
+    def each(self) -> Any:
+        """Type of one of its values on the command line."""
+        return get_args(self.kind)[0] if self.many else self.kind
+
+    def value(self, given: Any) -> Any:
+        """Convert a value to that of the key, unless it has parts of its own, as in Python."""
+        parts = given if self.many else [given]
+        if self.flag.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
+            return given
+        return self.flag.read(given, self.name)
+
+
+def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
+    """Return the value of each keyword, None where it is not given, and of ``paper``.
+
+    Raises InputError for a keyword of another name; ``ideal`` is another form of ``with_unknowns``, and ``paper`` needs
+    an instrument.
+    """
+    others = {"paper": "instrument", "ideal": "with_unknowns"}
+    known = [*keywords, *(name for name, needed in others.items() if needed in keywords)]
+    for name in given.keys() - known:
+        keys = [keyword for keyword, of in keywords.items() if of.path.rpartition(".")[2] == name]
+        close = keys or get_close_matches(name, known, n=3) or known
+        raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(close)}")
+    values = {name: given.get(name) for name in keywords}
+    for name, value in values.items():
+        if keywords[name].many and value is not None and not isinstance(value, Mapping):
+            # Neither a sequence nor an array.
+            single = isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")
+            values[name] = [value] if single else list(value)
+    if given.get("ideal"):
+        values["with_unknowns"] = False
+    return values | {"paper": given.get("paper")}
+
+
+def plain_kind(annotation: Any) -> Any:
+    """Return the type of a keyword's value: a plain type, or a list for a field of several values."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return plain_kind(parts[0])
+    if origin is tuple:
+        return list[plain_kind(parts[0])]  # type: ignore[misc]
+    if origin in (Union, UnionType):
+        kinds = {plain_kind(part) for part in parts if part is not NoneType}
+        # A number or a word is text.
+        return kinds.pop() if len(kinds) == 1 else str
+    return str if origin is Literal else annotation
+
+
+def changes_of(
+    given: Mapping[str, Any], keywords: Mapping[str, Keyword], nuisances: NuisanceChoice
+) -> dict[str, dict[str, Any]]:
+    """Return the values that keywords set, by sections of the study; stars have their own function."""
+    changes: dict[str, dict[str, Any]] = {}
+    flags: dict[str, str] = {}
+    for name, keyword in keywords.items():
+        section, _, key = keyword.path.rpartition(".")
+        if given[name] is None or section == "star" or name == "nuisance":
+            continue
+        other = flags.setdefault(keyword.path, name)
+        if other != name:
+            raise InputError(f"give either `{other}` or `{name}`: both set {keyword.path}", key=other)
+        changes.setdefault(section, {})[key] = keyword.value(given[name])
+    if spreads := given.get("nuisance"):
+        # Texts such as dark=0.1, or with the name of a file, stray.txt=free.
+        expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
+        if not isinstance(spreads, Mapping):
+            spreads = dict(read_assignment(text, "nuisance", expected) for text in spreads)
+        files = {
+            Path(name).stem: {"file": Path(name), "sd": sd} for name, sd in spreads.items() if name not in NUISANCES
+        }
+        own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()} | files
+        named = {name: sd for name, sd in spreads.items() if name in NUISANCES}
+        changes.setdefault("nuisances", {}).update(named | ({"own": own} if own else {}))
+    return changes
+
+
+def stars_of(
+    stars: Sequence[Star], given: Mapping[str, Any], keywords: Mapping[str, Keyword], *, own: bool
+) -> list[dict[str, Any]] | None:
+    """Return the data of the stars that keywords name or change, or None; `own`: the user's study has `stars`."""
+    if "star" not in given:
+        return None
+    names, magnitudes = given["star"], given["magnitude"]
+    described = [name for name, of in keywords.items() if of.path.startswith("star.") and given[name] is not None]
+    others = [name for name in described if name not in ("star", "magnitude")]
+    changed = {keywords[name].path.removeprefix("star."): given[name] for name in others}
+    of_files = [key for key in changed if key in FILE_KEYS]
+    if not (names or magnitudes or changed):
+        return None
+    if not (names or own):
+        # Those of the default study are not meant.
+        fault = f"`{described[0]}` needs a star, such as `star='M3V'`; `mauvecl library` lists them"
+        raise InputError(fault, key="star")
+    if names:
+        # A name of an existing file is a file; other names are searched for in the library.
+        each = [star for name in names for star in ([name] if is_there(name) else map(str.strip, name.split(",")))]
+        data: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
+    else:
+        data = [entry.model_dump(exclude_none=True) for entry in stars]
+    if magnitudes:
+        if len(magnitudes) not in (1, len(data)):
+            of = "one star" if len(data) == 1 else f"{len(data)} stars"
+            fault = f"there are {len(magnitudes)} magnitudes for {of}; give one for all or one each"
+            raise InputError(fault, key="magnitude")
+        for entry, value in zip(data, magnitudes * (len(data) if len(magnitudes) == 1 else 1), strict=True):
+            entry["magnitude"] = value
+    if of_files and not any("file" in entry for entry in data):
+        named = " and ".join(f"`{key}`" for key in of_files)
+        raise InputError(f"{named} needs a spectrum file among the stars: `star='my-star.txt'`", key=of_files[0])
+    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
+    return [entry | (changed if "file" in entry else same) for entry in data]
+
+
+def is_there(name: str) -> bool:
+    """Return whether a file has that name, which may contain commas."""
+    try:
+        return bool(name) and files.without_columns(name)[0].exists()
+    except (OSError, ValueError):
+        # Impossible file names raise an error.
+        return True
+
+
+def _is_file(name: str) -> bool:
+    # "K2.5V" and "power law -1.5" look like file names but are stars.
+    suffix = Path(name).suffix
+    return is_there(name) or (bool(suffix) and not suffix[1:].isupper() and resolve(name) is None)

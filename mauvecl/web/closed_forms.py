@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -11,22 +12,25 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
+from scipy.interpolate import PchipInterpolator
 
-from mauvecl.answers.closed_forms import InterpolatedForm, unknown_cost, unknown_lines
+from mauvecl.answers.closed_forms import unknown_cost, unknown_lines
 from mauvecl.answers.limit import LimitSearch
 from mauvecl.detection.distributions import Gaussian, Mixture
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.exposure.expectation import entirely_saturated
 from mauvecl.schema.columns import chance_range, chance_text
 from mauvecl.schema.errors import InputError
-from mauvecl.study.analyses import SPECTRUM
 from mauvecl.study.cases import Case, Loader, collect_messages
+from mauvecl.study.questions import SPECTRUM
 from mauvecl.study.study import Study, set_key
-from mauvecl.web.fields import ASKED_UNDER, FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, Choice, sentence, star_words
+from mauvecl.web.fields import ASKED_UNDER, FIELDS, IDEAL, REALISTIC, UNKNOWN, WITH_FILE, sentence, star_words
 from mauvecl.web.uploads import VisitorFile, write_spectrum
 
 if TYPE_CHECKING:
     from mauvecl.answers.detect import DetectAnswer
+    from mauvecl.detection.distributions import Form
     from mauvecl.detection.statistics import DetectionForms
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
@@ -62,21 +66,16 @@ class FieldValues:
         """The star, as part of a sentence."""
         return "your own star" if self.uploaded is not None else star_words(self.star)
 
-    @property
-    def as_bright_as_observed(self) -> bool:
-        """True if the visitor's file gives the brightness of the flare, and not the amplitude."""
-        return "flare_file" in self.uploads and bool(self.values["as_observed"])
-
     def case(self, folder: Path) -> Case:
         """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
-        The visitor's files are written to the folder for the study to find. Raises InputError for incompatible values.
+        The visitor's files are written to the folder for the study to find.
         """
         uploaded = self.uploaded
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
         case = Case(Study.build(self._data(folder), "page"), loader=loader)
-        return case.at_observed_brightness() if self.as_bright_as_observed else case
+        return case.at_observed_brightness() if case.study.flare.spectrum.as_observed else case
 
     def _data(self, folder: Path) -> dict[str, Any]:
         """Return the question as the data of a study, whose files are written to a folder."""
@@ -87,7 +86,7 @@ class FieldValues:
                 set_key(data, [*page_field.path], value, name)
         star = {"library": values["star"]}
         if self.uploaded is not None:
-            star = {"file": str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))}
+            star = {"file": write_spectrum(self.uploaded, folder, SPECTRA["star"])}
         data["star"] = [data["star"] | star]
         if values["sky"] == "none":
             data["sky"] = {"none": True}
@@ -96,10 +95,8 @@ class FieldValues:
         if "change_file" in self.uploads and SPECTRUM not in values["changes"]:
             data["change"]["of"] = (*values["changes"], SPECTRUM)
         points = self.uploads.get("own_unknown", values["own_unknown"])
-        data["nuisances"] = {
-            "usual": values["unknown"] == REALISTIC,
-            "own": {"own": {"points": points}} if points else {},
-        }
+        own = {"own": {"points": points}} if points else {}
+        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": own}
         number, tails = values["realisations"]
         statistics = list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]]))
         data["run"] |= {"realisations": number, "tails": tails, "statistics": statistics}
@@ -127,15 +124,35 @@ class FieldValues:
         if value is None or not conditions.get(name, True):
             return None
         if page_field.kind == "upload":
-            written = value.written(folder)
-            return str(written) if isinstance(written, Path) else written
+            return value.written(folder)
         if page_field.kind == "file":
-            return str(write_spectrum(value, folder, SPECTRA[name]))
+            return write_spectrum(value, folder, SPECTRA[name])
         if page_field.kind == "table":
-            return str(VisitorFile("neighbours.csv", value.encode()).written(folder))
+            return VisitorFile("neighbours.csv", value.encode()).written(folder)
         value = value if page_field.scale == 1.0 else value / page_field.scale
         # A single flare.
         return [value] if page_field.path[-1] == "amplitudes" else value
+
+
+class InterpolatedForm:
+    """Closed form that is exact at some points and interpolated in the probit between them."""
+
+    def __init__(self, form: Form) -> None:
+        self.mean, self.std = form.mean, form.std
+        at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
+        beyond = np.array([form.sf(value) for value in at])
+        # Probabilities that round to 0 or 1 have no finite probit.
+        inside = (beyond > 1e-12) & (beyond < 1 - 1e-12)
+        self._probit = PchipInterpolator(at[inside], special.ndtri(beyond[inside]), extrapolate=True)
+        self._inverse = PchipInterpolator(-special.ndtri(beyond[inside]), at[inside], extrapolate=True)
+
+    def sf(self, value: Float) -> Float:
+        """Return the probabilities of exceeding values."""
+        return np.asarray(special.ndtr(self._probit(value)))
+
+    def isf(self, probability: Float) -> Float:
+        """Return the values that are exceeded with given probabilities."""
+        return np.asarray(self._inverse(-special.ndtri(probability)))
 
 
 #: Answers that are simulated, by name: of one question.
@@ -159,14 +176,12 @@ class ClosedForms:
     ) -> ClosedForms:
         """Answer a question; `folder` holds the visitor's files for the study, and `given` their contents.
 
-        Without the chance a star may be too bright for the chance of detection. Raises InputError for incompatible
-        values.
+        Without the chance a star may be too bright for the chance of detection.
         """
         case = question.case(folder)
-        if question.as_bright_as_observed:
-            values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
-            question = replace(question, values=values)
-        closed = cls(question, case, given or {})
+        # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.
+        values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
+        closed = cls(replace(question, values=values), case, given or {})
         if chance:
             _ = closed.odds
         return closed
@@ -233,12 +248,10 @@ class ClosedForms:
     @property
     def words(self) -> str:
         """Question in words, as part of a sentence."""
-        q, x = self.question, self.quiet
+        q, x, light = self.question, self.quiet, self.study.flare.light().describe()
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
-        return (
-            f"a {q.amplitude_percent:g} % flare ({self.study.flare.light().describe()}) on {q.star_in_words} of "
-            f"{q.band} = {q.magnitude:g}, in {x.exposure_s:g} s ({frames})"
-        )
+        star = f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
+        return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
     def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:
         """Return the closed forms for factors on the light and on the amplitude, of shape (n_rise,).
@@ -341,15 +354,12 @@ def solved(closed: ClosedForms) -> str:
 
 def other_payloads(closed: ClosedForms) -> str:
     """Return a sentence on the chances with other payloads than the question's."""
-    clauses, payloads = [], FIELDS["instrument"].read
-    assert isinstance(payloads, Choice)
-    for name in payloads.options:
+    clauses = []
+    for name in FIELDS["instrument"].choices:
         if name != closed.question.instrument:
-            shown = []
+            shown = dict.fromkeys(UNKNOWN, "no number")
             for unknown in UNKNOWN:
-                try:
-                    shown.append(chance_text(closed.assuming(unknown, instrument=name).chance))
-                except InputError:
-                    shown.append("no number")
-            clauses.append(f"Chances with {name}: {' and '.join(shown)}.")
+                with contextlib.suppress(InputError):
+                    shown[unknown] = chance_text(closed.assuming(unknown, instrument=name).chance)
+            clauses.append(f"Chances with {name}: {' and '.join(shown.values())}.")
     return " ".join(clauses)

@@ -11,21 +11,7 @@ from mauvecl.answers.closed_forms import Cost, spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
 from mauvecl.answers.signal import simulate
-from mauvecl.charts.chart import (
-    SATURATED,
-    WAVELENGTH,
-    Area,
-    Axis,
-    Bars,
-    Chart,
-    ChartData,
-    Custom,
-    Dots,
-    Line,
-    Listed,
-    Own,
-    Rule,
-)
+from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Bars, Chart, ChartData, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.charts.detection import roc_columns
 from mauvecl.charts.limits import BUDGET, budget_series
 from mauvecl.detection.requests import statistic_label
@@ -34,7 +20,7 @@ from mauvecl.schema.columns import View, chance_text, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.observation import NuisanceChoice
 from mauvecl.web.closed_forms import Answers, short
-from mauvecl.web.figures import strips
+from mauvecl.web.figures import SATURATED, strips
 from mauvecl.web.tab import Tab
 
 if TYPE_CHECKING:
@@ -362,12 +348,11 @@ def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
 def table_of_costs(closed: ClosedForms, answers: Answers) -> View:
     """Return the S/N of the flare with each unknown, and the chance to detect it."""
     rows, fap = costs(closed), closed.question.fap
-    table = [
-        {"unknown": row.of, "plain": row.plain, "marginalised": row.marginal,
-         "detected": float(power(row.marginal, fap))}
-        for row in (Cost("nothing: everything is known", *[rows[0].known] * 3), *rows)
-    ]  # fmt: skip
-    return View("", [column for column in COLUMNS if column.name in table[0]], table)
+    known = Cost("nothing: everything is known", *[rows[0].known] * 3)
+    cells = [(row.of, row.plain, row.marginal, float(power(row.marginal, fap))) for row in (known, *rows)]
+    names = ("unknown", "plain", "marginalised", "detected")
+    table = [dict(zip(names, row, strict=True)) for row in cells]
+    return View("", [column for column in COLUMNS if column.name in names], table)
 
 
 UNKNOWN = Tab(

@@ -18,18 +18,7 @@ from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, named_star, near_names
 from mauvecl.host.tables.text_tables import columns, text_table
 from mauvecl.schema.errors import SUBJECT, InputError, shortened
-from mauvecl.schema.fields import (
-    Flag,
-    Help,
-    Range,
-    Unit,
-    Widget,
-    as_typed,
-    first,
-    found,
-    range_of,
-    with_unit,
-)
+from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget, as_typed, first, found, range_of, with_unit
 from mauvecl.schema.physical import LineFraction
 from mauvecl.schema.section import check_different
 from mauvecl.study.study import keys_of, study_keys
@@ -365,11 +354,7 @@ ADVANCED = {
 #: Fields of the card.
 SOLVED = _group("Limit")
 #: Fields that apply only with the file of another field, below which they stand.
-WITH_FILE = {
-    "star": _group("Own spectrum"),
-    "flare_file": _group("Own flare"),
-    "change_file": _group("Added spectrum"),
-}
+WITH_FILE = {"star": _group("Own spectrum"), "flare_file": _group("Own flare"), "change_file": _group("Added spectrum")}
 #: Fields of forms of their own, which stand in the panels of the tabs that read them.
 FORMS = {"campaign": _group("Campaign"), "frames": _group("Frames"), "standards": _group("Standards")}
 #: Fields that apply only with one text of another field.

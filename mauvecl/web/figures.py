@@ -3,36 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from bokeh import models
 from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.plotting import figure
 
-from mauvecl.charts.chart import (
-    Area,
-    Axis,
-    Bars,
-    Chart,
-    Contours,
-    Custom,
-    Dots,
-    Line,
-    Listed,
-    Own,
-    Rule,
-    Series,
-    Strips,
-    Targets,
-)
+from mauvecl.charts.chart import Area, Bars, Contours, Custom, Dots, Line, Listed, Own, Rule, Strips, Targets
 from mauvecl.host.arrays import true_runs
+from mauvecl.host.stars.flare import EmissionLine
+
+if TYPE_CHECKING:
+    from mauvecl.charts.chart import Axis, Chart, Series
 
 #: Wavelengths that are shown, nm.
 SHOWN_NM = (195.0, 705.0)
-#: Spectral lines, nm in vacuum (NIST Atomic Spectra Database, version 5): Mg II h and k, Ca II H and K, H alpha. The
-#: Balmer jump is 4 / R_H, with Rydberg's constant for hydrogen.
-MARKS = {"Mg II": (279.63, 280.35), "Ca II": (393.48, 396.96), "Balmer jump": (364.7,), "H alpha": (656.46,)}
+#: Spectral lines, and the Balmer jump at 4 / R_H with Rydberg's constant for hydrogen, nm in vacuum.
+MARKS = {name: EmissionLine.named(name).wavelengths_nm for name in ("Mg II", "Ca II", "H alpha")}
+MARKS["Balmer jump"] = (364.7,)
 #: Marks that are hidden by default.
 MORE_MARKS = ("H alpha",)
 
@@ -73,14 +62,13 @@ class Canvas:
         self.legend: list[tuple[str, str, str, str]] = []
         if chart.x.kind == "wavelength":
             self._mark()
-        own = [item for item in chart.series if isinstance(item, Own)]
         # A line for each scenario that can be pinned is drawn as the series that it repeats.
         pins = [
             replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
                     tips=(), listed=False)
             for k, (colour, dash) in enumerate(PINS[theme]) for item in chart.series if item.key == chart.pins
         ]  # fmt: skip
-        for series in (*(item for item in chart.series if item not in own), *pins, *own):
+        for series in sorted((*chart.series, *pins), key=lambda item: isinstance(item, Own)):
             self._add(series)
 
     def _frame(self, x: Axis, y: Axis) -> Any:
@@ -156,9 +144,8 @@ class Canvas:
             return
         if isinstance(series, Targets):
             for k, colour in enumerate(TARGETS):
-                self._add(
-                    Line(f"target {k + 1}", colour, f"{series.key} {k}", width=2, dash=series.dash, tips=series.tips)
-                )
+                look = {"width": 2, "dash": series.dash, "tips": series.tips}
+                self._add(Line(f"target {k + 1}", colour, f"{series.key} {k}", **look))
             return
         source = models.ColumnDataSource({column: [] for column in series.columns}, name=series.key)
         if isinstance(series, Custom):
@@ -245,6 +232,10 @@ class Canvas:
                     text_font="system-ui", text_font_size="10px", text_color=colour, text_alpha=0.8, **how,
                 )
             )  # fmt: skip
+
+
+#: Pixels that saturate, whose data `strips` returns.
+SATURATED = Strips("saturated", "own", show="if any", alpha=0.18, hatched=True)
 
 
 def strips(wavelength_nm: Any, flags: Any) -> tuple[Any, Any]:

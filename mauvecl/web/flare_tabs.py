@@ -22,13 +22,12 @@ from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import Tab
-from mauvecl.web.uploads import Shelf
+from mauvecl.web.uploads import RESULTS
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
-    from mauvecl.answers.measure import ExpectedMeasurement, MeasuredFlare
-    from mauvecl.detection.statistics import DetectionForms
+    from mauvecl.answers.measure import ExpectedMeasurement
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.web.closed_forms import ClosedForms
     from mauvecl.web.figures import Canvas
@@ -47,15 +46,8 @@ LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}
 FIRST, HALVINGS, CHANGE = 9, 5, 0.1
 
 
-#: Maps and curves of all visitors, without the closed forms, which take tens of MB.
-KEPT = Shelf(2**26)
 #: Fields on which a map does not depend; an upload is identified by its content.
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours", "uploaded"}
-
-
-def odds(closed: ClosedForms, magnitude: float, rises: Float) -> list[DetectionForms]:
-    """Return `ClosedForms.at` a magnitude."""
-    return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
 
 def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -> T:
@@ -63,10 +55,11 @@ def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -
     question = closed.question
     values = (value for name, value in question.values.items() if name not in FREE)
     key = (*values, question.uploaded and question.uploaded.digest, *more)
-    found: T | None = KEPT.get(None, make.__name__, key)
+    # Of all visitors, without the closed forms, which take tens of MB.
+    found: T | None = RESULTS.get(None, make.__name__, key)
     if found is None:
         found = make(closed)
-        KEPT.keep(None, make.__name__, key, found, 32)
+        RESULTS.keep(None, make.__name__, key, found, 32)
     return found
 
 
@@ -74,7 +67,7 @@ def _curve(closed: ClosedForms) -> tuple[Float, Float]:
     """Return magnitudes and probabilities, with more points where these change."""
 
     def exact(magnitudes: Float) -> list[float]:
-        each = (odds(closed, magnitude, np.ones(1)) for magnitude in magnitudes)
+        each = (closed.at(light, np.ones(1)) for light in 10 ** (-0.4 * (magnitudes - closed.question.magnitude)))
         return [forms[0].probability if forms else 0.0 for forms in each]
 
     x = np.linspace(*MAGNITUDES, FIRST)
@@ -101,19 +94,18 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
     # A saturated star has no detectable flare.
     forms = np.zeros((4, rows, columns))
     forms[0], forms[2] = -30.0, 3.0
-    for i, magnitude in enumerate(x):
-        for j, outcome in enumerate(odds(closed, magnitude, 10**y / closed.question.amplitude_percent)):
+    for i, light in enumerate(10 ** (-0.4 * (x - closed.question.magnitude))):
+        for j, outcome in enumerate(closed.at(light, 10**y / closed.question.amplitude_percent)):
             unit, seen = outcome.null.std, outcome.flaring
             part = max((seen.mean - outcome.null.mean) / unit, 1e-9)
             cut = (outcome.threshold - outcome.null.mean) / unit
             forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
     part, spread, cut, skewness = PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1])
-    off = (cut - np.exp(part)) / np.exp(spread)
-    shape = 4 / np.maximum(skewness, 1e-4) ** 2
-    gamma = special.gammaincc(shape, np.maximum(shape + np.sqrt(shape) * off, 0.0))
     # At low skewness the distribution is normal.
-    return *fine, np.where(skewness > 1e-4, gamma, special.ndtr(-off))
+    shape = 4 / np.maximum(skewness, 1e-4) ** 2
+    off = np.sqrt(shape) * (cut - np.exp(part)) / np.exp(spread)
+    return *fine, special.gammaincc(shape, np.maximum(shape + off, 0.0))
 
 
 @Chart(
@@ -284,11 +276,6 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
     return measurements
 
 
-def simulated(answers: Answers) -> MeasuredFlare | None:
-    """Return the simulated fits of the flare's own model, if there are any."""
-    return answers["measure"].flares[-1] if "measure" in answers else None
-
-
 @Chart(
     "errors", "Error of the temperature for smaller and larger flares", Axis("flare amplitude (%)", log=True),
     Axis("error of the temperature (%)", log=True, limits=(0.1, 1000)),
@@ -338,9 +325,9 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
     true, without_noise = all_known.truth[:2], all_known.perfect.estimates[0, :2]
     best = true if np.isfinite(true).all() else without_noise
     series: dict[str, Any] = {"own": ([best[0]], [100 * best[1]])}
-    fits = simulated(answers)
-    if fits is not None:
-        some = fits.found.estimates[:MOST_DOTS]
+    if "measure" in answers:
+        # The last fits are those of the flare's own model.
+        some = answers["measure"].flares[-1].found.estimates[:MOST_DOTS]
         series["fits"] = some[:, 0], 100 * some[:, 1]
     one_temperature = isinstance(all_known.fitted, FlareModel)
     for name, measurement in (("known", all_known), ("free", free)):
@@ -394,19 +381,15 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
         near = (since > -NEAR[0]) & (since < NEAR[1])
         for name, fit in (("true", stare_fit.joint.true), ("joint", stare_fit.joint.fitted)):
             series[name] = stare.middle_s[near], fit.kelvin[near]
-        measurement = stare_fit.joint.found
-        each = zip(
-            measurement.names[:4], measurement.units, measurement.estimates[0], measurement.errors[0], strict=False
-        )
+        found = stare_fit.joint.found
+        each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
         words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
     if stare_fit.unmeasured:
         words.append(stare_fit.unmeasured)
     elif stare_fit.drawn is not None:
-        bins = stare_fit.drawn
-        x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
-        ends = (
-            np.where(np.isfinite(end), end, kelvin) for end in (bins.found.low[-1, :, 0], bins.found.high[-1, :, 0])
-        )
+        bins, found = stare_fit.drawn, stare_fit.drawn.found
+        x, kelvin = (bins.start_s + bins.end_s) / 2, found.estimates[:, 0]
+        ends = (np.where(np.isfinite(end), end, kelvin) for end in (found.low[-1, :, 0], found.high[-1, :, 0]))
         series |= {"estimates": (x, kelvin), "bins": (x, *ends)}
         two = not isinstance(next(iter(expected(closed).values())).fitted, FlareModel)
         words.append(f"{x.size} bins of frames{', each fitted with one temperature' if two else ''}")
@@ -415,19 +398,18 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
 
 def measured(closed: ClosedForms, answers: Answers) -> View:
     """Return the errors of each quantity, and the counts of simulated fits."""
-    each, fits = expected(closed), simulated(answers)
+    each = expected(closed)
     first, *_ = each.values()
-    errors = zip(*(measurement.ahead.errors for measurement in each.values()), strict=True)
-    table = [
-        {"quantity": name, "unit": unit, "truth": truth, **dict(zip(each, own, strict=True))}
-        for name, unit, truth, own in zip(first.ahead.names, first.ahead.units, first.truth, errors, strict=True)
-    ]
-    if fits is not None:
-        table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
+    errors = [measurement.ahead.errors for measurement in each.values()]
+    rows = zip(first.ahead.names, first.ahead.units, first.truth, *errors, strict=True)
+    table = [dict(zip(("quantity", "unit", "truth", *each), row, strict=True)) for row in rows]
     verb = {column.name: column for column in COLUMNS}
     of_error = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
     columns = [verb["quantity"], verb["unit"], verb["truth"], *of_error]
-    columns += [] if fits is None else [verb["scatter"], verb["coverage_95"]]
+    if "measure" in answers:
+        counts = records(answers["measure"].flares[-1].rows())
+        table = [row | counted for row, counted in zip(table, counts, strict=True)]
+        columns += [verb["scatter"], verb["coverage_95"]]
     return View("", columns, table)
 
 
@@ -477,10 +459,8 @@ def shares(closed: ClosedForms, answers: Answers) -> ChartData:
     injected, parts = answers["completeness"].stars[0].injected, []
     for k, width in enumerate(injected.half_widths_s):
         x, share = 100 * injected.sizes, injected.completeness[k]
-        series |= {
-            f"band {k}": (x, injected.completeness_low[k], injected.completeness_high[k]),
-            f"line {k}": (x, share),
-        }
+        series[f"line {k}"] = x, share
+        series[f"band {k}"] = x, injected.completeness_low[k], injected.completeness_high[k]
         seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
         parts.append(f"{chance_text(seen)} of those of half-width {short(width)} s")
     peak = f"{closed.question.amplitude_percent:g} %"

@@ -11,32 +11,9 @@ from bokeh.palettes import interp_palette
 from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Axis,
-    Chart,
-    ChartData,
-    Contours,
-    Custom,
-    Dots,
-    Line,
-    Listed,
-    Own,
-    Rule,
-    Strips,
-    Targets,
-)
+from mauvecl.charts import chart, spectra
+from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, ChartData, Custom, Dots, Line, Own, Rule, Strips, Targets
 from mauvecl.charts.light_curves import SCATTER, scatter_series
-from mauvecl.charts.spectra import (
-    BIN,
-    THROUGHPUT,
-    TRANSFER,
-    along_magnitude,
-    residual_series,
-    shown_name,
-    throughput_series,
-    transfer_series,
-)
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.columns import with_error
 from mauvecl.schema.errors import InputError
@@ -137,9 +114,9 @@ def _image(canvas: Canvas, source: ColumnDataSource) -> None:
     "dynamic", "Dynamic spectrum", Axis("time from the first frame (min)"), Axis("wavelength (nm)"),
     (
         Custom("dynamic", columns=("image", "x", "y", "dw", "dh"), draw=_image),
-        Contours("events", "star", "marks", show="if any", width=5),
-        Listed("brighter than the median", RED, form="bar"),
-        Listed("fainter", BLUE, form="bar"),
+        chart.Contours("events", "star", "marks", show="if any", width=5),
+        chart.Listed("brighter than the median", RED, form="bar"),
+        chart.Listed("fainter", BLUE, form="bar"),
     ),
 ).data()  # fmt: skip
 def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
@@ -224,16 +201,16 @@ ANALYSE = Tab(
 NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
 
 
-@THROUGHPUT.data("calibrate", NO_OBSERVATIONS)
+@spectra.THROUGHPUT.data("calibrate", NO_OBSERVATIONS)
 def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the fitted throughput with its 95 % band, and the nominal one."""
     ratio = answer.throughput_table["ratio"]
     text = f"{answer.notice} It is {ratio.min():.3g} to {ratio.max():.3g} times the nominal one."
-    return ChartData(text, throughput_series(answer))
+    return ChartData(text, spectra.throughput_series(answer))
 
 
 @Chart(
-    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {BIN} pixels (sigma)"),
+    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {spectra.BIN} pixels (sigma)"),
     (
         Targets("residual", tips=("residual (sigma)",)),
         Rule("2 sigma", "threshold", "above", along="y", at=2.0),
@@ -242,20 +219,20 @@ def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
 ).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
 def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the residuals of each star."""
-    rows = residual_series(answer)
+    rows = spectra.residual_series(answer)
     words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
     text = f"Root mean square, 1 for noise alone: {words}; p = {answer.throughput.p_value:.2g}."
     return ChartData(text, {"residual": rows})
 
 
-@TRANSFER.data("calibrate", NO_OBSERVATIONS)
+@spectra.TRANSFER.data("calibrate", NO_OBSERVATIONS)
 def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
     """Return the measured over the fitted variance."""
     t = answer.transfer
     text = f"Gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise {t.read_noise_dn:.3g} DN."
     if "gain" in t.assumed:
         text = "The frames do not determine the gain: it is nominal."
-    return ChartData(text, transfer_series(answer)[0])
+    return ChartData(text, spectra.transfer_series(answer)[0])
 
 
 def read_observations(question: FieldValues) -> dict[str, Any]:
@@ -267,10 +244,8 @@ def read_observations(question: FieldValues) -> dict[str, Any]:
         mapping = files[str(row.mapping)] if row.mapping else None
         frames.append(read_frames_of(files[str(row.frames)], mapping))
         if sum(some.flux.size for some in frames) > MOST_VALUES:
-            raise InputError(
-                f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line",
-                key="observations",
-            )
+            fault = f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line"
+            raise InputError(fault, key="observations")
         if row.spectrum is None:
             stars.append(row.source())
             continue
@@ -301,9 +276,9 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
         lines, words, own = [], list[str](), list[float]()
         for row in here:
             change, scale = row.change.name, units[row.change.unit]
-            lines += along_magnitude(answer, [change], scale)
+            lines += spectra.along_magnitude(answer, [change], scale)
             hidden = np.isinf(row.smallest.one)
-            words.append(f"{shown_name(change)} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
+            words.append(f"{spectra.shown_name(change)} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
             own += [] if hidden else [scale * row.smallest.one]
         text = (
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
@@ -312,8 +287,8 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
         return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
 
     axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
-    chart = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
-    return chart.data("change", "Change computes which differences between visits are detected.")(along)
+    changes = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
+    return changes.data("change", "Change computes which differences between visits are detected.")(along)
 
 
 CHANGE = Tab(
@@ -355,9 +330,9 @@ def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
     x, y = (values.ravel() for values in np.meshgrid(r.periods_d, r.amplitudes))
     wide, high = (np.sqrt(points[1] / points[0]) for points in (r.periods_d, r.amplitudes))
     share = row.shares("value").ravel()
+    each = [(row.error, row.change) for row in answer.periods]
     errors = "; ".join(
-        f"{shown_name(row.change.name)} {row.error * (1 if row.change.unit else 100):.3g} {row.change.unit or '%'}"
-        for row in answer.periods
+        f"{spectra.shown_name(of.name)} {error * (1 if of.unit else 100):.3g} {of.unit or '%'}" for error, of in each
     )
     text = (
         f"{r.time_d.size} visits within {np.ptp(r.time_d):.0f} days recover {100 * np.mean(share):.0f} % of the "

@@ -23,7 +23,7 @@ from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
 from mauvecl.schema.fields import as_typed
 from mauvecl.study.plan import PlanTarget
-from mauvecl.web.closed_forms import OTHER, TITLES, Answers, Chance, ClosedForms, FieldValues, chances, short
+from mauvecl.web.closed_forms import OTHER, TITLES, Answers, ClosedForms, FieldValues, chances, short
 from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
 from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
@@ -76,10 +76,10 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the contents of the card.
 
     It holds ``headline``, the sentence of the tab's simulated answer, or before that on the chance if there is one,
-    and ``words``, the question;
-    ``chance`` says whether there are ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and
-    ``interval`` are of the question's choice; ``facts``, pairs of names and values; ``notes``, pairs of sentences and
-    kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
+    and ``words``, the question; ``chance`` says whether there are ``numbers``, one for each choice of what is unknown;
+    ``chosen``, ``shown`` and ``interval`` are of the question's choice; ``facts``, pairs of names and values;
+    ``notes``, pairs of sentences and kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of
+    downloads.
     """
     messages = answers[tab.answer].messages if tab.answer in answers else []
     # The first sentence of the command line's output.
@@ -95,29 +95,28 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "facts": [],
         "notes": _notes(messages),
         "simulated": sorted(name for name in answers if name not in ("snr", "draw", OTHER)),
-        "files": [f"{each.name} {name}" for each in TABS.values() for name in each.files if each.offers(name, answers)]
-        + [f"{each.name} {name}" for each in TABS.values() for name, of in each.documents.items() if of in answers],
+        "files": [
+            f"{each.name} {name}"
+            for each in TABS.values()
+            for name in (*each.files, *each.documents)
+            if each.offers(name, answers)
+        ],
     }
     return plain | (_with_chance(str(plain["headline"]), closed, answers) if tab.chance else {})
 
 
-def _estimate(closed: ClosedForms, both: list[Chance]) -> str:
-    """Return the sentence with which `mauvecl detect` begins, by the closed form; empty where it has no number."""
-    shown = {chance.unknown: chance_text(chance.value) for chance in both if chance.value == chance.value}
-    if (chance := shown.get(closed.question.unknown)) is None:
-        return ""
-    if closed.question.unknown == REALISTIC and IDEAL in shown:
-        chance += f" ({shown[IDEAL]} {IF_KNOWN})"
-    seen = chance_of_flare(closed.study, closed.case.label, closed.case.amplitudes[0], closed.quiet, chance)
-    return f"{seen}, by the estimate before a simulation."
-
-
 def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
-    """Return the entries of a card with the chance of detection."""
+    """Return the entries of a card with the chance of detection; its headline is by default that of the closed form."""
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
-    told = [message for name in TOLD if name in answers for message in answers[name].messages]
+    shown = {chance.unknown: chance_text(chance.value) for chance in both}
     (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
+    if not headline and chosen.value == chosen.value:
+        ideal = q.unknown == REALISTIC and all(chance.value == chance.value for chance in both)
+        seen = shown[q.unknown] + (f" ({shown[IDEAL]} {IF_KNOWN})" if ideal else "")
+        seen = chance_of_flare(closed.study, closed.case.label, closed.case.amplitudes[0], x, seen)
+        headline = f"{seen}, by the estimate before a simulation."
+    told = [message for name in TOLD if name in answers for message in answers[name].messages]
     facts = []
     if "detection" in answers:
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
@@ -134,19 +133,13 @@ def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[s
         f"per test, with the payload {q.instrument}."
     )
     return {
-        "headline": headline or _estimate(closed, both),
+        "headline": headline,
         "numbers": [
-            {
-                "unknown": unknown,
-                "title": TITLES[unknown],
-                "shown": chance_text(value),
-                "value": None if value != value else value,
-                "interval": how,
-            }
-            for unknown, value, how in both
+            {"unknown": of, "title": TITLES[of], "shown": shown[of], "value": None if p != p else p, "interval": how}
+            for of, p, how in both
         ],
         "chosen": q.unknown,
-        "shown": chance_text(chosen.value),
+        "shown": shown[q.unknown],
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",
         "words": words,
         "facts": facts,
@@ -201,30 +194,23 @@ class State:
             }
         self.entered = {name: field.first for name, field in ENTRIES.items()}
         self._values, self._invalid = dict(FIRST), dict[str, str]()
-        for name in ENTRIES:
+        for name, field in ENTRIES.items():
+            if name not in given:
+                continue
+            text = given[name]
+            self.entered[name] = text[: field.characters]
             try:
-                if name in given:
-                    self._values[name] = self._read(name, given[name])
+                if len(text) > field.characters:
+                    raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
+                self._values[name] = field.read(text)
+                if name in UPLOADS and text == UPLOADS[name].entered and name not in self.uploads:
+                    raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
             except InputError as error:
                 self._invalid[name] = sentence(error)
         for name, field in SEEN.items():
             if name in self._invalid:
                 self.entered[name] = field.first
                 self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
-
-    def _read(self, name: str, text: str) -> Any:
-        """Enter a text, and return its value."""
-        field = ENTRIES[name]
-        self.entered[name] = text[: field.characters]
-        if len(text) > field.characters:
-            raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
-        value = field.read(text)
-        if self._holds_file(name) and name not in self.uploads:
-            raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
-        return value
-
-    def _holds_file(self, name: str) -> bool:
-        return name in UPLOADS and self.entered[name] == UPLOADS[name].entered
 
     def faults_of(self, names: Collection[str]) -> dict[str, str]:
         """Return the error messages of some fields, with those of values that cannot be together."""
@@ -249,18 +235,14 @@ class State:
         return tuple(self.entered[name] for name in FIELDS if name in names)
 
     def question(self, names: Collection[str] = tuple(FIELDS)) -> FieldValues:
-        """Return the question, whose other fields have their first values.
-
-        Raises InputError with the accepted values if a requested field is invalid.
-        """
+        """Return the question, whose other fields have their first values."""
         faults = self.faults_of(names)
         if faults:
             all_of_them = "; ".join(f"{ENTRIES[name].label}: {why}" for name, why in faults.items())
             raise InputError(all_of_them, key=next(iter(faults)))
         values = {name: (self._values if name in names else FIRST)[name] for name in FIELDS}
-        return FieldValues(
-            values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
-        )
+        holding = [name for name in UPLOADS if name in names and self.entered[name] == UPLOADS[name].entered]
+        return FieldValues(values, {name: self.uploads[name] for name in holding})
 
 
 def known(state: State) -> dict[str, Any]:
@@ -269,21 +251,19 @@ def known(state: State) -> dict[str, Any]:
     The star has ``about`` in words, ``given``, texts of fields, and ``offer``, the words of a button that enters them;
     ``targets`` has texts by the columns of the table for each row.
     """
+    about: dict[str, Any] = {"about": "", "given": {}, "offer": ""}
+    text = state.entered["star"]
+    star = None if text == UPLOADED else resolve(text, own=False)
+    if star is not None and star.known is not None:
+        magnitude = f"{star.known.magnitude:g}"
+        given = {"magnitude": magnitude, "band": "V", "target": star.name}
+        about = {"about": star.known.about, "given": given, "offer": f"Use V = {magnitude}"}
+    elif star is not None and star.light is None:
+        about["about"] = listed_note(text)
     rows: tuple[dict[str, Any], ...] = ()
     with contextlib.suppress(InputError):
         rows = targets(state.entered["targets"], check=False)
-    return {"star": _star(state.entered["star"]), "targets": list(map(_target, rows))}
-
-
-def _star(text: str) -> dict[str, Any]:
-    star = None if text == UPLOADED else resolve(text, own=False)
-    if star is None:
-        return {"about": "", "given": {}, "offer": ""}
-    if star.known is None:
-        return {"about": listed_note(text) if star.light is None else "", "given": {}, "offer": ""}
-    magnitude = f"{star.known.magnitude:g}"
-    given = {"magnitude": magnitude, "band": "V", "target": star.name}
-    return {"about": star.known.about, "given": given, "offer": f"Use V = {magnitude}"}
+    return {"star": about, "targets": list(map(_target, rows))}
 
 
 def _target(row: dict[str, Any]) -> dict[str, str]:

@@ -40,8 +40,7 @@ def read_limited(kind: Callable[..., T], reader: Callable[..., T], files: Mappin
     """Read the first of some files, by their names, in a process with limited memory and time.
 
     The reader, a function of a path and of options, may need the other files; it returns a dataclass of this kind.
-    Blocks for about a second, most of it for the start of Python: call it from a thread. Raises InputError if the file
-    is unusable, or reading it takes more memory or time than allowed.
+    Blocks for about a second, most of it for the start of Python: call it from a thread.
     """
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time: try again in a minute", key="upload")
@@ -80,9 +79,8 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
         except subprocess.TimeoutExpired as error:
             raise InputError(f"the upload takes more than {SECONDS} s to read; give {smaller}", key="upload") from error
         except OSError as error:
-            raise InputError(
-                f"the upload cannot be read now ({error.strerror}): try again later", key="upload"
-            ) from error
+            fault = f"the upload cannot be read now ({error.strerror}): try again later"
+            raise InputError(fault, key="upload") from error
     if done.returncode == 0:
         return done.stdout
     reasons = {

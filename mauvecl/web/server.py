@@ -18,7 +18,7 @@ import tempfile
 import time
 import traceback
 import webbrowser
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,10 +54,7 @@ HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
 
 
 def local(address: str) -> bool:
-    """Return whether an address is reachable from this machine only.
-
-    Raises InputError if it is empty, or this machine cannot resolve it.
-    """
+    """Return whether an address is reachable from this machine only."""
     if not address.strip():
         raise InputError.of("address", address, "one such as 127.0.0.1, ::1 or 0.0.0.0")
     try:
@@ -79,23 +76,12 @@ def plain(host: str) -> str:
     return re.sub(r":(80|443)$", "", host.strip().lower())
 
 
-def origin(text: str) -> str:
-    """Parse a value of `--allow-origin`, ``https://name`` or ``name:port``, to a host with its port.
-
-    Raises InputError if it does not name a single host.
-    """
-    host = re.sub(r"^https?://", "", text.strip().lower()).removesuffix("/")
-    if re.fullmatch(HOST, host) is None:
-        raise InputError.of("allow_origin", text, "one host such as https://mauve.example.org")
-    return plain(host)
-
-
-def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
-    """Return the hosts under which the page is served.
-
-    Raises InputError if other machines may connect and no origin is given, or an origin or the address is invalid.
-    """
-    named = {origin(text) for text in allowed}
+def hosts(address: str, port: int, allowed: Sequence[str]) -> frozenset[str]:
+    """Return the hosts under which the page is served; origins are ``https://name`` or ``name:port``."""
+    named = [re.sub(r"^https?://", "", text.strip().lower()).removesuffix("/") for text in allowed]
+    for text, host in zip(allowed, named, strict=True):
+        if re.fullmatch(HOST, host) is None:
+            raise InputError.of("allow_origin", text, "one host such as https://mauve.example.org")
     if not local(address) and not named:
         raise InputError(
             f"address = {shortened(address)} accepts other machines; give `allow_origin` with the address that "
@@ -103,7 +89,7 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
             key="address",
         )
     own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
-    return frozenset(plain(netloc(host, port)) for host in own) | named
+    return frozenset(plain(host) for host in (*named, *(netloc(host, port) for host in own)))
 
 
 class PageApplication(Application):
@@ -248,10 +234,8 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
         make(address, port, allow_origin)
         warm()
         if not local(address):
-            print(
-                f"mauvecl: the page has no users and no passwords: whoever reaches {netloc(address, port)} may use it.",
-                file=sys.stderr,
-            )
+            text = f"the page has no users and no passwords: whoever reaches {netloc(address, port)} may use it."
+            print(f"mauvecl: {text}", file=sys.stderr)
         url = f"http://{netloc(address, port)}/"
         print(f"mauvecl serves at {url}; Ctrl-C ends it.", flush=True)
         PeriodicCallback(close_unused, 1000 * SWEEP_S).start()
@@ -273,8 +257,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
         logger.handlers, logger.propagate = [], True
         logger.setLevel(logging.WARNING)
     # Threads share two pools of glibc's malloc, since each pool keeps what its threads have freed; -8 is M_ARENA_MAX.
-    if (change := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        change(-8, 2)
+    getattr(ctypes.CDLL(None), "mallopt", lambda *_: None)(-8, 2)
     asyncio.run(run())
 
 
@@ -346,7 +329,7 @@ def _words() -> dict[str, Any]:
         },
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
         "uploads": {
-            name: {"entered": upload.entered, "options": list(upload.options.values()), "most": upload.most}
+            name: {"entered": upload.entered, "options": upload.fields, "most": upload.most}
             for name, upload in UPLOADS.items()
         },
         "withFile": fields.WITH_FILE,
@@ -382,19 +365,19 @@ def figure(theme: str, name: str, logs: str) -> bytes | None:
 
 
 class RefusalHandler(RequestHandler):
-    """Handler that returns an error message instead of the page."""
+    """Handler that answers any request with an error message."""
 
     def initialize(self, status: int, why: str) -> None:
         """Set status and message."""
         self._status, self._why = status, why
 
-    async def prepare(self) -> None:
-        """Answer any request."""
+    def prepare(self) -> None:
+        """Send the message."""
         self.set_status(self._status)
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         if self._status == 503:
             self.set_header("Retry-After", "60")
-        await self.finish(f"{self._why}\n")
+        self.finish(f"{self._why}\n")
 
 
 class ContentHandler(RequestHandler):

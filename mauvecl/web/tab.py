@@ -162,9 +162,9 @@ class Tab:
     def __post_init__(self) -> None:
         if verb := self.verb:
             title, (about, *_) = verb.capitalize(), VERBS[verb].help.split("\n")
-            of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
-            for key, value in (of_verb | {"files": {verb: verb}}).items():
-                setattr(self, key, getattr(self, key) or value)
+            self.name, self.title, self.about = self.name or verb, self.title or title, self.about or about
+            self.simulations, self.answer = self.simulations or {verb: title}, self.answer or verb
+            self.files = self.files or {verb: verb}
         self.questions = self.questions or tuple(self.simulations) or ("detection",)
         self.group = self.group or VERBS[QUESTIONS[self.questions[0]].verbs[0]].group
 
@@ -177,23 +177,15 @@ class Tab:
     def reads_of(self, *questions: str) -> frozenset[str]:
         """Return the fields on which questions depend, by the keys that the flags of their verbs set."""
         verbs = [VERBS[verb] for question in questions for verb in QUESTIONS[question].verbs]
-        taken = {
-            name for name, field in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in field.keys)
-        }
-        return frozenset(taken | set(self.also)) - set(self.never)
+        taken = (name for name, one in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in one.keys))
+        return frozenset({*taken, *self.also}).difference(self.never)
 
     def offers(self, name: str, answers: Answers) -> bool:
-        """Return whether one of `files` can be downloaded: whether the answer it needs is simulated and has it."""
-        needed = self.files[name]
+        """Return whether one of `files` or `documents` can be downloaded: the answer it needs is there and has it."""
+        needed = self.documents[name] if name in self.documents else self.files[name]
         # An answer may lack tables of what was not asked.
-        return needed is None or (needed in answers and (self.own_table is not None or answers[needed].has_table(name)))
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return the table of one of `files`."""
-        if self.own_table is not None:
-            return self.own_table(closed, answers)
-        table: Table = answers[str(self.files[name])].tables[name]
-        return table
+        has = name in self.documents or self.own_table is not None
+        return needed is None or (needed in answers and (has or answers[needed].has_table(name)))
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
@@ -326,23 +318,22 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
     """Return file name and content of one of a tab's `files` or `documents`, or of the study that reproduces it.
 
-    The ending is "ecsv", "fits" or "study", and empty for a document. Raises InputError if there is no such file, or it
-    is not simulated yet.
+    The ending is "ecsv", "fits" or "study", and empty for a document.
     """
-    if name in tab.documents and tab.documents[name] in answers:
-        # Matplotlib's settings are those of the process.
-        with _drawing:
-            return name, answers[tab.documents[name]].documents[name]()
-    if name not in tab.files or ending not in ("ecsv", "fits", "study"):
+    if name not in tab.documents and (name not in tab.files or ending not in ("ecsv", "fits", "study")):
         raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}; use one of its own", key="name")
     if not tab.offers(name, answers):
         raise InputError(f"no {name} is computed yet: start a simulation first", key="name")
+    if name in tab.documents:
+        # Matplotlib's settings are those of the process.
+        with _drawing:
+            return name, answers[tab.documents[name]].documents[name]()
     if ending == "study":
         needed = tab.files[name]
         return study_file(closed.study if needed is None else answers[needed].study, f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"mauvecl-{name}.{ending}"
-        write_table(tab.table(name, closed, answers), path)
+        path, make = Path(folder) / f"mauvecl-{name}.{ending}", tab.own_table
+        write_table(make(closed, answers) if make else answers[str(tab.files[name])].tables[name], path)
         return path.name, path.read_bytes()
 
 

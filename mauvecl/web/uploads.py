@@ -11,9 +11,9 @@ import sys
 import tempfile
 import threading
 import zipfile
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
@@ -30,7 +30,7 @@ from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import built
-from mauvecl.study.analyses import PATHS, CalibrateQuestion, CalibrationObservation
+from mauvecl.study.questions import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN, read_points
 from mauvecl.web.sandboxed_reader import read_limited
 
@@ -72,8 +72,23 @@ class Observations:
 
     @classmethod
     def of(cls, name: str, content: bytes) -> Observations:
-        """Keep an archive of observations; raises InputError if it lacks a file."""
-        return cls(printable(name, MOST_NAME), content, observations_in(unpacked(content)))
+        """Keep an archive, which must hold one study with observations, and all files that it names."""
+        files = unpacked(content)
+        studies = [rows for file, text in files.items() if file.endswith(".toml") and (rows := _observed(file, text))]
+        if len(studies) != 1:
+            has = f"but holds {len(studies)}"
+            raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], {has}")
+        (rows,) = studies
+        if len(rows) > MOST_FILES:
+            raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
+        for row in rows:
+            for key in PATHS:
+                if isinstance(row.get(key), str):
+                    row[key] = file = PureWindowsPath(row[key]).name
+                    if file not in files:
+                        raise refusal(f"the archive needs {shortened(file)}, but holds {', '.join(sorted(files))}")
+        observations = built(CalibrateQuestion, {"observations": rows}, "the archive").observations
+        return cls(printable(name, MOST_NAME), content, observations)
 
     def written(self, folder: Path) -> list[dict[str, Any]]:
         """Write the files below a folder, once, and return the observations with their paths."""
@@ -83,11 +98,7 @@ class Observations:
 
 
 def unpacked(content: bytes) -> dict[str, bytes]:
-    """Return the files of a zip archive by their names without folders.
-
-    Hidden files, which some systems add, are left out. Raises InputError if the content is not a zip archive, is
-    damaged, encrypted or too large, or contains a name that is not a plain one in a folder of the archive.
-    """
+    """Return the files of a zip archive by their names without folders, but hidden ones, which some systems add."""
     remedy = "give a TOML file and the files that it names, in a sound zip archive without a password"
     with parsing("the archive", remedy), zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = dict[zipfile.ZipInfo, str]()
@@ -117,27 +128,7 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     return files
 
 
-def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation, ...]:
-    """Return the observations that a study among files lists, with the names of their files.
-
-    Raises InputError unless exactly one file is such a study, and the archive contains all files that it names.
-    """
-    studies = [rows for name, file in files.items() if name.endswith(".toml") and (rows := _observations(name, file))]
-    if len(studies) != 1:
-        raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}")
-    (rows,) = studies
-    if len(rows) > MOST_FILES:
-        raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
-    for row in rows:
-        for key in PATHS:
-            if isinstance(row.get(key), str):
-                row[key] = name = PureWindowsPath(row[key]).name
-                if name not in files:
-                    raise refusal(f"the archive needs {shortened(name)}, but holds {', '.join(sorted(files))}")
-    return built(CalibrateQuestion, {"observations": rows}, "the archive").observations
-
-
-def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
+def _observed(name: str, content: bytes) -> list[dict[str, Any]]:
     """Return the rows of a file's table of observations; empty if it has none."""
     if len(content) > MOST_TOML_BYTES:
         raise refusal(f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB")
@@ -155,7 +146,7 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
-def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:
+def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> str:
     """Write an uploaded spectrum to a file of this name without loss, once per spectrum, and return its path."""
     from astropy.table import Table
 
@@ -168,7 +159,7 @@ def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Pa
         return {name: text.getvalue().encode()}
 
     content = name.encode() + source.wavelength_nm.tobytes() + source.flux_flam.tobytes()
-    return content_folder(folder, content, files) / name
+    return str(content_folder(folder, content, files) / name)
 
 
 #: Largest size of an upload, bytes, and largest number of points of its spectrum.
@@ -184,11 +175,7 @@ MOST_PAIRS_BYTES = 2**18
 def _spectrum(
     kind: type[Spectrum], reader: Callable[..., Spectrum], called: str, name: str, content: bytes, **options: Any
 ) -> Spectrum:
-    """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content.
-
-    Raises InputError if it holds no usable spectrum. Called on a thread of its own; any other exception is reported to
-    the visitor too.
-    """
+    """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content."""
     spectrum = read_limited(kind, reader, {"upload": content}, **options)
     if spectrum.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
@@ -218,15 +205,10 @@ class VisitorFile:
         plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", re.split(r"[/\\]", name)[-1])[-80:].strip(".-")
         return cls(plain or "file", content)
 
-    def written(self, folder: Path) -> Path:
+    def written(self, folder: Path) -> str:
         """Write the file below a folder, once, and return its path."""
         content = self.name.encode() + self.content
-        return content_folder(folder, content, lambda: {self.name: self.content}) / self.name
-
-
-def _options(*names: str) -> dict[str, str]:
-    """Return fields that say how a file is read, by the reader's names, which are those of their keys."""
-    return {FIELDS[name].path[-1]: name for name in names}
+        return str(content_folder(folder, content, lambda: {self.name: self.content}) / self.name)
 
 
 @dataclass(frozen=True)
@@ -236,33 +218,35 @@ class Upload:
     reader: Callable[..., Any]  # of its name and content, and of options by name
     entered: str = UPLOADED_FILE  # text of the field that stands for the file
     most: int = MOST_UPLOADED  # largest number of bytes
-    options: Mapping[str, str] = field(default_factory=dict)  # see `_options`
+    fields: tuple[str, ...] = ()  # fields that say how it is read
+
+    @property
+    def options(self) -> dict[str, str]:
+        """Its `fields` by the reader's names, which are those of their keys."""
+        return {FIELDS[name].path[-1]: name for name in self.fields}
 
     def read(self, name: str, content: bytes, values: Mapping[str, Any]) -> Any:
         """Read an untrusted file with the values of fields; raises InputError if it is too large or unusable."""
         if len(content) > self.most:
             size = len(content) / 2**20
-            raise InputError(
-                f"the upload has {size:.1f} MiB, but may have at most {self.most / 2**20:g} MiB", key="upload"
-            )
+            fault = f"the upload has {size:.1f} MiB, but may have at most {self.most / 2**20:g} MiB"
+            raise InputError(fault, key="upload")
         return self.reader(name, content, **{option: values[name] for option, name in self.options.items()})
 
 
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
     "star": Upload(
-        partial(_spectrum, Source, Source.read, UPLOADED),
-        UPLOADED,
-        options=_options("wavelength_unit", "flux_unit", "extend"),
+        partial(_spectrum, Source, Source.read, UPLOADED), UPLOADED, fields=("wavelength_unit", "flux_unit", "extend")
     ),
-    "flare_file": Upload(_flare, options=_options("flare_wavelength_unit", "flare_flux_unit", "continue_at_k")),
+    "flare_file": Upload(_flare, fields=("flare_wavelength_unit", "flare_flux_unit", "continue_at_k")),
     "flare_quiescent": Upload(
         partial(_spectrum, ReadSpectrum, read_spectrum, "uploaded star without the flare"),
-        options=_options("flare_wavelength_unit", "flare_flux_unit"),
+        fields=("flare_wavelength_unit", "flare_flux_unit"),
     ),
     "change_file": Upload(
         partial(_spectrum, Source, Source.read, "added spectrum"),
-        options=_options("change_wavelength_unit", "change_flux_unit", "change_extend"),
+        fields=("change_wavelength_unit", "change_flux_unit", "change_extend"),
     ),
     "own_unknown": Upload(
         lambda name, content: read_points(as_text(content, shortened(name)), shortened(name)),
@@ -284,7 +268,7 @@ MAPPED = {"time": "Time", "flux": "Flux", "error": "Error", "quality": "Quality"
 TIME_UNITS = ("s", "min", "h", "d", "jd", "mjd", "bjd", "btjd", "bkjd")
 #: Assets that visitors may try in place of a file of their own, by field, with what they are.
 EXAMPLES: Mapping[str, tuple[str, str]] = {
-    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)"),
+    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)")
 }
 
 
@@ -359,18 +343,14 @@ RESULTS, UPLOAD_SHELF = Shelf(MOST_RESULTS), Shelf(MOST_UPLOADS)
 
 def size_of(value: object) -> int:
     """Return the approximate size of a value and of what it refers to, bytes."""
-    seen: set[int] = set()
-    waiting: list[Any] = [value]
-    size = 0
+    # The oldest first, so that the top is counted before the details.
+    seen, waiting, size = set[int](), deque[Any]([value]), 0
     while waiting and len(seen) < MOST_OBJECTS:
-        # The oldest first, so that the top is counted before the details.
-        level, waiting = waiting, []
-        for item in level:
-            if id(item) in seen or isinstance(item, PROGRAM):
-                continue
+        item = waiting.popleft()
+        if id(item) not in seen and not isinstance(item, PROGRAM):
             seen.add(id(item))
             size += sys.getsizeof(item, 0)
             waiting += gc.get_referents(item)
-            if isinstance(item, np.ndarray) and item.base is not None:
+            if isinstance(item, np.ndarray):
                 waiting.append(item.base)
     return size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import ctypes
 import gc
 import hashlib
@@ -13,7 +14,7 @@ import math
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Coroutine, Hashable
+from collections.abc import Callable, Collection, Coroutine
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -36,8 +37,7 @@ from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import SIMULATIONS, TABS, State, card, known, reads_of
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, as_file, commands_and_programs, simulate, study_file
-from mauvecl.web.uploads import RESULTS, UPLOADS
-from mauvecl.web.uploads import UPLOAD_SHELF as UPLOADED
+from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
 
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
@@ -58,10 +58,8 @@ class Cancelled(Exception):  # noqa: N818
     """Cancellation by the visitor."""
 
 
-def _set_pending(thread: int, error: type[BaseException] | None) -> None:
-    """Set the exception that a thread raises at its next bytecode, or clear a pending one."""
-    given = None if error is None else ctypes.py_object(error)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), given)
+#: Sets the exception that a thread raises at its next bytecode, or with None clears a pending one.
+_set_pending = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
 def _engine(device: str | None, progress: Callable[[int, int], None]) -> Engine:
@@ -77,9 +75,7 @@ def _engine(device: str | None, progress: Callable[[int, int], None]) -> Engine:
 def release_memory() -> None:
     """Free what simulations leave: arrays in reference cycles, which Python finds late, and pages that malloc keeps."""
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+    getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: pad)(0)
 
 
 @dataclass(eq=False)
@@ -91,7 +87,7 @@ class Job:
     #: Whether realisations are drawn. Such a job is cancelled between two tiles, others anywhere by an exception.
     drawing: bool = True
     unit: str = ""  # of the progress; realisations of the pool if empty
-    _cancelled: threading.Event = field(default_factory=threading.Event)
+    _cancelled: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _thread: int | None = None
     _pool: Pool | None = None
@@ -107,9 +103,10 @@ class Job:
             with self._lock:
                 self._thread = threading.get_ident()
         try:
-            self._check()
             self._started = time.monotonic()
-            self._pool = Pool(LocalWorkers(make=_engine), progress=lambda done, total: self._check())
+            self._pool = Pool(LocalWorkers(make=_engine))
+            if self._cancelled:
+                raise Cancelled
             return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
         except Stopped as error:
             raise Cancelled from error
@@ -117,27 +114,20 @@ class Job:
             # A pending interruption would otherwise reach the next work of this thread.
             with self._lock:
                 if self._thread is not None:
-                    _set_pending(self._thread, None)
+                    _set_pending(ctypes.c_ulong(self._thread), None)
                 self._thread = None
             if time.monotonic() - (self._started or math.inf) > LONG_S:
                 release_memory()
 
     def _count(self, done: int, total: int) -> None:
         self._counted = done, total
-        if self.drawing:
-            self._check()
-
-    def _check(self) -> None:
-        if self._cancelled.is_set():
-            raise Cancelled
 
     def cancel(self) -> None:
         """Cancel between tiles, outside of draws, or before the start."""
         with self._lock:
-            again = self._cancelled.is_set()
-            self._cancelled.set()
-            if self._thread is not None and not again:
-                _set_pending(self._thread, Cancelled)
+            if self._thread is not None and not self._cancelled:
+                _set_pending(ctypes.c_ulong(self._thread), ctypes.py_object(Cancelled))
+            self._cancelled = True
         # Work that waits for fits in other threads is not interrupted: fits end between two of their draws.
         if self._pool is not None:
             self._pool.stop()
@@ -160,15 +150,6 @@ class Job:
 
 
 log = logging.getLogger(__name__)
-
-
-def _sent(message: asyncio.Future[None]) -> None:
-    """Report an error of a message that was sent, but for that of a visitor who has left meanwhile."""
-    error = None if message.cancelled() else message.exception()
-    if error is not None and not isinstance(error, WebSocketClosedError):
-        log.error("a message could not be sent", exc_info=error)
-
-
 #: Seconds between two looks at a simulation.
 LOOK_S = 0.25
 #: Number of threads, besides the event loop, that make closed forms, pictures and files for all visitors.
@@ -214,7 +195,8 @@ class Visitor(WebSocketHandler):
         self._tasks: set[asyncio.Task[None]] = set()
         self._coming: dict[str, Any] | None = None
         self._digests: dict[str, str] = {}
-        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
+        self._home = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
+        self._folder = Path(self._home.name)
 
     def check_origin(self, origin: str) -> bool:
         """Accept every origin, since `server.PageApplication` has checked it."""
@@ -231,27 +213,31 @@ class Visitor(WebSocketHandler):
         for job in (self.job, self._drawing):
             if job is not None:
                 job.cancel()
-        self._folder.cleanup()
-        for shelf in (RESULTS, UPLOADED):
+        self._home.cleanup()
+        for shelf in (RESULTS, UPLOAD_SHELF):
             shelf.drop(self)
         Visitor.has_left = True
 
     def send(self, content: bytes | None = None, **message: Any) -> None:
         """Send a message, followed by bytes; a visitor who has left gets none."""
+
+        def sent(message: asyncio.Future[None]) -> None:
+            error = None if message.cancelled() else message.exception()
+            if error is not None and not isinstance(error, WebSocketClosedError):
+                log.error("a message could not be sent", exc_info=error)
+
         if self.ws_connection is None or self not in self.here:
             return
-        try:
-            self.write_message(json.dumps(message, allow_nan=False)).add_done_callback(_sent)
+        with contextlib.suppress(WebSocketClosedError):
+            self.write_message(json.dumps(message, allow_nan=False)).add_done_callback(sent)
             if content is not None:
-                self.write_message(content, binary=True).add_done_callback(_sent)
-        except WebSocketClosedError:
-            return
+                self.write_message(content, binary=True).add_done_callback(sent)
 
     def on_message(self, message: str | bytes) -> None:
         """Handle a message; an invalid one closes the connection."""
         self.used = time.monotonic()
-        if isinstance(message, bytes):
-            self._content(message)
+        if isinstance(message, bytes) and self._coming is not None:
+            self._content(self._coming, message)
             return
         try:
             asked = json.loads(message)
@@ -261,74 +247,71 @@ class Visitor(WebSocketHandler):
             if not (isinstance(asked["n"], int) and isinstance(asked["link"], str)):
                 raise TypeError
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            log.warning("a message is not a valid request: %s", shortened(message))
+            log.warning("a message is not a valid request: %s", shortened(str(message)))
             self.close(1003, "a message must be a question as the page asks it")
             return
-        if (work := ask(asked)) is not None:
-            self._give(work, n=asked["n"], **REFUSED.get(asked["ask"], {}))
+        if (work := ask(asked)) is None:
+            return
+        reply = {"n": asked["n"]} | REFUSED.get(asked["ask"], {})
+        if len(self._tasks) < MOST_TASKS:
+            self._begin(self._or_why(work, **reply))
+        else:
+            work.close()
+            self.send(**reply, refused="too many requests at the same time; wait for an answer before the next one")
 
     # State and answers
 
     def state(self, link: str) -> State:
         """Enter the values of a link."""
-        return State(link, UPLOADED.of(self, "upload"))
+        return State(link, UPLOAD_SHELF.of(self, "upload"))
 
     def _ask_answer(self, asked: dict[str, Any]) -> None:
         """Send the answer and a tab's pictures; a later question replaces a waiting one."""
+
+        async def answer_all() -> None:
+            while self._next is not None and self.ws_connection is not None:
+                asked, self._next = self._next, None
+                state, tab = self.state(asked["link"]), tab_of(asked)
+                faults = state.faults_of(tab.reads)
+                message = {"n": asked["n"], "stray": state.stray, "faults": faults, "known": known(state)}
+                if faults:
+                    self.send(**message)
+                else:
+                    await self._or_why(self._answer(message, state, tab), **message)
+
         self._next = asked
         if self._answering is None or self._answering.done():
-            self._answering = self._begin(self._answer_all())
+            self._answering = self._begin(answer_all())
 
-    async def _answer_all(self) -> None:
-        while self._next is not None and self.ws_connection is not None:
-            asked, self._next = self._next, None
-            await self._answer(asked)
-
-    async def _answer(self, asked: dict[str, Any]) -> None:
-        n, state, tab = asked["n"], self.state(asked["link"]), tab_of(asked)
-        faults = state.faults_of(tab.reads)
-        message: dict[str, Any] = {"n": n, "stray": state.stray, "faults": faults, "known": known(state)}
-        if faults:
-            self.send(**message)
-            return
-
-        async def answer() -> None:
-            closed = await _in_thread(self.closed, state, tab)
-            answers = self.answers(state)
-            self.send(**message, answer=await _in_thread(card, tab, closed, answers))
-            if self._next is None:
-                self.send(n=n, **await _in_thread(shown, tab, closed, answers))
-
-        await self._or_why(answer(), **message)
+    async def _answer(self, message: dict[str, Any], state: State, tab: Tab) -> None:
+        closed = await _in_thread(self.closed, state, tab)
+        answers = self.answers(state)
+        self.send(**message, answer=await _in_thread(card, tab, closed, answers))
+        if self._next is None:
+            self.send(n=message["n"], **await _in_thread(shown, tab, closed, answers))
 
     def closed(self, state: State, tab: Tab) -> ClosedForms:
         """Return the closed forms of the part of a question that a tab reads; the last ones are cached."""
-
-        def make() -> ClosedForms:
-            question, folder = state.question(tab.reads), Path(self._folder.name)
-            return ClosedForms.of(question, folder, chance=tab.chance, given=self.given(state, tab))
-
-        return self._last("closed", (self._key(state, tab.reads), tab.chance), make)
+        key = self._key(state, tab.reads), tab.chance
+        closed: ClosedForms | None = RESULTS.get(self, "closed", key)
+        if closed is None:
+            given = self.given(state, tab)
+            closed = ClosedForms.of(state.question(tab.reads), self._folder, chance=tab.chance, given=given)
+        # They compute and keep more when they are used, and are counted again.
+        RESULTS.keep(self, "closed", key, closed)
+        return closed
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
         """Return the content of the files that a tab reads; the last ones are cached."""
-
-        def read() -> dict[str, Any]:
-            question = state.question(tab.reads)
+        key, question = (tab.name, self._key(state, tab.reads & (UPLOADS.keys() | DATA))), state.question(tab.reads)
+        given: dict[str, Any] | None = RESULTS.get(self, "given", key)
+        if given is None:
             try:
-                return tab.given(question) if tab.needs in question.uploads else {}
+                given = tab.given(question) if tab.needs in question.uploads else {}
             except InputError as error:
                 raise reworded(error, str(error), tab.needs) from error
-
-        return self._last("given", (tab.name, self._key(state, tab.reads & (UPLOADS.keys() | DATA))), read)
-
-    def _last(self, kind: str, key: Hashable, make: Callable[[], T]) -> T:
-        """Return the value of a key; the last one of a kind is cached."""
-        value: T | None = RESULTS.get(self, kind, key)
-        value = make() if value is None else value
-        # Closed forms compute and keep more when they are used, and are counted again.
-        RESULTS.keep(self, kind, key, value)
-        return value
+            RESULTS.keep(self, "given", key, given)
+        return given
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
@@ -339,7 +322,7 @@ class Visitor(WebSocketHandler):
                 RESULTS.get(self, "answers", (simulation, key))
         return valid
 
-    def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
+    def _key(self, state: State, names: Collection[str]) -> tuple[Any, ...]:
         """Return everything on which an answer to some fields depends."""
         return state.asked(names), *(self._digests.get(name) for name in UPLOADS if name in names)
 
@@ -349,14 +332,6 @@ class Visitor(WebSocketHandler):
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
-
-    def _give(self, work: Coroutine[Any, Any, None], **message: Any) -> None:
-        """Run a function that the page may request a limited number of times."""
-        if len(self._tasks) < MOST_TASKS:
-            self._begin(self._or_why(work, **message))
-            return
-        work.close()
-        self.send(**message, refused="too many requests at the same time; wait for an answer before the next one")
 
     async def _or_why(self, work: Coroutine[Any, Any, None], **message: Any) -> None:
         """Run a function, and report an invalid request or an internal error."""
@@ -391,15 +366,15 @@ class Visitor(WebSocketHandler):
         tab = tab_of(asked)
         pictures = [picture for picture in tab.pictures if picture.pins]
         question = self.state(asked["link"]).question(tab.reads)
-        closed = await _in_thread(ClosedForms.of, question, Path(self._folder.name))
+        closed = await _in_thread(ClosedForms.of, question, self._folder)
         drawn = await _in_thread(lambda: {p.name: p.drawn(closed, {})["sources"][p.pins] for p in pictures})
         pins = {name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()}
         self.send(n=asked["n"], pins=pins)
 
     # Draws and simulations
 
-    def _ask_draw(self, asked: dict[str, Any]) -> None:
-        """Draw one exposure with the flare."""
+    async def _ask_draw(self, asked: dict[str, Any]) -> None:
+        """Draw one exposure with the flare, in place of one that is being drawn."""
         state, tab = self.state(asked["link"]), tab_of(asked)
         key = self._key(state, tab.reads), tab.chance
         closed: ClosedForms | None = RESULTS.get(self, "closed", key)
@@ -408,18 +383,14 @@ class Visitor(WebSocketHandler):
         if self._drawing is not None:
             self._drawing.cancel()
         how = closed.case.draw_options | {"seed": closed.study.run.seed}
-        self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
-
-        async def draw(job: Job) -> None:
-            try:
-                drawn = await asyncio.wrap_future(job.future)
-            except (Exception, asyncio.CancelledError):
-                # Another draw took its place, or a simulation reports what is wrong.
-                return
-            if RESULTS.get(self, "closed", key) is closed:
-                self.send(n=asked["n"], **shown(tab, closed, self.answers(state) | {"draw": drawn}))
-
-        self._begin(draw(self._drawing))
+        job = self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
+        try:
+            drawn = await asyncio.wrap_future(job.future)
+        except (Exception, asyncio.CancelledError):
+            # Another draw took its place, or a simulation reports what is wrong.
+            return
+        if RESULTS.get(self, "closed", key) is closed:
+            self.send(n=asked["n"], **shown(tab, closed, self.answers(state) | {"draw": drawn}))
 
     async def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
@@ -429,7 +400,7 @@ class Visitor(WebSocketHandler):
         key = kind, self._key(state, reads_of(kind))
         question, tab = state.question(reads_of(kind)), SIMULATIONS[kind]
         given = await _in_thread(self.given, state, tab)
-        closed = await _in_thread(ClosedForms.of, question, Path(self._folder.name), chance=tab.chance, given=given)
+        closed = await _in_thread(ClosedForms.of, question, self._folder, chance=tab.chance, given=given)
         if self.job is not None:
             raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
@@ -461,38 +432,34 @@ class Visitor(WebSocketHandler):
         if asked.get("field") in UPLOADS:
             self._coming = asked
 
-    def _content(self, content: bytes) -> None:
+    def _content(self, asked: dict[str, Any], content: bytes) -> None:
         """Read an uploaded file in a thread; its field is empty until then."""
-        if self._coming is None:
-            self.close(1003, "a message must be a question as the page asks it")
-            return
-        asked, self._coming = self._coming, None
-        UPLOADED.drop(self, "upload", asked["field"])
-        state = self.state(asked["link"])
-        options = tuple(state.entered[name] for name in UPLOADS[asked["field"]].options.values())
-        self._digests[asked["field"]] = hashlib.sha256(content + repr(options).encode()).hexdigest()
-        self._begin(self._read(asked, content, state))
+        field, name, state = asked["field"], str(asked.get("name")), self.state(asked["link"])
+        self._coming, upload = None, UPLOADS[field]
+        UPLOAD_SHELF.drop(self, "upload", field)
+        options = tuple(state.entered[name] for name in upload.fields)
+        self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
 
-    async def _read(self, asked: dict[str, Any], content: bytes, state: State) -> None:
-        field, name, upload = asked["field"], str(asked.get("name")), UPLOADS[asked["field"]]
-        names = tuple(upload.options.values())
-        reply: dict[str, Any] = {"n": asked["n"], "field": field}
-        try:
-            work = READER.submit(lambda: upload.read(name, content, state.question(names).values))
-            UPLOADED.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
-            reply["entered"] = upload.entered
-        except InputError as error:
-            reply["lacks"] = sentence(error, upload.options)
-            reply["remedies"] = [remedy for remedy in remedies(error, upload.options) if remedy[0] in names]
-        except Exception as error:
-            log.exception("an upload failed")
-            kind = type(error).__name__
-            reply["lacks"] = f"upload {shortened(name)} cannot be read ({kind}); give another"
-        self.send(**reply)
+        async def read() -> None:
+            reply: dict[str, Any] = {"n": asked["n"], "field": field}
+            try:
+                work = READER.submit(lambda: upload.read(name, content, state.question(upload.fields).values))
+                UPLOAD_SHELF.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
+                reply["entered"] = upload.entered
+            except InputError as error:
+                reply["lacks"] = sentence(error, upload.options)
+                given = remedies(error, upload.options)
+                reply["remedies"] = [remedy for remedy in given if remedy[0] in upload.fields]
+            except Exception as error:
+                log.exception("an upload failed")
+                reply["lacks"] = f"upload {shortened(name)} cannot be read ({type(error).__name__}); give another"
+            self.send(**reply)
+
+        self._begin(read())
 
     async def _ask_columns(self, asked: dict[str, Any]) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
-        file, names = UPLOADED.get(self, "upload", "frames"), tuple[str, ...]()
+        file, names = UPLOAD_SHELF.get(self, "upload", "frames"), tuple[str, ...]()
         if file is not None:
             work = READER.submit(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content})
             names = (await asyncio.wrap_future(work)).names
@@ -512,7 +479,7 @@ class Visitor(WebSocketHandler):
                 raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab")
             # A simulation asks what its own answers depend on, which their tables state.
             question = state.question(reads_of(name) if name in SIMULATIONS else front.reads)
-            return study_file(QUESTIONS[name].study(question.case(Path(self._folder.name)).study), "study")
+            return study_file(QUESTIONS[name].study(question.case(self._folder).study), "study")
 
         file, content = await _in_thread(make)
         self.send(content, n=asked["n"], file=file)
@@ -521,7 +488,7 @@ class Visitor(WebSocketHandler):
         """Send a tab's questions as commands and as Python programs."""
         tab = tab_of(asked)
         question = self.state(asked["link"]).question(tab.reads)
-        taken = await _in_thread(commands_and_programs, tab, question, Path(self._folder.name))
+        taken = await _in_thread(commands_and_programs, tab, question, self._folder)
         self.send(n=asked["n"], taken=taken)
 
 
