@@ -23,7 +23,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, ReducedSums, usable_variance, variance_of
 from mauvecl.fits.profile import Profile
 from mauvecl.fits.spectrum import LEVELS, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
-from mauvecl.host.arrays import true_runs
+from mauvecl.host.arrays import Float, true_runs
 from mauvecl.host.stars import flare as spectra
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.noise.scene import drawn_factors
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.flare import FlareSpectrum
 
-Float = NDArray[np.float64]
 
 #: Number of exposures drawn and fitted at once, which limits the memory and the time until a fit can be cancelled.
 BATCH = 256

@@ -10,7 +10,6 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_columns
 from mauvecl.answers.closed_forms import throughput_cases
@@ -20,6 +19,7 @@ from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
 from mauvecl.flares.settings import Curve
+from mauvecl.host.arrays import Float
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE, Particles, Thermal
 from mauvecl.host.stars.library import nearest_spectrum
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from mauvecl.detection.snr import Arrays
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.search.completeness import DurationLaw
-
-Float = NDArray[np.float64]
 
 
 def two_digits(value: float) -> str:

@@ -16,7 +16,6 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, metadata_of, reported
@@ -26,6 +25,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.flares.stare import Event, Stare, coefficients, temperatures_of
 from mauvecl.host import VERSION
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, kept
@@ -127,9 +127,6 @@ def _table(star: StarStare) -> fits.BinTableHDU:
         hdu.header["LOSTFRMS"] = (star.drifting_frames, "frames that lost light, assumed drifts")
         hdu.header["COMMENT"] = "POINTING_LOSS: share of all light lost in the frame, as drawn."
     return hdu
-
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,11 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, TableOf, first_of, metadata_of
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host import VERSION
-from mauvecl.host.arrays import true_runs
+from mauvecl.host.arrays import Float, true_runs
 from mauvecl.host.orbit.orbit import Bodies, Target, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
 from mauvecl.schema.columns import Column, View, percent, table_of
@@ -56,8 +55,6 @@ def calendar_bytes(entries: Iterable[tuple[str, str, str, str]]) -> bytes:
     folded = (re.findall(rb"(?:^.{1,75}|.{1,74})(?![\x80-\xbf])", line.encode()) for line in lines)
     return b"".join(b"\r\n ".join(parts) + b"\r\n" for parts in folded)
 
-
-Float = NDArray[np.float64]
 
 #: Largest number of rows for which the table of windows is written.
 MOST_WINDOWS = 100_000

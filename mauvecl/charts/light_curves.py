@@ -14,6 +14,7 @@ from scipy.special import ndtri
 from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
+from mauvecl.host.arrays import Float
 from mauvecl.schema.columns import First, part_note
 
 if TYPE_CHECKING:
@@ -107,7 +108,6 @@ def _edges(middles: Any) -> Any:
     return np.concatenate([[middles[0] / steps[0]], middles[:-1] * steps, [middles[-1] * steps[-1]]])
 
 
-Float = NDArray[np.float64]
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
 MOST_POINTS, MOST_ROWS = 4000, 600
 #: Units of time: longest duration that is shown in it, its length, s, and its name.

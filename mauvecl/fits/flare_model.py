@@ -25,6 +25,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances, join_names
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.response import Order, response_matrix
 from mauvecl.host.stars.flare import (
     BALMER_EDGE_NM,
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
 
-Float = NDArray[np.float64]
 
 #: Range of fitted temperatures, K: that of flares, without cool ones that emit no ultraviolet light.
 TEMPERATURES_K = (3_000.0, float(range_of(Temperature).high))

@@ -26,13 +26,13 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.fits.flare_model import Ratio, derived_values
+from mauvecl.host.arrays import Float
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
     from mauvecl.fits.flare_model import FlareModel, MeanSums, ReducedSums
 
-Float = NDArray[np.float64]
 
 #: Steps of the search for the end of an interval.
 STEPS = 12

@@ -35,6 +35,7 @@ from mauvecl.fits.profile import (
     intervals,
     with_bounds,
 )
+from mauvecl.host.arrays import Float
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, formatted, table_of
 from mauvecl.schema.errors import InputError
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
 
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
 
 #: Probabilities of the intervals: one and two standard deviations of a normal variable, about.
 LEVELS = (0.6827, 0.95)

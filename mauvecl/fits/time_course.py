@@ -26,7 +26,7 @@ from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare
-from mauvecl.host.arrays import array_cache
+from mauvecl.host.arrays import Float, array_cache
 from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from mauvecl.fits.flare_model import FlareModel
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
 
 #: Bins span at most this many frames, which bounds the time that the search for them takes.
 MOST_FRAMES_PER_BIN = 4096

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mauvecl.flares.shapes import Shape, shape_of
-from mauvecl.host.arrays import set_read_only
+from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.stars.flare import (
     PARSEC_CM,
     STEFAN_BOLTZMANN,
@@ -52,7 +52,6 @@ from mauvecl.schema.physical import Distance, Energy, Positive, Radius, RateExpo
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
-Float = NDArray[np.float64]
 #: Light of a flare that counts for its energy: in the band of its amplitude, or at all wavelengths.
 Kind = Literal["band", "bolometric"]
 #: Energies below it, erg, are logarithms: a flare of a star has more than 1e20 erg.

@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arrays import set_read_only
+from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.flares.stare import Stare
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
 
 #: Components of every frame; one flare component per temperature follows.
 STEADY = ("star", "sky", "dark", "neighbours")

@@ -13,15 +13,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mauvecl.flares.settings import check_shape, integral_between_points
-from mauvecl.host.arrays import set_read_only
+from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.physical import Duration
-
-Float = NDArray[np.float64]
 
 
 class Integrable(ABC):

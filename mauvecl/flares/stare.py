@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.flares.energies import EnergyScale, amplitude_of
 from mauvecl.flares.settings import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
-from mauvecl.host.arrays import set_read_only
+from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.orbit import Limits
 from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid
 from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
@@ -27,8 +27,6 @@ from mauvecl.schema.physical import DAY_S, Amplitude, Duration, Energy, Moment, 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
-
-Float = NDArray[np.float64]
 
 #: Largest number of flare spectra of a stare (`frames.MOST_FLARES`), and the smallest for flares that cool.
 MOST_TEMPERATURES, LEAST_STEPS = 8, 3

@@ -23,6 +23,7 @@ from mauvecl.detection.requests import Countable
 from mauvecl.detection.snr import Arrays
 from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
+from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants, joint_is_exact, truncation_distance
@@ -36,7 +37,6 @@ from mauvecl.schema.physical import Realisations, Seed
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 #: Deviation of conditions from their known values up to which frames are checked, in standard deviations.

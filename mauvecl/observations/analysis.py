@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK
 from mauvecl.flares.shapes import shape_of
+from mauvecl.host.arrays import Float
 from mauvecl.observations.detection import LONG_S, detect_events, most_events
 from mauvecl.observations.events import ObservedEvent, measure_events
 from mauvecl.observations.frame_model import CleanedSpectra, FrameModel, clean_spectra
@@ -38,8 +39,6 @@ from mauvecl.observations.spectra import (
 )
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.completeness import size_at
-
-Float = NDArray[np.float64]
 
 #: Default numbers of half-widths, sizes and peak times.
 WIDTHS, SIZES, TIMES = 4, 12, 40

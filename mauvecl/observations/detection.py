@@ -11,16 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import DetectedEvent, ProcessSearch, SeriesSurvey
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.templates import REACH
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 #: Statistic of events whose frames take no part in fits of the process.
 PROVISIONAL = 5.0

@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
@@ -17,7 +18,6 @@ from mauvecl.schema.errors import InputError
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
-Float = NDArray[np.float64]
 
 #: Share of saturation above which a mean raw level is not used, since clipping then changes mean and variance.
 MOST_OF_SATURATION = 0.98

@@ -18,13 +18,12 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import SHAPES, Shape
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.event_windows import GENERAL_WEIGHT, Family, FittedFlare, Likelihood, Profile, Window
 
 if TYPE_CHECKING:
     from mauvecl.observations.search import DetectedEvent, SeriesSurvey
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 #: Published shapes that are averaged, besides that of the search.
 AVERAGED = ("davenport2014", "tovarmendoza2022")

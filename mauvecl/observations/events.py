@@ -9,17 +9,13 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from mauvecl.flares.shapes import consecutive_integrals
-from mauvecl.host.arrays import map_in_threads
+from mauvecl.host.arrays import Bool, Float, map_in_threads
 from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 #: Fall of chi-squared by which a step must fit better than a flare.
 STEP_GAIN = 9.0

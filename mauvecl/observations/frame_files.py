@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.spectra.columns import words_of
 from mauvecl.host.spectra.units import unit_and_medium, vacuum_wavelengths
 from mauvecl.host.tables.files import limit_bytes, parsing, without_columns
@@ -44,8 +45,6 @@ from mauvecl.observations.stored_frames import (
 )
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-
-Float = NDArray[np.float64]
 
 FORMATS = "give FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
 #: Columns of bands and of stars, of which a light curve has one.

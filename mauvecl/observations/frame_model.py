@@ -11,6 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import spectrum_of
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.level import PER_MAD
 from mauvecl.schema.errors import InputError
 
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.observations.frames import Frames
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 #: Share of bias and dark current below which the median of a pixel cannot include them.
 LEAST_OF_OFFSET = 0.5

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.tables.units import SCALES, offline
 from mauvecl.schema.calls import validated
@@ -94,8 +95,6 @@ class QualityBits:
         frames, verb = ("1 frame", "is") if n == 1 else (f"{n} frames", "are")
         return (f"{frames} of {name} with the quality flag {bits} {verb} kept, because it can mark flares",)
 
-
-Float = NDArray[np.float64]
 
 #: Smallest number of frames from which level and noise can be estimated.
 MIN_FRAMES = 20

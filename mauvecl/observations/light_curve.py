@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
-from mauvecl.host.arrays import true_runs
+from mauvecl.host.arrays import Bool, Float, true_runs
 from mauvecl.observations import detection
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import (
@@ -31,9 +31,6 @@ from mauvecl.observations.level import (
 from mauvecl.observations.process import UNREPORTED, Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 #: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
 #: stated one, above which losses are tried (assumed).

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import model_validator
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.tables import units
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
@@ -19,8 +19,6 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Accepted
 from mauvecl.schema.physical import DAY_S, Exposure
 from mauvecl.schema.section import Record
-
-Float = NDArray[np.float64]
 
 
 class FrameMapping(Record):

@@ -17,11 +17,10 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.schema.errors import InputError
 
-Float = NDArray[np.float64]
 Item = TypeVar("Item")
 Kind = Literal["correlated", "smooth", "rotation", "sharp rotation"]
 

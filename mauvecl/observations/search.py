@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from mauvecl.flares.stare import Stare, select_frames
-from mauvecl.host.arrays import map_in_threads
+from mauvecl.host.arrays import Bool, Float, map_in_threads
 from mauvecl.observations.level import LevelGiven
 from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
 from mauvecl.schema.physical import DAY_S
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from mauvecl.observations.frames import Frames
     from mauvecl.observations.process import Covariance
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 #: Flux of a template relative to its peak below which it is neglected.
 NEGLECTED = 1e-4

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.spectrum import Measurement, fit
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.frame_model import (
@@ -37,8 +38,6 @@ from mauvecl.search.templates import TEMPERATURES_K, Templates
 if TYPE_CHECKING:
     from mauvecl.flares.shapes import Shape
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 #: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0
@@ -337,9 +336,7 @@ class EventSpectrum:
         return "no flare of one temperature fits its spectrum" if self.p_value < NO_FIT else ""
 
 
-def event_spectrum(
-    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: DetectedEvent
-) -> EventSpectrum:
+def event_spectrum(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one: DetectedEvent) -> EventSpectrum:
     """Compare the spectrum of an event with those of flares and of changes that resemble them."""
     spectrum, variance = _weighted(survey, series, taken, one)
     flares = series.model.flares(TEMPERATURES_K)
@@ -369,9 +366,7 @@ def event_spectrum(
     return EventSpectrum(cause, snr, chi2, dof, p_value)
 
 
-def _window(
-    survey: SeriesSurvey, taken: NDArray[np.bool_], one: DetectedEvent
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _window(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> tuple[NDArray[np.intp], Bool]:
     """Return the frames of an event and of its surroundings without other events, and which belong to the event."""
     lead, tail = survey.bank.window(one.half_width_s)
     numbers = survey.stare.numbers
@@ -382,9 +377,7 @@ def _window(
     return at, inside[at]
 
 
-def _weighted(
-    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: DetectedEvent
-) -> tuple[Float, Float]:
+def _weighted(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one: DetectedEvent) -> tuple[Float, Float]:
     """Return the spectrum of an event, of the size of its peak, and its variance.
 
     The template of the search is fitted to each pixel, with a straight line.
@@ -401,7 +394,7 @@ def _weighted(
     return np.asarray(spectrum), np.asarray(quiet + photons)
 
 
-def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], n_frames: int) -> dict[str, float]:
+def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, n_frames: int) -> dict[str, float]:
     """Return the standard deviations by which star, dark current and sky differ in an event from its surroundings.
 
     They follow from means of `n_frames` quiescent frames, compared with those before and after: the scatter in excess
@@ -434,9 +427,7 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_
     return found
 
 
-def measure_flare(
-    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: DetectedEvent
-) -> Measurement | str:
+def measure_flare(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one: DetectedEvent) -> Measurement | str:
     """Fit a flare to the sum of the spectra of an event, or return the reason why none is.
 
     Star, dark current and sky may differ from the surroundings as much as other parts of the frames do; see `drifts`.

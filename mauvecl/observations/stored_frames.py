@@ -13,6 +13,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.tables.files import check_folder, limit_bytes, parsing
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import matched
@@ -105,8 +106,6 @@ class FolderFile(TableFile):
                 headers.append(file.header)
         return headers
 
-
-Float = NDArray[np.float64]
 
 #: Attributes that every scene has.
 REQUIRED = ("exposure_s", "frames", "instrument", "dark_unit", "saturation_dn")

@@ -17,18 +17,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
 
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.background import Sky
 from mauvecl.host.exposure.expectation import continued_to_reach, expect
 from mauvecl.host.exposure.response import Order, response_matrix
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.detector import CalibrationFrames, DarkFit, PhotonTransfer
 from mauvecl.schema.errors import InputError
-
-Float = NDArray[np.float64]
 
 #: Knots of the errors of a star's spectrum, and their relative size if one star alone cannot tell: an assumption.
 ERROR_KNOTS, ONE_STAR_ERROR = 12, 0.10

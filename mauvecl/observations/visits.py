@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.fits.flare_model import variance_of
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.response import W_PER_NM_IN_FLAM, Order, electrons_per_second
 from mauvecl.host.stars.flare import BALMER_EDGE_NM, EmissionLine
 from mauvecl.host.stars.spectrum import photons
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.visibility import Windows
     from mauvecl.host.stars.source import Source
 
-Float = NDArray[np.float64]
 
 #: Frequencies per resolution of the time base.
 OVERSAMPLING = 5

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arrays import true_runs
+from mauvecl.host.arrays import Float, true_runs
 from mauvecl.search.flare_fits import (
     AMPLITUDE,
     KELVIN,
@@ -34,7 +34,6 @@ from mauvecl.search.templates import LEAD, TAIL
 if TYPE_CHECKING:
     from mauvecl.search.search import Row, Survey
 
-Float = NDArray[np.float64]
 
 #: Values of a fit without a measurement.
 UNMEASURED = FittedFlares(**{each.name: np.full(1, np.nan) for each in fields(FittedFlares)})

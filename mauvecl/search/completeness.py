@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import interpolate, optimize, stats
 
 from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
@@ -15,15 +15,13 @@ from mauvecl.detection.nuisances import Nuisances
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
 from mauvecl.flares.settings import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
-from mauvecl.host.arrays import set_read_only
+from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S, Duration, DurationExponent, DurationScatter, Energy, NotNegative, Positive
 from mauvecl.search.false_alarms import TemplateGrid
 from mauvecl.search.templates import Bank, white_bank
-
-Float = NDArray[np.float64]
 
 #: Energies per decade of the closed form, and its numbers of half-widths and peak times.
 PER_DECADE, WIDTHS, PEAKS = 20, 40, 24

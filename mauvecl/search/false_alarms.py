@@ -40,12 +40,11 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_counts
 from mauvecl.flares.stare import select_frames
+from mauvecl.host.arrays import Float
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.search.search import BATCH, Search, Survey
 from mauvecl.search.templates import Bank
-
-Float = NDArray[np.float64]
 
 #: Smallest number of alarms for a counted threshold.
 MIN_ALARMS = 10

@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 
 from mauvecl.fits.profile import Profile
 from mauvecl.flares.shapes import between, sides
-from mauvecl.host.arrays import array_cache
+from mauvecl.host.arrays import Float, array_cache
 from mauvecl.search.templates import REACH, Bank, Templates
 
 if TYPE_CHECKING:
     from mauvecl.search.search import SearchedFrames, Survey
 
-Float = NDArray[np.float64]
 
 #: Columns of a flare's parameters: log amplitude, peak time in s, log half-width in s, log temperature in K.
 AMPLITUDE, PEAK, WIDTH, KELVIN = range(4)

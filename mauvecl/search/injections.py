@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
+from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
 
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from mauvecl.search.search import Search, SearchedFrames, Survey
     from mauvecl.search.templates import Bank
 
-Float = NDArray[np.float64]
 
 #: Quantities of each fit: ratios of fitted to injected values, the peak offset in half-widths, and whether the
 #: equivalent duration is within its standard error.

@@ -29,11 +29,10 @@ from numpy.typing import NDArray
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
+from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import CHANGED_PART, NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
-
-Float = NDArray[np.float64]
 
 #: Approximate number of values in an array of a batch of stares.
 BATCH = 2**21
@@ -302,7 +301,7 @@ class Trend:
         frames, variance = self.frames[part], self.variance[part]
         return replace(self, frames=frames, variance=variance, curves=self.curves[:, part], known=self.known[:, part])
 
-    def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
+    def subtracted(self, sums: NDArray[Any]) -> Float:
         """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
         left = np.array(sums, np.float64)
         # One stare at a time, since the rounding of matrix products may depend on the number of stares.

@@ -13,12 +13,11 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import MeanSums, spanning_weights
 from mauvecl.flares.settings import RANK, WINDOW_S
-from mauvecl.host.arrays import set_read_only
+from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.noise.unknowns import CHANGED_PART
 from mauvecl.schema.errors import InputError
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from mauvecl.flares.stare import Stare
     from mauvecl.host.exposure.expectation import Expectation
 
-Float = NDArray[np.float64]
 
 #: Shortest window before and after a peak, in half-widths of the template.
 LEAD, TAIL = 5.0, 10.0

@@ -8,12 +8,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of
 from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, TableShape, shape_of
 from mauvecl.flares.stare import Event, Stare, check_contributions, temperatures_of
+from mauvecl.host.arrays import Float
 from mauvecl.host.tables.text_tables import read_columns
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, STARE_PROCESSES, Changing, Course
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from mauvecl.study.plan import OrbitQuestion
     from mauvecl.study.study import Study
 
-Float = NDArray[np.float64]
 
 #: Smallest distance of a prior's cuts from its mean, in standard deviations, for a normal distribution to replace it:
 #: 6e-7 of the values lie beyond.

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
@@ -19,6 +18,7 @@ from mauvecl.answers.closed_forms import unknown_cost, unknown_lines
 from mauvecl.answers.limit import LimitSearch
 from mauvecl.detection.distributions import Gaussian, Mixture
 from mauvecl.detection.requests import STATISTICS
+from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.expectation import entirely_saturated
 from mauvecl.schema.columns import chance_range, chance_text
 from mauvecl.schema.errors import InputError
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
 
-Float = NDArray[np.float64]
 
 #: Names of uploaded spectra by field, in the folder of their study.
 SPECTRA = {

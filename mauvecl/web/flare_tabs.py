@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
 from contourpy import contour_generator
-from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
@@ -18,6 +17,7 @@ from mauvecl.answers.measure import COLUMNS, expected_measurements, models_of
 from mauvecl.charts.chart import Area, Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
 from mauvecl.charts.limits import RISES
 from mauvecl.fits.flare_model import FlareModel
+from mauvecl.host.arrays import Float
 from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from mauvecl.web.figures import Canvas
 
 
-Float = NDArray[np.float64]
 T = TypeVar("T")
 
 #: Ranges of the pictures: magnitudes, and amplitudes in per cent, fixed for all questions.

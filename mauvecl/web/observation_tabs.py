@@ -14,6 +14,7 @@ from mauvecl.answers.plan import COLUMNS
 from mauvecl.charts import chart, spectra
 from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, ChartData, Custom, Dots, Line, Own, Rule, Strips, Targets
 from mauvecl.charts.light_curves import SCATTER, scatter_series
+from mauvecl.host.arrays import Float
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.columns import with_error
 from mauvecl.schema.errors import InputError
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
     from mauvecl.web.figures import Canvas
     from mauvecl.web.uploads import Observations
 
-
-Float = NDArray[np.float64]
 
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
