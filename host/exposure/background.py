@@ -21,7 +21,7 @@ from mauvecl.host.tables import names
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.physical import Share, SkyBrightness, SolidAngle
+from mauvecl.schema.fields import Share, SkyBrightness, SolidAngle
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord

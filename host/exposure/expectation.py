@@ -26,8 +26,7 @@ from mauvecl.host.stars.spectrum import continued
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, number, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
-from mauvecl.schema.fields import Unit
-from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
+from mauvecl.schema.fields import Duration, Exposure, SkyBrightness, Unit
 
 if TYPE_CHECKING:
     from astropy.table import QTable

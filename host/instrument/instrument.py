@@ -20,10 +20,10 @@ from mauvecl.host.arrays import Float
 from mauvecl.host.instrument import FORMERLY_MAUVE, instrument_path, shipped_names
 from mauvecl.host.instrument.curves import MAX_PIXELS, PixelMap, SpectralCurve, ThroughputErrors
 from mauvecl.host.tables.files import read_text, toml
+from mauvecl.schema import fields
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Help, Range, Unit, whole, word_of
-from mauvecl.schema.physical import DetectorTemperature, Exposure, NotNegative, Positive, Wavelength
 from mauvecl.schema.section import Section, built
 
 if TYPE_CHECKING:
@@ -118,8 +118,8 @@ class Instrument(Section):
         Help("Tag and source of each value by name", "P paper, D datasheet, C computed, A assumption, U user"),
     ] = Field(default_factory=dict)
 
-    collecting_area_cm2: Annotated[Positive, Unit("cm2"), Help("Collecting area")]
-    field_of_view_radius_arcsec: Annotated[Positive, Unit("arcsec"), Help("Radius of the field of view")]
+    collecting_area_cm2: Annotated[fields.Positive, Unit("cm2"), Help("Collecting area")]
+    field_of_view_radius_arcsec: Annotated[fields.Positive, Unit("arcsec"), Help("Radius of the field of view")]
     pointing_loss: Annotated[Loss, Help("Fraction of the light that is lost by pointing")]
 
     grating_efficiency: Annotated[Efficiency, Help("Efficiency of the grating")]
@@ -136,20 +136,20 @@ class Instrument(Section):
 
     pixels: Annotated[Whole, Range(1, MAX_PIXELS), Help("Number of pixels")]
     pixel_zero_nm: Annotated[float, Unit("nm"), Range(), Help("Wavelength of the centre of pixel 0")]
-    dispersion_nm_per_pixel: Annotated[Positive, Unit("nm / pix"), Help("Linear dispersion")]
-    output_min_nm: Annotated[Wavelength, Help("Smallest wavelength of the centre of a pixel that is read")]
-    output_max_nm: Annotated[Wavelength, Help("Largest wavelength of the centre of a pixel that is read")]
+    dispersion_nm_per_pixel: Annotated[fields.Positive, Unit("nm / pix"), Help("Linear dispersion")]
+    output_min_nm: Annotated[fields.Wavelength, Help("Smallest wavelength of the centre of a pixel that is read")]
+    output_max_nm: Annotated[fields.Wavelength, Help("Largest wavelength of the centre of a pixel that is read")]
     top_hat_width_nm: Annotated[Width, Help("Full width of the top hat of the line spread function")]
     gaussian_fwhm_nm: Annotated[Width, Help("Full width at half maximum of its Gaussian")]
-    resolution_element_nm: Annotated[Wavelength, Help("Width of a resolution element")]
+    resolution_element_nm: Annotated[fields.Wavelength, Help("Width of a resolution element")]
 
     quantum_efficiency_a_per_w: Annotated[Responsivity, Help("Responsivity of the detector, A/W")]
-    conversion_uv_per_electron: Annotated[Positive, Unit("uV / electron"), Help("Voltage per electron")]
+    conversion_uv_per_electron: Annotated[fields.Positive, Unit("uV / electron"), Help("Voltage per electron")]
     adc_bits: Annotated[Whole, Range(1, 24), Help("Bits of the converter")]
-    adc_range_v: Annotated[Positive, Unit("V"), Help("Voltage of the converter's full range")]
-    saturation_v: Annotated[Positive, Unit("V"), Help("Voltage at which the detector saturates")]
-    temperature_c: Annotated[DetectorTemperature, Help("Temperature of the detector")]
-    dark_scale_dn_per_s: Annotated[NotNegative, Unit("DN / s"), Help("Dark current at 0 deg C")]
+    adc_range_v: Annotated[fields.Positive, Unit("V"), Help("Voltage of the converter's full range")]
+    saturation_v: Annotated[fields.Positive, Unit("V"), Help("Voltage at which the detector saturates")]
+    temperature_c: Annotated[fields.DetectorTemperature, Help("Temperature of the detector")]
+    dark_scale_dn_per_s: Annotated[fields.NotNegative, Unit("DN / s"), Help("Dark current at 0 deg C")]
     dark_slope_per_c: Annotated[
         float, Unit("1 / K"), Range(-1, 1), Help("Relative change of the dark current per degree")
     ]
@@ -159,9 +159,9 @@ class Instrument(Section):
     photon_noise: Annotated[Literal["gaussian", "poisson"], Help("Distribution of the photons about their mean")] = (
         "gaussian"
     )
-    read_noise_dn: Annotated[NotNegative, Unit("DN"), Help("Read noise of a frame")]
-    bias_dn: Annotated[NotNegative, Unit("DN"), Help("Bias")]
-    frame_s: Annotated[Exposure, Help("Length of a frame")]
+    read_noise_dn: Annotated[fields.NotNegative, Unit("DN"), Help("Read noise of a frame")]
+    bias_dn: Annotated[fields.NotNegative, Unit("DN"), Help("Bias")]
+    frame_s: Annotated[fields.Exposure, Help("Length of a frame")]
     pixel_map: Annotated[
         PixelMap | None,
         BeforeValidator(partial(_read_path, kind=PixelMap)),

@@ -25,8 +25,7 @@ from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import records
 from mauvecl.schema.errors import InputError, printable, shortened
-from mauvecl.schema.fields import Range, Unit
-from mauvecl.schema.physical import DAY_S, Duration
+from mauvecl.schema.fields import DAY_S, Duration, Range, Unit
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -18,7 +18,7 @@ from mauvecl.host.orbit.orbit import Bodies, Orbit, TimeGrid, Track, Vectors, un
 from mauvecl.host.tables.files import parse_ecsv
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share
+from mauvecl.schema.fields import DetectorTemperature, Duration, NotNegative, Share
 
 
 @cache

@@ -21,10 +21,10 @@ from mauvecl.host.arrays import ContentEquality, Float, array_cache, set_read_on
 from mauvecl.host.spectra.units import NEEDED_NM
 from mauvecl.host.stars.spectrum import ANGSTROM, attached, check_points, photons, supplemented
 from mauvecl.host.tables.files import LARGEST, SMALLEST
+from mauvecl.schema import fields
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.fields import Range, Unit, checked, number
-from mauvecl.schema.physical import Amplitude, AreaRatio, BalmerJump, LineFraction, Temperature
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -126,7 +126,7 @@ class FlareSpectrum:
 class Blackbody(FlareSpectrum):
     """Flare with the spectrum of a blackbody."""
 
-    temperature_k: Temperature = 10_000.0
+    temperature_k: fields.Temperature = 10_000.0
 
     def flux(self, wavelength_nm: Wavelengths) -> Float:
         return blackbody(wavelength_nm, self.temperature_k)
@@ -143,9 +143,9 @@ class Blackbody(FlareSpectrum):
 class TwoBlackbodies(FlareSpectrum):
     """Flare of two temperatures; `second_area` is the area at the second over that at the first."""
 
-    temperature_k: Temperature = 10_000.0
-    second_temperature_k: Temperature = 30_000.0
-    second_area: AreaRatio = 0.05
+    temperature_k: fields.Temperature = 10_000.0
+    second_temperature_k: fields.Temperature = 30_000.0
+    second_area: fields.AreaRatio = 0.05
 
     def flux(self, wavelength_nm: Wavelengths) -> Float:
         second = blackbody(wavelength_nm, self.second_temperature_k)
@@ -166,9 +166,9 @@ class BalmerFlare(FlareSpectrum):
     The `jump` is the ratio of the flux just below the Balmer edge to that just above; 1 means no jump.
     """
 
-    temperature_k: Temperature = 10_000.0
-    jump: BalmerJump = 2.0
-    electron_temperature_k: Temperature = ELECTRON_TEMPERATURE_K
+    temperature_k: fields.Temperature = 10_000.0
+    jump: fields.BalmerJump = 2.0
+    electron_temperature_k: fields.Temperature = ELECTRON_TEMPERATURE_K
 
     @property
     def nodes_nm(self) -> Float:  # type: ignore[override]
@@ -246,7 +246,7 @@ class FlareWithLines(FlareSpectrum):
     """
 
     continuum: FlareSpectrum
-    fractions: Mapping[str, LineFraction] = field(default_factory=dict)
+    fractions: Mapping[str, fields.LineFraction] = field(default_factory=dict)
     fluxes_cgs: Mapping[str, LineFlux] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -343,7 +343,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         flux_flam: ArrayLike,
         *,
         name: str = "flare",
-        continue_at_k: Temperature | None = None,
+        continue_at_k: fields.Temperature | None = None,
         messages: tuple[str, ...] = (),
     ) -> Self:
         """Return a flare from wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of the flare alone, shape (n,) each.
@@ -372,7 +372,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         *,
         wavelength_unit: str | None = None,
         flux_unit: str | None = None,
-        continue_at_k: Temperature | None = None,
+        continue_at_k: fields.Temperature | None = None,
     ) -> Self:
         """Read the spectrum of a star with its flare, and subtract its quiescent one, on the same scale, from it.
 
@@ -456,7 +456,7 @@ def with_flare(
     photosphere in a region of filling factor f = A / (R - 1), it is F (1 - f) + f R (N_F / N_B) B, where A is the
     amplitude, N are photons in the band and R is the ratio of the surface fluxes of flare and photosphere there.
     """
-    checked(Amplitude, "flare amplitude", amplitude)
+    checked(fields.Amplitude, "flare amplitude", amplitude)
     light = added_light(nm, flux_flam, spectrum, band, geometry, photosphere_k)
     star, hot, ratio = light.star, light.flare, light.ratio
     grid = spectrum.grid(nm)
@@ -526,7 +526,7 @@ def added_light(
     if not spectrum.surface or spectrum.fixed_lines:
         fault = f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown"
         raise InputError(fault, key="flare_geometry")
-    checked(Temperature, "photosphere temperature", photosphere_k)
+    checked(fields.Temperature, "photosphere temperature", photosphere_k)
     ratio = hot / photons(nm, blackbody(nm, photosphere_k), band)
     if ratio <= 1.0:
         photosphere = f"the {photosphere_k:g} K of the photosphere that it replaces"

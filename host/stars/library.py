@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING
 from mauvecl.host.tables.files import Numbers, parse_numbers, read_ecsv
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, checked, number
-from mauvecl.schema.physical import Temperature
+from mauvecl.schema.fields import Range, Temperature, checked, number
 
 if TYPE_CHECKING:
     import numpy as np

@@ -22,8 +22,7 @@ from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbo
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
-from mauvecl.schema.fields import AnyUnit, Unit
-from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
+from mauvecl.schema.fields import Amplitude, AnyUnit, BinWidth, Magnitude, Reddening, Temperature, Unit
 
 if TYPE_CHECKING:
     from astropy.table import QTable

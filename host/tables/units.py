@@ -15,7 +15,7 @@ import numpy as np
 from mauvecl.host.arrays import Float
 from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 
 if TYPE_CHECKING:
     import astropy.units as u

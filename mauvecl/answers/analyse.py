@@ -26,7 +26,7 @@ from mauvecl.observations.spectra import EventSpectrum
 from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.study.cases import Case, Use, cases
 from mauvecl.study.star import Star
 

@@ -21,7 +21,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
 from mauvecl.search.false_alarms import consecutive_alarm_rate, counted_threshold, sampled_rate
 from mauvecl.search.flare_fits import SingleFlareFit

@@ -31,7 +31,7 @@ from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind, reworded
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.study.cases import (
     SATURATED,
     Case,

@@ -28,7 +28,7 @@ from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, interval_columns, number, percent, records
 from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.schema.section import given_keys
 from mauvecl.search.completeness import PER_DECADE, SMALL, Completeness, Yield, frame_signal, recovered_per_day
 from mauvecl.search.templates import frame_nuisances

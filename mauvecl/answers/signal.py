@@ -20,7 +20,7 @@ from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, stacked
 from mauvecl.schema.errors import InputError, Message
-from mauvecl.schema.physical import DAY_S, FirstRealisation, Wavelength
+from mauvecl.schema.fields import DAY_S, FirstRealisation, Wavelength
 from mauvecl.study.cases import Case, cases, collect_messages, star_column, star_label
 from mauvecl.study.study import Study
 

@@ -31,7 +31,7 @@ from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, kept
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error
 from mauvecl.schema.errors import InputError, Message
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.false_alarms import sampled_rate
 from mauvecl.study.cases import Case, cases, collect_messages, place_columns

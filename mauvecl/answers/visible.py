@@ -20,7 +20,7 @@ from mauvecl.host.arrays import Float, true_runs
 from mauvecl.host.orbit.orbit import Bodies, Target, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
 from mauvecl.schema.columns import Column, View, percent, table_of
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.study.plan import targets_of
 from mauvecl.study.study import Study
 

@@ -29,8 +29,7 @@ from mauvecl.noise.scene import BATCH, Scene, factor_distributions, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message
-from mauvecl.schema.fields import OneOrMore
-from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
+from mauvecl.schema.fields import FirstRealisation, OneOrMore, Realisations, Seed
 
 #: All statistics in the order of tables and plots; add a new one here.
 STATISTICS: dict[str, Statistic] = {

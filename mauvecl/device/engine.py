@@ -22,8 +22,7 @@ from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import OneOrMore
-from mauvecl.schema.physical import DEFAULT_SEED, FirstRealisation, Realisations, Seed
+from mauvecl.schema.fields import DEFAULT_SEED, FirstRealisation, OneOrMore, Realisations, Seed
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation

@@ -19,7 +19,7 @@ from mauvecl.flares.stare import Stare
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DEFAULT_SEED, Realisations, Seed
+from mauvecl.schema.fields import DEFAULT_SEED, Realisations, Seed
 
 Floats = NDArray[np.float32]
 

@@ -41,8 +41,7 @@ from mauvecl.host.stars.flare import (
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import range_of
-from mauvecl.schema.physical import Distance, Radius, Temperature, Wavelength
+from mauvecl.schema.fields import Distance, Radius, Temperature, Wavelength, range_of
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation

@@ -39,7 +39,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, formatted, table_of
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import Probability, Temperature, Wavelength
+from mauvecl.schema.fields import Probability, Temperature, Wavelength
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -31,8 +31,7 @@ from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range
-from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
+from mauvecl.schema.fields import Duration, Moment, Probability, Range, Wavelength
 
 if TYPE_CHECKING:
     from astropy.table import QTable

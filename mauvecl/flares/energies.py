@@ -46,8 +46,7 @@ from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Range, Unit, checked
-from mauvecl.schema.physical import Distance, Energy, Positive, Radius, RateExponent, Temperature
+from mauvecl.schema.fields import Distance, Energy, Positive, Radius, Range, RateExponent, Temperature, Unit, checked
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source

@@ -13,8 +13,7 @@ from pydantic import AfterValidator
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Help, Range, Unit
-from mauvecl.schema.physical import Duration, Temperature
+from mauvecl.schema.fields import Duration, Help, Range, Temperature, Unit
 from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from mauvecl.flares.settings import check_shape, integral_between_points
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.physical import Duration
+from mauvecl.schema.fields import Duration
 
 
 class Integrable(ABC):

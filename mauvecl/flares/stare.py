@@ -21,8 +21,7 @@ from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import STARE_CHANGES, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, Unit
-from mauvecl.schema.physical import DAY_S, Amplitude, Duration, Energy, Moment, Temperature
+from mauvecl.schema.fields import DAY_S, Amplitude, Duration, Energy, Moment, Range, Temperature, Unit
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation

@@ -31,8 +31,7 @@ from mauvecl.noise.scene import Scene, padded, prepare
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range
-from mauvecl.schema.physical import Realisations, Seed
+from mauvecl.schema.fields import Range, Realisations, Seed
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation

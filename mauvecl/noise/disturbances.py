@@ -15,8 +15,7 @@ from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonS
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, Unit, is_quantity, without_unit
-from mauvecl.schema.physical import Duration
+from mauvecl.schema.fields import Duration, Range, Unit, is_quantity, without_unit
 from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:

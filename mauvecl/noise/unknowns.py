@@ -17,8 +17,7 @@ from pydantic import create_model
 from mauvecl.noise.disturbances import ADDITIVE, Normal, ParticleRate, PointingDrifts, PriorField, Uniform
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, range_of
-from mauvecl.schema.physical import DetectorTemperature
+from mauvecl.schema.fields import DetectorTemperature, Range, range_of
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:

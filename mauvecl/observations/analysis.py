@@ -37,7 +37,7 @@ from mauvecl.observations.spectra import (
     measure_flare,
     survey_spectra,
 )
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.search.completeness import size_at
 
 #: Default numbers of half-widths, sizes and peak times.

@@ -16,7 +16,7 @@ from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import DetectedEvent, ProcessSearch, SeriesSurvey
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.search.templates import REACH
 
 #: Statistic of events whose frames take no part in fits of the process.

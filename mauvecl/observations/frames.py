@@ -18,8 +18,7 @@ from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.tables.units import SCALES, offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Unit
-from mauvecl.schema.physical import DAY_S, Moment
+from mauvecl.schema.fields import DAY_S, Moment, Unit
 
 if TYPE_CHECKING:
     from astropy.time import Time

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 
 #: Standard deviation of a normal distribution in units of its median absolute deviation.
 PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))

@@ -16,8 +16,7 @@ from mauvecl.host.tables.files import read_text, toml
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
 from mauvecl.host.tables.table import TableFile, Values, converted, unit_in, unit_in_name
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Accepted
-from mauvecl.schema.physical import DAY_S, Exposure
+from mauvecl.schema.fields import DAY_S, Accepted, Exposure
 from mauvecl.schema.section import Record
 
 

@@ -28,7 +28,7 @@ from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.host.arrays import Bool, Float, map_in_threads
 from mauvecl.observations.level import LevelGiven
 from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.search.search import largest_values
 from mauvecl.search.templates import LEAST_SHARE, Bank, Baseline, Template, Templates
 

@@ -23,8 +23,7 @@ from mauvecl.host.stars.flare import BALMER_EDGE_NM, EmissionLine
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Range, Unit
-from mauvecl.schema.physical import DEFAULT_SEED, Positive, Probability, Seed, Wavelength
+from mauvecl.schema.fields import DEFAULT_SEED, Positive, Probability, Range, Seed, Unit, Wavelength
 
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances

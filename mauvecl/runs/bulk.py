@@ -37,7 +37,7 @@ from mauvecl.runs.store import (
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, missing_package
-from mauvecl.schema.physical import FirstRealisation, Realisations
+from mauvecl.schema.fields import FirstRealisation, Realisations
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 

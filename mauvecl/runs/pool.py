@@ -22,8 +22,7 @@ from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.runs.checkpoint import Checkpoint, ShardLost, Stopped, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
-from mauvecl.schema.fields import Range
-from mauvecl.schema.physical import Realisations
+from mauvecl.schema.fields import Range, Realisations
 
 if TYPE_CHECKING:
     from mauvecl.detection.detection import Detection

@@ -19,7 +19,7 @@ from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S, Duration, DurationExponent, DurationScatter, Energy, NotNegative, Positive
+from mauvecl.schema.fields import DAY_S, Duration, DurationExponent, DurationScatter, Energy, NotNegative, Positive
 from mauvecl.search.false_alarms import TemplateGrid
 from mauvecl.search.templates import Bank, white_bank
 

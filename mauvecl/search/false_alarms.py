@@ -42,7 +42,7 @@ from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_cou
 from mauvecl.flares.stare import select_frames
 from mauvecl.host.arrays import Float
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.search.search import BATCH, Search, Survey
 from mauvecl.search.templates import Bank
 

@@ -14,7 +14,7 @@ from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
-from mauvecl.schema import physical
+from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Accepted, Flag, Help, Range, Slider, says_none
 from mauvecl.schema.section import Section, check_all, check_one, read_words, setting
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class Observation(Section):
     """Instrument, exposure, and how the detector is modelled."""
 
-    exposure_s: physical.Exposure = setting(
+    exposure_s: fields.Exposure = setting(
         50.0,
         "Exposure time; rounded up to whole frames of 5 s",
         flag="--exposure -t",
@@ -51,7 +51,7 @@ class Observation(Section):
         "MauveSim paper, which makes the dark noise 1.3 times as large.",
         options=("mauve", "mauvesim"),
     )
-    temperature_c: physical.DetectorTemperature | None = setting(
+    temperature_c: fields.DetectorTemperature | None = setting(
         None,
         "Detector temperature",
         flag="--temperature",
@@ -95,7 +95,7 @@ class Observation(Section):
 class SkyLight(Section):
     """Sky background: a surface brightness, that of a target at a time, or none."""
 
-    surface_brightness: physical.SkyBrightness | None = setting(
+    surface_brightness: fields.SkyBrightness | None = setting(
         None,
         "Surface brightness of the sky in V; or none",
         flag=Flag("--sky", kind=str),
@@ -158,9 +158,9 @@ class SkyLight(Section):
 class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
-    realisations: physical.Realisations = setting(1_000_000, "Noise realisations", flag="--realisations -n")
-    seed: physical.Seed = setting(
-        physical.DEFAULT_SEED, "Seed", flag="--seed", hint="The same seed gives the same noise, to the bit.", place=3
+    realisations: fields.Realisations = setting(1_000_000, "Noise realisations", flag="--realisations -n")
+    seed: fields.Seed = setting(
+        fields.DEFAULT_SEED, "Seed", flag="--seed", hint="The same seed gives the same noise, to the bit.", place=3
     )
     statistics: Annotated[
         tuple[str, ...], AfterValidator(lambda given: STATISTIC_NAMES if "all" in given else given)
@@ -179,7 +179,7 @@ class Run(Section):
         ),
         choices=f"{', '.join(STATISTIC_NAMES)}, or all",
     )
-    fap: physical.Probability = setting(
+    fap: fields.Probability = setting(
         1e-3,
         "False-alarm probability per test",
         flag="--fap",
@@ -203,7 +203,7 @@ class Run(Section):
     variances: Literal["model", "estimated"] = setting(
         "model", "Variances", flag="--variances", choices="model, or estimated from the counts as an observer must"
     )
-    template_temperatures_k: tuple[physical.Temperature, ...] = setting(
+    template_temperatures_k: tuple[fields.Temperature, ...] = setting(
         (), "Temperature of a flare that is also looked for; shows what a wrong template costs", flag="--template"
     )
     weights: dict[str, Path] = setting(dict, "Files with weights of your own statistics, by name")
@@ -217,7 +217,7 @@ class Run(Section):
 
 
 #: Standard deviation of an unknown.
-Spread = Annotated[physical.Positive | Literal["free"], Accepted("a number above 0, or 'free'")]
+Spread = Annotated[fields.Positive | Literal["free"], Accepted("a number above 0, or 'free'")]
 
 
 def sd_of(spread: Spread) -> float:

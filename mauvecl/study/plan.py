@@ -11,7 +11,7 @@ from pydantic import field_validator, model_validator
 
 from mauvecl.host.orbit import Limits
 from mauvecl.host.tables import names
-from mauvecl.schema import physical
+from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, first
 from mauvecl.schema.section import Section, built, check_all, check_different, check_one, number_or_text, setting
@@ -49,7 +49,7 @@ class OrbitQuestion(Section):
         most=1000,
         slider=Slider(5, 730, 5),
     )
-    step_s: physical.Duration = setting(60.0, "Time between the computed positions", flag="--step")
+    step_s: fields.Duration = setting(60.0, "Time between the computed positions", flag="--step")
     tle: Path | None = setting(None, "File of two-line elements, newer than the embedded ones", flag="--tle")
     kind: Literal["auto", "tle", "mean"] = setting(
         "auto", "Model of the orbit", flag="--orbit", choices="tle, mean, or auto (mean far from the elements' epoch)"
@@ -99,8 +99,8 @@ class PlanTarget(Section):
     name: Annotated[str, Help("Name of the target")]
     coordinates: str | None = setting(None, "Coordinates, which replace those of the name")
     spectral_type: str | None = setting(None, "Spectral type, such as M3V; the nearest spectrum of the library is used")
-    magnitude: physical.Magnitude | None = setting(None, "V magnitude")
-    distance_pc: physical.Distance | None = setting(None, "Distance")
+    magnitude: fields.Magnitude | None = setting(None, "V magnitude")
+    distance_pc: fields.Distance | None = setting(None, "Distance")
     rates: Literal["G", "K", "M", "sunlike"] | None = setting(
         None, "Published flare rates", usual="the spectral type's"
     )
@@ -108,16 +108,16 @@ class PlanTarget(Section):
         None, "Mass, for the rates of Davenport et al. 2019; needs the age"
     )
     age_myr: Annotated[float, Unit("Myr"), Range(0, open_low=True)] | None = setting(None, "Age")
-    alpha: physical.RateExponent | None = setting(None, "Exponent of a power law of bolometric energies")
+    alpha: fields.RateExponent | None = setting(None, "Exponent of a power law of bolometric energies")
     rate_per_day: Annotated[float, Unit("1 / d"), Range(0, open_low=True)] | None = setting(
         None, "Rate of flares above an energy, for the power law"
     )
-    at_erg: physical.Energy | None = setting(None, "That energy")
+    at_erg: fields.Energy | None = setting(None, "That energy")
     rates_file: Path | None = setting(None, "File with a cumulative distribution of energies")
     rates_band: str = setting("bolometric", "Band of the energies in that file")
     neighbours: Path | None = setting(None, "Table of other stars near the target, as for a star")
     neighbours_of: str | None = setting(None, "The target's own row in that table, or its coordinates")
-    neighbour_share: physical.Share = setting(
+    neighbour_share: fields.Share = setting(
         1.0, "Share of the light of neighbours within the fibre's radius that enters it; an assumption"
     )
 
@@ -198,10 +198,10 @@ class PlanQuestion(Section):
         first="100",
         slider=Slider(10, 1000, 10),
     )
-    half_width_s: physical.Duration = setting(100.0, "Half-width of flares of the energy at_erg")
-    at_erg: physical.Energy = setting(1e33, "That energy")
-    exponent: physical.DurationExponent = setting(0.39, "Exponent with which half-widths grow with energy")
-    scatter_dex: physical.DurationScatter = setting(0.3, "Scatter of half-widths about that law, dex")
+    half_width_s: fields.Duration = setting(100.0, "Half-width of flares of the energy at_erg")
+    at_erg: fields.Energy = setting(1e33, "That energy")
+    exponent: fields.DurationExponent = setting(0.39, "Exponent with which half-widths grow with energy")
+    scatter_dex: fields.DurationScatter = setting(0.3, "Scatter of half-widths about that law, dex")
     completeness: Literal["injections", "closed form"] = setting(
         "closed form",
         "Completeness",

@@ -14,8 +14,21 @@ from pydantic import Field, model_validator
 from mauvecl.host.stars.library import ALIASES
 from mauvecl.schema import section
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, first
-from mauvecl.schema.physical import DetectorTemperature, Magnitude, Positive, Probability, Wavelength
+from mauvecl.schema.fields import (
+    Accepted,
+    DetectorTemperature,
+    Flag,
+    Help,
+    Magnitude,
+    Positive,
+    Probability,
+    Quantity,
+    Range,
+    Slider,
+    Unit,
+    Wavelength,
+    first,
+)
 from mauvecl.schema.section import Section, read_axis, setting
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star, unit_of_file

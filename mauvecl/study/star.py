@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import model_validator
 
 from mauvecl.host.stars.library import ALIASES, listed_values
-from mauvecl.schema import physical
+from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
 from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
@@ -59,7 +59,7 @@ class Star(Section):
         quantity=("star", "library name or file, with its magnitude", "star"),
     )
     file: Path | None = setting(None, "Spectrum file, instead of a name of the library")
-    magnitude: physical.Magnitude | None = setting(
+    magnitude: fields.Magnitude | None = setting(
         None,
         "Magnitude; one for all stars or one each, as in 7,8",
         flag=Flag("--magnitude", "-m", kind=list[float]),
@@ -83,7 +83,7 @@ class Star(Section):
         flag="--magnitude-system",
         choices="catalogue, vega (Vega is 0 in every band) or ab",
     )
-    ebv: physical.Reddening | None = setting(
+    ebv: fields.Reddening | None = setting(
         None,
         "Dust in front of the star, E(B-V); needs mauvecl[extinction]",
         flag="--ebv",
@@ -122,10 +122,8 @@ class Star(Section):
     ignore_checksum: bool | None = setting(
         None, "Read FITS files although their CHECKSUM or DATASUM differs", flag="--ignore-checksum"
     )
-    bin_nm: physical.BinWidth | None = setting(
-        None, "Width of bins over which the spectrum is averaged", flag="--bin-nm"
-    )
-    distance_pc: physical.Distance | None = setting(
+    bin_nm: fields.BinWidth | None = setting(None, "Width of bins over which the spectrum is averaged", flag="--bin-nm")
+    distance_pc: fields.Distance | None = setting(
         None,
         "Distance of the star; for energies",
         flag="--distance",
@@ -133,8 +131,8 @@ class Star(Section):
         hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
         group="Measurement",
     )
-    radius_rsun: physical.Radius | None = setting(None, "Radius of the star; for energies", flag="--radius")
-    effective_temperature_k: physical.Temperature | None = setting(
+    radius_rsun: fields.Radius | None = setting(None, "Radius of the star; for energies", flag="--radius")
+    effective_temperature_k: fields.Temperature | None = setting(
         None, "Effective temperature of the star; for energies", flag="--star-temperature"
     )
     neighbours: Path | None = setting(
@@ -157,7 +155,7 @@ class Star(Section):
         "has positions but no separations.",
         group="Neighbours",
     )
-    neighbour_share: physical.Share = setting(
+    neighbour_share: fields.Share = setting(
         1.0,
         "Share of the light of neighbours within the fibre's radius that enters it; an assumption",
         flag="--neighbour-share",
@@ -240,7 +238,7 @@ FLARE_FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k",
 class FlareLight(Section):
     """Spectrum of a flare; by default a blackbody of `flare.temperature_k`."""
 
-    balmer_jump: physical.BalmerJump | None = setting(
+    balmer_jump: fields.BalmerJump | None = setting(
         None,
         "Ratio of the flare's flux just below the Balmer edge to that just above",
         flag="--balmer-jump",
@@ -254,8 +252,8 @@ class FlareLight(Section):
             "Balmer jump ratio",
         ),
     )
-    electron_temperature_k: physical.Temperature = setting(10_000.0, "Electron temperature of the Balmer continuum")
-    second_temperature_k: physical.Temperature | None = setting(
+    electron_temperature_k: fields.Temperature = setting(10_000.0, "Electron temperature of the Balmer continuum")
+    second_temperature_k: fields.Temperature | None = setting(
         None,
         "Temperature of a second blackbody of the flare; needs its area",
         flag="--second-temperature",
@@ -263,7 +261,7 @@ class FlareLight(Section):
         hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
         quantity=("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     )
-    second_area: physical.AreaRatio | None = setting(
+    second_area: fields.AreaRatio | None = setting(
         None,
         "Area of the second blackbody over that of the first",
         flag="--second-area",
@@ -272,7 +270,7 @@ class FlareLight(Section):
         first="0.05",
         quantity=("second_area", "area of the flare's second blackbody over that of the first", "second area"),
     )
-    lines: dict[str, physical.LineFraction] = setting(
+    lines: dict[str, fields.LineFraction] = setting(
         dict,
         "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm; as in 'Mg II=0.05'",
         flag=Flag("--line", kind=list[str], read=read_line_fluxes),
@@ -282,7 +280,7 @@ class FlareLight(Section):
         "Emission line at the telescope, by name or wavelength in nm; as in '280=1e-12'",
         flag=Flag("--line-flux", kind=list[str], read=read_line_fluxes),
     )
-    line_scale: physical.LineScale = setting(
+    line_scale: fields.LineScale = setting(
         1.0,
         "Factor on all line fluxes",
         quantity=("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
@@ -312,7 +310,7 @@ class FlareLight(Section):
     )
     wavelength_unit: str | None = unit_of_file("wavelength", "flare", "the flare's files", "Flare", "Own flare")
     flux_unit: str | None = unit_of_file("flux", "flare", "the flare's files", "Flare", "Own flare")
-    continue_at_k: physical.Temperature | None = setting(
+    continue_at_k: fields.Temperature | None = setting(
         None,
         "Temperature of a blackbody that continues the flare's file beyond its ends",
         flag="--continue-at",
@@ -382,7 +380,7 @@ def amplitudes_in(path: Path, _: str) -> list[float]:
 class Flare(Section):
     """Amplitudes, spectrum and geometry of flares."""
 
-    amplitudes: tuple[physical.Amplitude, ...] = setting(
+    amplitudes: tuple[fields.Amplitude, ...] = setting(
         (0.0076, 0.02, 0.081, 0.24),
         "Flare amplitude; 0.24 is a rise of 24 % in the flare's band",
         min_length=1,
@@ -404,7 +402,7 @@ class Flare(Section):
         slider=Slider(0.01, 1000, 10**0.1, log=True),
         quantity=("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),
     )
-    temperature_k: physical.Temperature = setting(
+    temperature_k: fields.Temperature = setting(
         10_000.0,
         "Flare temperature",
         flag="--flare-temperature",
@@ -418,7 +416,7 @@ class Flare(Section):
     geometry: Literal["added", "replaces"] = setting(
         "added", "Whether a flare is added to the star or replaces part of its photosphere", flag="--geometry"
     )
-    photosphere_temperature_k: physical.Temperature | None = setting(
+    photosphere_temperature_k: fields.Temperature | None = setting(
         None,
         "Temperature of the photosphere that a flare replaces",
         flag="--photosphere-temperature",

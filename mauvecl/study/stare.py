@@ -10,9 +10,9 @@ from mauvecl.flares import settings
 from mauvecl.flares.settings import HALF_WIDTHS_S, SHAPE_NAMES, WINDOW_S, CoolingLaw, Curve, Per, ShapeName
 from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import Changing, NuisanceName
+from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit
-from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
 from mauvecl.schema.section import Section, check_one, read_ranges, setting
 from mauvecl.study.observation import Spread, sd_of
 
@@ -25,13 +25,13 @@ ORBIT_FRAMES_S = 5680.0
 
 #: Known changes during a stare.
 KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
-Spreads = dict[Changing, Positive]
+Spreads = dict[Changing, fields.Positive]
 
 
 class StareQuestion(Section):
     """Duration and gaps of a stare, known and unknown changes during it, and its flares unless `events` are given."""
 
-    duration_s: Duration = setting(ORBIT_FRAMES_S, "Duration of the stare", flag="--duration")
+    duration_s: fields.Duration = setting(ORBIT_FRAMES_S, "Duration of the stare", flag="--duration")
     gaps: Annotated[tuple[tuple[float, float], ...], Unit("s")] = setting(
         (),
         "Gap without recorded frames, from:to; as in 1000:2000",
@@ -39,7 +39,7 @@ class StareQuestion(Section):
             "--gap", kind=list[str], read=partial(read_ranges, expected="two times in s, such as 1000:2000", unit="s")
         ),
     )
-    orbit_s: Duration = setting(settings.ORBIT_S, "Orbital period")
+    orbit_s: fields.Duration = setting(settings.ORBIT_S, "Orbital period")
     orbit_gap_s: Annotated[float, Unit("s"), Range(0)] = setting(
         0.0, "Gap at the end of every orbit", flag="--orbit-gap"
     )
@@ -72,13 +72,13 @@ class StareQuestion(Section):
         ),
     )
     number: Annotated[int, Range(0, 2**32 - 1)] = setting(0, "Number of the drawn stare")
-    half_width_s: Duration = setting(60.0, "Half-width of the flares", flag="--half-width")
+    half_width_s: fields.Duration = setting(60.0, "Half-width of the flares", flag="--half-width")
     shape: ShapeName = setting("davenport2014", "Shape of flares", flag="--shape", choices=SHAPE_NAMES)
-    energies_erg: tuple[Energy, ...] = setting(
+    energies_erg: tuple[fields.Energy, ...] = setting(
         (), "Bolometric energy of a flare; instead of amplitudes", flag="--energy"
     )
     search: bool = setting(True, "Search the stare for flares, as the section search says", flag="--search/--no-search")
-    bands_nm: tuple[tuple[Wavelength, Wavelength], ...] = setting(
+    bands_nm: tuple[tuple[fields.Wavelength, fields.Wavelength], ...] = setting(
         ((200.0, 300.0), (300.0, 400.0), (400.0, 550.0), (550.0, 700.0)), "Wavelength ranges of light curves"
     )
 
@@ -103,13 +103,13 @@ class EventChoice(Section):
     """
 
     peak_s: Annotated[float, Unit("s"), Help("Time of the peak after the start of the stare")]
-    half_width_s: Duration | None = setting(None, "Half-width of the shape", usual="the stare's")
-    amplitude: Amplitude | None = setting(None, "Amplitude of the shape", usual="the flare's")
-    peak: Amplitude | None = setting(None, "Maximum of the shape, instead of its amplitude")
-    equivalent_duration_s: Duration | None = setting(None, "Equivalent duration, instead of an amplitude")
-    energy_erg: Energy | None = setting(None, "Energy, instead of an amplitude")
+    half_width_s: fields.Duration | None = setting(None, "Half-width of the shape", usual="the stare's")
+    amplitude: fields.Amplitude | None = setting(None, "Amplitude of the shape", usual="the flare's")
+    peak: fields.Amplitude | None = setting(None, "Maximum of the shape, instead of its amplitude")
+    equivalent_duration_s: fields.Duration | None = setting(None, "Equivalent duration, instead of an amplitude")
+    energy_erg: fields.Energy | None = setting(None, "Energy, instead of an amplitude")
     energy: Literal["bolometric", "band"] = setting("bolometric", "Meaning of the energy")
-    temperature_k: Temperature | None = setting(None, "Temperature", usual="the flare's")
+    temperature_k: fields.Temperature | None = setting(None, "Temperature", usual="the flare's")
     cooling: CoolingLaw | None = setting(None, "Exponential cooling from that temperature")
     shape: ShapeName | None = setting(None, "Shape", usual="the stare's", choices=SHAPE_NAMES)
     shape_file: Path | None = setting(None, "File of a shape with two columns, time in half-widths and value")
@@ -127,7 +127,9 @@ class SearchChoice(Section):
     """Search of a stare for flares, and its rate of false alarms."""
 
     shape: ShapeName = setting("davenport2014", "Shape of flares", flag="--shape", choices=SHAPE_NAMES)
-    half_widths_s: tuple[Duration, ...] = setting(HALF_WIDTHS_S, "Half-widths of the template bank", min_length=1)
+    half_widths_s: tuple[fields.Duration, ...] = setting(
+        HALF_WIDTHS_S, "Half-widths of the template bank", min_length=1
+    )
     sums: Annotated[int, Range(1, 8)] = setting(settings.RANK, "Largest number of weighted sums per frame")
     offset: bool = setting(True, "Whether to marginalise over the offset of the baseline")
     slope: bool = setting(True, "Whether to marginalise over the slope of the baseline")
@@ -140,7 +142,7 @@ class SearchChoice(Section):
     frame: dict[NuisanceName, Spread] = setting(
         dict, "Standard deviations of nuisance parameters of each frame, in addition to the stare's jitters"
     )
-    false_alarms: Positive = setting(
+    false_alarms: fields.Positive = setting(
         1.0,
         "False alarms of the search per star-day, star-month or star-year",
         flag="--false-alarms",
@@ -159,7 +161,7 @@ class SearchChoice(Section):
     )
     nulls: Annotated[int, Range(0, 1_000_000)] = setting(100, "Simulated stares without a flare")
     points: Annotated[int, Range(1, 100)] = setting(3, "Consecutive frames of the conventional rule, for comparison")
-    sigma: Positive = setting(3.0, "Threshold of the conventional rule, in standard deviations")
+    sigma: fields.Positive = setting(3.0, "Threshold of the conventional rule, in standard deviations")
 
     def _check_values(self) -> None:
         if list(self.half_widths_s) != sorted(set(self.half_widths_s)):
@@ -211,12 +213,12 @@ class InjectionQuestion(Section):
         flag="--size",
         usual="energy if the star's size is known, else amplitude",
     )
-    low: Positive | None = setting(None, "Smallest size", flag="--smallest", usual="0.3 of what is found")
-    high: Positive | None = setting(None, "Largest size", flag="--largest", usual="3 times what is found")
+    low: fields.Positive | None = setting(None, "Smallest size", flag="--smallest", usual="0.3 of what is found")
+    high: fields.Positive | None = setting(None, "Largest size", flag="--largest", usual="3 times what is found")
     sizes: Annotated[int, Range(2, 256)] = setting(16, "Number of sizes, evenly spaced in the logarithm")
     widths: Annotated[int, Range(1, 256)] = setting(16, "Number of half-widths, evenly spaced in the logarithm")
-    half_width_low_s: Duration = setting(10.0, "Smallest half-width")
-    half_width_high_s: Duration = setting(1800.0, "Largest half-width")
+    half_width_low_s: fields.Duration = setting(10.0, "Smallest half-width")
+    half_width_high_s: fields.Duration = setting(1800.0, "Largest half-width")
     count: Annotated[int, Range(10, 10**8)] = setting(
         2_000, "Injections of each size and half-width", flag="--injections -n"
     )

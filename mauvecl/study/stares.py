@@ -18,7 +18,7 @@ from mauvecl.host.tables.text_tables import read_columns
 from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, STARE_PROCESSES, Changing, Course
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import DAY_S
 from mauvecl.study.stare import KNOWN_CHANGES, EventChoice, StareQuestion
 
 if TYPE_CHECKING:

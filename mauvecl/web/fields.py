@@ -18,8 +18,19 @@ from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, named_star, near_names
 from mauvecl.host.tables.text_tables import columns, text_table
 from mauvecl.schema.errors import SUBJECT, InputError, shortened
-from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget, as_typed, first, found, range_of, with_unit
-from mauvecl.schema.physical import LineFraction
+from mauvecl.schema.fields import (
+    Flag,
+    Help,
+    LineFraction,
+    Range,
+    Unit,
+    Widget,
+    as_typed,
+    first,
+    found,
+    range_of,
+    with_unit,
+)
 from mauvecl.schema.section import check_different
 from mauvecl.study.study import keys_of, study_keys
 
