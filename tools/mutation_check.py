@@ -324,6 +324,10 @@ MUTATIONS: dict[str, Mutation] = {
         ("Ratio(value, bottom, variance, dims + factor_at.variance", "Ratio(value, bottom, variance, dims"),
     ),
     # Fits of events.
+    "a prior of the number of flares that depends on the time since the start": (
+        "test_flares_that_may_be_one_or_two_are_measured_alike_at_any_time",
+        ("np.log(span[-1, 1] - span[0, 0])", "np.log(span[-1, 1] + span[0, 0])"),
+    ),
     "intervals of events that are not truncated at zero": (
         "test_quantiles_are_those_of_a_truncated_normal_distribution[0.0]",
         ("goal = _log_above(0.0, *held, 0.0) + float", "goal = float"),

@@ -42,14 +42,23 @@ SHORT, LONG = 80_000, 320_000
 SMOOTH = processes.Process((processes.ProcessTerm("smooth", (np.log(2.0), np.log(40_000.0))),), 1.0)
 
 
-def survey_of(n: int, model: processes.Process) -> searches.SeriesSurvey:
-    """Return frames with a flare in the middle, around which light curves of each length are the same."""
+def survey_of(n: int, model: processes.Process, second: float = 0.0) -> searches.SeriesSurvey:
+    """Return frames with a flare in the middle and perhaps another, about which light curves of all lengths agree."""
     noise = np.random.default_rng(5).normal(0.0, SD, LONG)[(LONG - n) // 2 : (LONG + n) // 2]
     time = np.arange(n) * CADENCE_S
-    flux = LEVEL * (1 + 0.05 * flare(time + CADENCE_S / 2, CADENCE_S, time[n // 2], 120.0)) + noise
+    rise = (flare(time + CADENCE_S / 2, CADENCE_S, time[n // 2] + after, 120.0) for after in (0.0, 500.0))
+    flux = LEVEL * (1 + 0.05 * next(rise) + second * next(rise)) + noise
     frames = Frames.of(time, flux, np.full(n, SD))
     survey = searches.SeriesSurvey.of(frames, flux, np.full(n, SD**2), np.ones(n, np.bool_), LEVEL, 0.0, SHAPE)
     return replace(survey, processes=(model,), flux_process=model)
+
+
+def measured_event(survey: searches.SeriesSurvey) -> Any:
+    """Return the equivalent durations of the event in the middle."""
+    n = len(survey.stare.start_s)
+    one = searches.DetectedEvent(100.0, 120.0, float(survey.stare.start_s[n // 2]), 0, 20.0, n // 2 - 8, n // 2 + 120)
+    taken = np.isin(np.arange(n), range(one.first, one.last + 1))
+    return events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy
 
 
 def watch(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, place: int, found: list[tuple[str, int]]) -> None:
@@ -79,11 +88,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(model: processes.Pr
     for name in ("covariance", "times", "at"):
         watch(monkeypatch, processes.Process, name, 1, sizes)
     for n in (SHORT, LONG):
-        survey = survey_of(n, model)
-        start = float(survey.stare.start_s[n // 2])
-        one = searches.DetectedEvent(100.0, 120.0, start, 0, 20.0, n // 2 - 8, n // 2 + 120)
-        taken = np.isin(np.arange(n), range(one.first, one.last + 1))
-        measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy)
+        measured.append(measured_event(survey_of(n, model)))
         work.append(sizes[:])
         sizes.clear()
     assert work[0]
@@ -91,6 +96,13 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(model: processes.Pr
     assert max(size for name, size in work[0] if name != "at") <= 2 * event_windows.WINDOW_FRAMES + 200
     for name in ("summed_s", "summed_error_s", "fitted_s", "low_s", "high_s"):
         assert getattr(measured[1], name) == pytest.approx(getattr(measured[0], name), rel=1e-4)
+
+
+def test_flares_that_may_be_one_or_two_are_measured_alike_at_any_time() -> None:
+    """Compare an event 2 and 9 days after the start, in which one flare and two are about as probable."""
+    early, late = (measured_event(survey_of(n, SMOOTH, second=0.005)) for n in (SHORT // 4, SHORT))
+    for name in ("fitted_s", "low_s", "high_s"):
+        assert getattr(late, name) == pytest.approx(getattr(early, name), rel=5e-4)
 
 
 def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve(monkeypatch: Any) -> None:
