@@ -29,22 +29,25 @@ def exponential_less_one(x: np.ndarray) -> np.ndarray:
 def strengths(scene: StareScene, numbers: np.ndarray, frame: int, seed: int, lost: np.ndarray) -> dict[str, np.ndarray]:
     """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
-    if scene.stare_job["jittered"]:
+    stare = scene.stare
+    jitters = np.float32([stare.light_jitter, stare.sky_jitter, stare.temperature_jitter_c])
+    if jitters.any():
         drawn = reference.four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
-        for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):
-            moved[name] = z * scene.stare_job[f"{name}_jitter"]
+        for name, z, jitter in zip(("light", "sky", "temperature"), drawn, jitters, strict=False):
+            moved[name] = z * jitter
     for u, kind in enumerate(scene.kinds):
         name = layout.MOVED[kind]
         z = reference.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
     star, star_less_one, sky, sky_less_one, dark, dark_less_one, near, near_less_one, _ = scene.known[:, frame]
+    dark_slope = np.float32(scene.components.quiet.conditions["dark_slope_per_c"])
     light = moved["light"]
-    if scene.stare.pointing is not None:
+    if stare.pointing is not None:
         light = reference.combine_factors(light, -lost[:, frame])
     return {
         "star": fma(star, reference.combine_factors(light, moved["star"]), star_less_one),
         "sky": fma(sky, reference.combine_factors(light, moved["sky"]), sky_less_one),
-        "dark": fma(dark, exponential_less_one(moved["temperature"] * scene.stare_job["dark_slope"]), dark_less_one),
+        "dark": fma(dark, exponential_less_one(moved["temperature"] * dark_slope), dark_less_one),
         "neighbours": fma(near, light, near_less_one),
         "light": light,
     }
