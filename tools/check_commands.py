@@ -103,7 +103,12 @@ def page_tables(tab: Tab, state: State, closed: ClosedForms, folder: Path) -> di
     pool = Pool(LocalWorkers([None]))
     for name in tab.simulations:
         answers |= simulate(name, state.question(reads_of(name)).case(folder).study, pool)
-    return {name: tab.table(name, closed, answers) for name in tab.files if tab.offers(name, answers)}
+    own = tab.own_table
+    return {
+        name: own(closed, answers) if own else answers[needed].tables[name]
+        for name, needed in tab.files.items()
+        if tab.offers(name, answers)
+    }
 
 
 def command_tables(tab: Tab, question: FieldValues, folder: Path) -> dict[str, Table]:

@@ -284,7 +284,7 @@ class Answer(Drawable, ContentEquality):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Functions that make the content of documents, by full file name."""
-        documents: dict[str, Callable[[], bytes]] = import_module("mauvecl.charts.chart").documents_of(self)
+        documents: dict[str, Callable[[], bytes]] = import_module("mauvecl.charts.chart").made_of(self, document=True)
         return documents
 
     @property

@@ -283,29 +283,22 @@ def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:
     """Return every picture of an object by file name, as functions of `path` and `ax`."""
     return {
         name: lambda path=None, draw=draw, **how: draw(path=path, **how)
-        for name, draw in _made_of(thing, document=False)
+        for name, draw in made_of(thing, document=False).items()
     }
 
 
-def documents_of(thing: Any) -> dict[str, Callable[[], bytes]]:
-    """Return the function of each document of an object, by file name."""
-    return dict(_made_of(thing, document=True))
-
-
-def _made_of(thing: Any, *, document: bool) -> list[tuple[str, Callable[..., Any]]]:
-    """Return the functions of an object's class by name, numbered ones in the order of their numbers."""
+def made_of(thing: Any, *, document: bool) -> dict[str, Callable[..., Any]]:
+    """Return the function of each document or picture of an object by file name, numbered ones by their numbers."""
     load()
     own = next((ENTRIES[kind.__name__] for kind in type(thing).__mro__ if kind.__name__ in ENTRIES), [])
     made = list[tuple[int, str, Callable[..., Any]]]()
     for entry in own:
         if entry.document is not document or not entry.when(thing):
             continue
-        if entry.each is None:
-            made.append((0, entry.name, partial(entry.make, *entry.given(thing))))
-        else:
-            numbered = enumerate(entry.each(thing), 1)
-            made += [(n, f"{entry.name}-{n}", partial(entry.make, *given)) for n, given in numbered]
-    return [(name, make) for _, name, make in sorted(made, key=lambda pair: pair[0])]
+        single = entry.each is None
+        for n, given in enumerate([entry.given(thing)] if entry.each is None else entry.each(thing), 1):
+            made.append((n, entry.name if single else f"{entry.name}-{n}", partial(entry.make, *given)))
+    return {name: make for _, name, make in sorted(made, key=lambda pair: pair[0])}
 
 
 @cache

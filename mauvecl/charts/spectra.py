@@ -144,23 +144,20 @@ TRANSFER = Chart(
 )  # fmt: skip
 
 
-def throughput_series(answer: CalibrateAnswer, scale: str = "throughput") -> dict[str, Any]:
-    """Return the data of `THROUGHPUT`, or with the scale "ratio" those relative to the nominal throughput."""
+def throughput_series(answer: CalibrateAnswer) -> dict[str, Any]:
+    """Return the data of `THROUGHPUT`."""
     table = answer.throughput_table
-    nm = table["wavelength"].value
-    wide = np.exp(1.96 * np.asarray(table["relative_error"]))
-    if scale == "ratio":
-        fitted, nominal = np.asarray(table["ratio"]), np.ones(nm.size)
-    else:
-        fitted, nominal = (100 * np.asarray(table[name]) for name in ("throughput", "nominal"))
+    nm, wide = table["wavelength"].value, np.exp(1.96 * np.asarray(table["relative_error"]))
+    fitted, nominal = (100 * np.asarray(table[name]) for name in ("throughput", "nominal"))
     return {"band": (nm, fitted / wide, fitted * wide), "fitted": (nm, fitted), "nominal": (nm, nominal)}
 
 
 @picture_of("CalibrateAnswer", "throughput")
 def fitted_throughput(answer: CalibrateAnswer) -> Picture:
     """Plot the fitted throughput with its 95 % band next to the nominal one, and their ratio."""
-    above = THROUGHPUT.panel(throughput_series(answer), f"nominal: {answer.nominal.name}")
-    ratio = THROUGHPUT.panel(throughput_series(answer, "ratio"))
+    series, nominal = throughput_series(answer), np.asarray(answer.throughput_table["nominal"])
+    above = THROUGHPUT.panel(series, f"nominal: {answer.nominal.name}")
+    ratio = THROUGHPUT.panel({name: (nm, *np.divide(y, 100 * nominal)) for name, (nm, *y) in series.items()})
     below = Panel(WAVELENGTH, Axis("fitted / nominal"), [replace(item, listed=False) for item in ratio.series])
     return Picture([[above], [below]], (5.2, 4.6), f"Throughput {answer.source}", share_x=True)
 

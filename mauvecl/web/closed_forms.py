@@ -49,11 +49,6 @@ class FieldValues:
     values: Mapping[str, Any]
     uploads: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def uploaded(self) -> Source | None:
-        """The visitor's own star, or None."""
-        return self.uploads.get("star")
-
     def __getattr__(self, name: str) -> Any:
         """Return the value of a field, as in ``question.magnitude``."""
         if name != "values" and name in self.values:
@@ -63,14 +58,14 @@ class FieldValues:
     @property
     def star_in_words(self) -> str:
         """The star, as part of a sentence."""
-        return "your own star" if self.uploaded is not None else star_words(self.star)
+        return "your own star" if "star" in self.uploads else star_words(self.star)
 
     def case(self, folder: Path) -> Case:
         """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
         The visitor's files are written to the folder for the study to find.
         """
-        uploaded = self.uploaded
+        uploaded: Source | None = self.uploads.get("star")
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
         case = Case(Study.build(self._data(folder), "page"), loader=loader)
@@ -84,8 +79,8 @@ class FieldValues:
             if page_field.path and (value := self._value(name, folder)) is not None:
                 set_key(data, [*page_field.path], value, name)
         star = {"library": values["star"]}
-        if self.uploaded is not None:
-            star = {"file": write_spectrum(self.uploaded, folder, SPECTRA["star"])}
+        if "star" in self.uploads:
+            star = {"file": write_spectrum(self.uploads["star"], folder, SPECTRA["star"])}
         data["star"] = [data["star"] | star]
         if values["sky"] == "none":
             data["sky"] = {"none": True}
@@ -201,11 +196,6 @@ class ClosedForms:
         return float("nan") if self.flare.saturated[used].all() else self.odds.probability
 
     @property
-    def study(self) -> Study:
-        """The question as a study."""
-        return self.case.study
-
-    @property
     def quiet(self) -> Expectation:
         """Expectation of the star without the flare."""
         return self.case.quiet
@@ -220,7 +210,7 @@ class ClosedForms:
         question = {"unknown": unknown, "instrument": instrument or self.question.instrument}
         if question.items() <= self.question.values.items():
             return self
-        study = self.study
+        study = self.case.study
         sections: dict[str, Any] = {"nuisances": study.nuisances.model_copy(update={"usual": unknown == REALISTIC})}
         if question["instrument"] != self.question.instrument:
             sections["observation"] = study.observation.model_copy(update={"instrument": question["instrument"]})
@@ -240,14 +230,14 @@ class ClosedForms:
     @cached_property
     def messages(self) -> list[str]:
         """Messages for the visitor, the most severe first."""
-        nuisances = self.study.nuisances
-        cost = unknown_cost("this flare", self.quiet, self.flare, nuisances, self.study.run.comparison())
+        nuisances = self.case.study.nuisances
+        cost = unknown_cost("this flare", self.quiet, self.flare, nuisances, self.case.study.run.comparison())
         return [*collect_messages([self.quiet, self.flare]), *unknown_lines([cost], nuisances)]
 
     @property
     def words(self) -> str:
         """Question in words, as part of a sentence."""
-        q, x, light = self.question, self.quiet, self.study.flare.light().describe()
+        q, x, light = self.question, self.quiet, self.case.study.flare.light().describe()
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
         star = f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
         return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
@@ -306,7 +296,7 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
                 how = f"{chance_range(row['low'], row['high'])}, {drawn}"
             else:
                 value, how = assumed.chance, "in closed form"
-                if not (assumed.study.nuisances.usual or assumed.slow or value != value):
+                if not (assumed.case.study.nuisances.usual or assumed.slow or value != value):
                     # Computed at once.
                     lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
                     ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), sky=True)]
@@ -330,7 +320,7 @@ LIMITS: dict[str, tuple[str, Callable[[float], str], str, str]] = {
 
 def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
-    q, asked = closed.question, closed.study.limit
+    q, asked = closed.question, closed.case.study.limit
     before, in_words, none, some = LIMITS[asked.of]
     clauses: dict[str, str] = {}
     near: float | None = None

@@ -50,9 +50,9 @@ NOISE = Tab(
     # The closed-form table of `mauvecl snr`.
     own_table=lambda closed, answers: stacked(
         [star_column()],
-        [({"star": star_label(closed.study.star[0], closed.quiet)}, closed.quiet.noise_budget())],
-        realisations=closed.study.run.realisations,
-        study=closed.study.ideal().text(),
+        [({"star": star_label(closed.case.study.star[0], closed.quiet)}, closed.quiet.noise_budget())],
+        realisations=closed.case.study.run.realisations,
+        study=closed.case.study.ideal().text(),
     ),
 )
 
@@ -170,7 +170,7 @@ SPECTRUM = Tab(
     questions=("simulate",),
     files={"observation": None},
     # One observation with the flare and its components.
-    own_table=lambda closed, answers: simulate(closed.study, flaring=True).observations[1][2],
+    own_table=lambda closed, answers: simulate(closed.case.study, flaring=True).observations[1][2],
 )
 
 
@@ -310,9 +310,9 @@ def costs(closed: ClosedForms) -> list[Cost]:
             alone = NuisanceChoice.model_validate({"usual": False, name: spread})
             chosen[spoken(alone).removeprefix("the ")] = alone
     chosen["all the usual together"] = NuisanceChoice()
-    if closed.study.nuisances.own:
-        chosen["your own spectrum"] = NuisanceChoice(usual=False, own=closed.study.nuisances.own)
-    flare, comparison = closed.flare, closed.study.run.comparison()
+    if closed.case.study.nuisances.own:
+        chosen["your own spectrum"] = NuisanceChoice(usual=False, own=closed.case.study.nuisances.own)
+    flare, comparison = closed.flare, closed.case.study.run.comparison()
     return [unknown_cost(name, closed.quiet, flare, choice, comparison) for name, choice in chosen.items()]
 
 

@@ -144,8 +144,8 @@ class Canvas:
             return
         if isinstance(series, Targets):
             for k, colour in enumerate(TARGETS):
-                look = {"width": 2, "dash": series.dash, "tips": series.tips}
-                self._add(Line(f"target {k + 1}", colour, f"{series.key} {k}", **look))
+                name = f"{series.key} {k}"
+                self._add(Line(f"target {k + 1}", colour, name, width=2, dash=series.dash, tips=series.tips))
             return
         source = models.ColumnDataSource({column: [] for column in series.columns}, name=series.key)
         if isinstance(series, Custom):

@@ -46,14 +46,14 @@ FIRST, HALVINGS, CHANGE = 9, 5, 0.1
 
 
 #: Fields on which a map does not depend; an upload is identified by its content.
-FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours", "uploaded"}
+FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours"}
 
 
 def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -> T:
     """Return a map or curve, which is kept for the values of the question, and `more`, on which it depends."""
     question = closed.question
     values = (value for name, value in question.values.items() if name not in FREE)
-    key = (*values, question.uploaded and question.uploaded.digest, *more)
+    key = (*values, *(star.digest for name, star in question.uploads.items() if name == "star"), *more)
     # Of all visitors, without the closed forms, which take tens of MB.
     found: T | None = RESULTS.get(None, make.__name__, key)
     if found is None:
@@ -120,7 +120,7 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
 ).data()  # fmt: skip
 def curve(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the detection probability against the star's magnitude."""
-    q, power = closed.question, closed.study.limit.power
+    q, power = closed.question, closed.case.study.limit.power
     series: dict[str, Any] = {"own": ([q.magnitude], [closed.chance]), "power": power}
     text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
     if not closed.slow:
@@ -128,7 +128,7 @@ def curve(closed: ClosedForms, answers: Answers) -> ChartData:
         text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
     if "limit" in answers:
         limits = [limit for limit in answers["limit"].limits if limit.statistic == q.statistic]
-        before, in_words, *_ = LIMITS[closed.study.limit.of]
+        before, in_words, *_ = LIMITS[closed.case.study.limit.of]
         for one in limits:
             # Points of another quantity than the axis's are reported in words only.
             if one.of == "magnitude":
@@ -291,7 +291,7 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
 ).data()  # fmt: skip
 def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the relative error of the temperature against the amplitude of the flare."""
-    own = 100 * closed.study.flare.amplitudes[0]
+    own = 100 * closed.case.study.flare.amplitudes[0]
     series: dict[str, Any] = {}
     for name, measurement in zip(NAMES, expected(closed).values(), strict=True):
         ahead = measurement.forecasts(FACTORS, measurement.unknown)

@@ -77,7 +77,7 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
 
     It holds ``headline``, the sentence of the tab's simulated answer, or before that on the chance if there is one,
     and ``words``, the question; ``chance`` says whether there are ``numbers``, one for each choice of what is unknown;
-    ``chosen``, ``shown`` and ``interval`` are of the question's choice; ``facts``, pairs of names and values;
+    ``chosen`` and ``shown`` are of the question's choice; ``facts``, pairs of names and values;
     ``notes``, pairs of sentences and kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of
     downloads.
     """
@@ -88,9 +88,7 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "chance": tab.chance,
         "headline": next((str(answers[name].headline) for name in names if name in answers), ""),
         "numbers": [],
-        "chosen": "",
         "shown": tab.title,
-        "interval": "",
         "words": tab.words(closed.question),
         "facts": [],
         "notes": _notes(messages),
@@ -114,7 +112,7 @@ def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[s
     if not headline and chosen.value == chosen.value:
         ideal = q.unknown == REALISTIC and all(chance.value == chance.value for chance in both)
         seen = shown[q.unknown] + (f" ({shown[IDEAL]} {IF_KNOWN})" if ideal else "")
-        seen = chance_of_flare(closed.study, closed.case.label, closed.case.amplitudes[0], x, seen)
+        seen = chance_of_flare(closed.case.study, closed.case.label, closed.case.amplitudes[0], x, seen)
         headline = f"{seen}, by the estimate before a simulation."
     told = [message for name in TOLD if name in answers for message in answers[name].messages]
     facts = []
@@ -140,7 +138,6 @@ def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[s
         ],
         "chosen": q.unknown,
         "shown": shown[q.unknown],
-        "interval": f"{TITLES[q.unknown]}; {chosen.how}",
         "words": words,
         "facts": facts,
         # The card shows both chances itself.

@@ -110,7 +110,7 @@ class PageApplication(Application):
         elif (talks or request.path == "/") and len(Visitor.here) >= MAX_VISITORS:
             status, why = 503, "Too many visitors are here at the moment; please come again in some minutes."
         if why:
-            return self.get_handler_delegate(request, RefusalHandler, {"status": status, "why": why})
+            return self.get_handler_delegate(request, ContentHandler, {"status": status, "why": why})
         return super().find_handler(request, **kwargs)
 
 
@@ -175,16 +175,15 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
 
     application = PageApplication(
         [
-            (r"/", ContentHandler, {"content": lambda _: front(), "kind": "html"}),
+            (r"/", ContentHandler, {"content": lambda _: front()}),
             (r"/live", Visitor),
-            (r"/figures/([a-z]+)/([a-z]+)\.json", ContentHandler, {"content": asked_figure, "kind": "json"}),
+            (r"/figures/([a-z]+)/([a-z]+)\.json", ContentHandler, {"content": asked_figure}),
             (r"/(favicon\.svg)", ContentHandler, {"content": lambda _, name: asset(name)}),
             (r"/assets/([a-z0-9.-]+)", ContentHandler, {"content": lambda _, name: asset(name)}),
         ],
         websocket_max_message_size=MESSAGE,
         websocket_ping_interval=PING_S,
-        default_handler_class=RefusalHandler,
-        default_handler_args={"status": 404, "why": "There is no such page."},
+        default_handler_class=ContentHandler,
         log_function=lambda handler: None,
     )
     application.allowed = hosts(address, port, allowed)
@@ -364,28 +363,17 @@ def figure(theme: str, name: str, logs: str) -> bytes | None:
     return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
 
 
-class RefusalHandler(RequestHandler):
-    """Handler that answers any request with an error message."""
+class ContentHandler(RequestHandler):
+    """Handler of static content, or without any of requests that are refused."""
 
-    def initialize(self, status: int, why: str) -> None:
-        """Set status and message."""
-        self._status, self._why = status, why
+    def initialize(self, content: Callable[..., bytes | None] | None = None, status: int = 404, why: str = "") -> None:
+        """Set the function that returns content for the handler and parts of the address, or the refusal."""
+        self._content, self._status, self._why = content, status, why
 
     def prepare(self) -> None:
-        """Send the message."""
-        self.set_status(self._status)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        if self._status == 503:
-            self.set_header("Retry-After", "60")
-        self.finish(f"{self._why}\n")
-
-
-class ContentHandler(RequestHandler):
-    """Handler of static content."""
-
-    def initialize(self, content: Callable[..., bytes | None], kind: str = "") -> None:
-        """Set the function that returns content for the handler and parts of the address, and its kind."""
-        self._content, self._kind = content, kind
+        """Refuse any request if there is no content."""
+        if self._content is None:
+            self.send_error(self._status)
 
     def set_default_headers(self) -> None:
         """Set the headers of every answer."""
@@ -398,13 +386,12 @@ class ContentHandler(RequestHandler):
 
         Tornado adds a tag of the content, and sends status 304 if the browser has it.
         """
-        content = self._content(self, *names)
-        if content is None:
+        if self._content is None or (content := self._content(self, *names)) is None:
             raise HTTPError(404)
-        # The names of assets end in their kind.
-        self.set_header("Content-Type", KINDS[self._kind or names[0].rpartition(".")[2]])
+        # Addresses end in the kind of content, but for that of the page.
+        self.set_header("Content-Type", KINDS.get(self.request.path.rpartition(".")[2], KINDS["html"]))
         self.set_header("Vary", "Accept-Encoding")
-        keep = "v" in self.request.arguments and self._kind != "html"
+        keep = "v" in self.request.arguments and self.request.path != "/"
         self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
         if "gzip" in self.request.headers.get("Accept-Encoding", ""):
             self.set_header("Content-Encoding", "gzip")
@@ -414,6 +401,7 @@ class ContentHandler(RequestHandler):
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Send a message without internal details."""
         self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(
-            "There is no such page.\n" if status_code == 404 else f"The page cannot answer this ({status_code}).\n"
-        )
+        if status_code == 503:
+            self.set_header("Retry-After", "60")
+        usual = "There is no such page." if status_code == 404 else f"The page cannot answer this ({status_code})."
+        self.finish(f"{self._why or usual}\n")

@@ -330,7 +330,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
             return name, answers[tab.documents[name]].documents[name]()
     if ending == "study":
         needed = tab.files[name]
-        return study_file(closed.study if needed is None else answers[needed].study, f"mauvecl-{name}")
+        return study_file(closed.case.study if needed is None else answers[needed].study, f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:
         path, make = Path(folder) / f"mauvecl-{name}.{ending}", tab.own_table
         write_table(make(closed, answers) if make else answers[str(tab.files[name])].tables[name], path)

@@ -364,12 +364,9 @@ class Visitor(WebSocketHandler):
     async def _ask_pinned(self, asked: dict[str, Any]) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""
         tab = tab_of(asked)
-        pictures = [picture for picture in tab.pictures if picture.pins]
-        question = self.state(asked["link"]).question(tab.reads)
-        closed = await _in_thread(ClosedForms.of, question, self._folder)
-        drawn = await _in_thread(lambda: {p.name: p.drawn(closed, {})["sources"][p.pins] for p in pictures})
-        pins = {name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()}
-        self.send(n=asked["n"], pins=pins)
+        closed = await _in_thread(ClosedForms.of, self.state(asked["link"]).question(tab.reads), self._folder)
+        drawn = (await _in_thread(shown, tab, closed, {}))["pictures"]
+        self.send(n=asked["n"], pins={p.name: drawn[p.name]["sources"][p.pins] for p in tab.pictures if p.pins})
 
     # Draws and simulations
 
@@ -382,7 +379,7 @@ class Visitor(WebSocketHandler):
             return
         if self._drawing is not None:
             self._drawing.cancel()
-        how = closed.case.draw_options | {"seed": closed.study.run.seed}
+        how = closed.case.draw_options | {"seed": closed.case.study.run.seed}
         job = self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
         try:
             drawn = await asyncio.wrap_future(job.future)
@@ -407,7 +404,7 @@ class Visitor(WebSocketHandler):
         unit = VERBS[main].counts
         # Several verbs count the realisations of all in the pool.
         job = self.job = Job(
-            partial(simulate, kind, closed.study, given=closed.given), unit in DRAWN_UNITS, "" if more else unit
+            partial(simulate, kind, closed.case.study, given=closed.given), unit in DRAWN_UNITS, "" if more else unit
         )
         done = asyncio.wrap_future(job.future)
         try:
