@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import check_probability
 from mauvecl.detection.distributions import Interval, central_counts
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Arrays, Float
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -83,6 +83,18 @@ class SparseCounts:
         self._counts = np.zeros(self._keys.size, np.int64)
         np.add.at(self._counts, place, counts)
         self._waiting, self._waits = [], 0
+
+    def pack(self, name: str) -> Arrays:
+        """Return the counts as arrays: differences of keys, in the smallest integer types."""
+        parts = {f"{name}-steps": np.diff(self.keys), name: self.counts}
+        packed = {key: each.astype(np.min_scalar_type(int(each.max(initial=0)))) for key, each in parts.items()}
+        return {f"{name}-first": self.keys[:1], **packed}
+
+
+def unpacked(name: str, arrays: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return keys and counts that `SparseCounts.pack` has packed."""
+    steps = np.concatenate([arrays[f"{name}-first"], arrays[f"{name}-steps"].astype(np.int64)])
+    return np.cumsum(steps, dtype=np.int64), arrays[name].astype(np.int64)
 
 
 def keys_of(values: NDArray[np.float32], *, above: bool) -> NDArray[np.int64]:

@@ -21,7 +21,7 @@ from scipy import special
 
 from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
-from mauvecl.detection.snr import Arrays, Counts
+from mauvecl.detection.snr import Counts
 from mauvecl.device import drivers
 from mauvecl.device.build import SAME_BITS, choose_device
 from mauvecl.device.drivers import DeviceError
@@ -30,6 +30,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
 from mauvecl.flares.stare_scene import StaresRequest
+from mauvecl.host.arrays import Arrays
 from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import CosmicRays, Uniform

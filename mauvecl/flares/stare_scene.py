@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.requests import Countable
-from mauvecl.detection.snr import Arrays
 from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Arrays, Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants, joint_is_exact, truncation_distance
