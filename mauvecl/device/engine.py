@@ -286,9 +286,9 @@ class Engine:
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
                 launches.tally(tile, tally)
-                for grid, samples_of_grid in zip(tally.grids, samples, strict=True):
-                    if samples_of_grid is not None:
-                        samples_of_grid.add(launches.channel(tile, grid.channel), shard.start + done)
+                for channel, extremes in zip(plan.grids["channel"].tolist(), samples, strict=True):
+                    if extremes is not None:
+                        extremes.add(launches.channel(tile, channel), shard.start + done)
 
             self._tiles.for_each(shard.start, shard.count, 4 * plan.n_rows, work, before=before, total=total)
             launches.flush(tally)
