@@ -23,7 +23,7 @@ from mauvecl.host.arrays import Arrays, Float
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE, Particles, Thermal
 from mauvecl.host.stars.library import nearest_spectrum
-from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES
+from mauvecl.noise.unknowns import COURSES
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, interval_columns, number, percent, records
@@ -516,7 +516,7 @@ class PlanAnswer(Answer):
             if case.neighbours is not None:
                 lines += case.neighbours.messages(case.label, case.instrument)
         lines += self._messages_on_rates
-        slow = any(getattr(study.stare, name) for name in (*COURSES, *STARE_PROCESSES))
+        slow = any(getattr(study.stare, name) for name in (*COURSES, "pointing"))
         if study.plan.completeness == "closed form" and (slow or study.nuisances.usual):
             text = (
                 "FALSE ALARMS may be more than stated: the closed form marginalises over what is unknown in each "
