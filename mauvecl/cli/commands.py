@@ -220,8 +220,8 @@ class Session(flags.Options):
 
                 workers: LocalWorkers | DaskWorkers = DaskWorkers(self.cluster, self.device)
             else:
-                names = [None] if self.device is None else [word.strip() for word in self.device.split(",")]
-                workers = LocalWorkers(names)
+                words = [] if self.device is None else self.device.split(",")
+                workers = LocalWorkers([word.strip() for word in words] or [None])
             try:
                 pool = Pool(workers, progress=meter if counts == "realisations" else None, **how)
                 meter.standing = lambda: pool.standing
