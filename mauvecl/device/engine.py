@@ -12,7 +12,7 @@ from mauvecl.detection import DEFAULT_STATISTICS, Tails, requests, snr
 from mauvecl.detection.counts import TailSamples, Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.nuisances import Nuisances
-from mauvecl.detection.snr import SnrResult
+from mauvecl.detection.snr import Counts, SnrResult
 from mauvecl.detection.statistics import Linear
 from mauvecl.device.build import Device, DeviceRecord, devices
 from mauvecl.device.drivers import DeviceError
@@ -202,7 +202,7 @@ class Engine:
         request = requests.SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
         return snr.snr_of(request, self._snr(request, requests.Shard(0, request.start, request.realisations)))
 
-    def _snr(self, request: requests.SnrRequest, shard: requests.Shard) -> snr.Counts:
+    def _snr(self, request: requests.SnrRequest, shard: requests.Shard) -> Counts:
         x, scene, counts = request.expectation, request.scene, snr.counts_of(request)
         with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
             launches.observe(snr.observers(x, scene), snr.elements(x))
