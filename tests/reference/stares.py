@@ -28,11 +28,13 @@ def exponential_less_one(x: np.ndarray) -> np.ndarray:
 
 def strengths(scene: StareScene, numbers: np.ndarray, frame: int, seed: int, lost: np.ndarray) -> dict[str, np.ndarray]:
     """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
+    none = Flares(np.zeros((1, scene.stare.n_frames, 0), np.float32), np.ones((1, 1), np.float32))
+    job = scene.stare_struct(none)[0]
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in unknowns.CHANGING}
-    if scene.stare_job["jittered"]:
+    if job["jittered"]:
         drawn = reference.four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
         for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):
-            moved[name] = z * scene.stare_job[f"{name}_jitter"]
+            moved[name] = z * job[f"{name}_jitter"]
     for u, kind in enumerate(scene.kinds):
         name = unknowns.CHANGING[kind]
         z = reference.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
@@ -44,7 +46,7 @@ def strengths(scene: StareScene, numbers: np.ndarray, frame: int, seed: int, los
     return {
         "star": fma(star, reference.combine_factors(light, moved["star"]), star_less_one),
         "sky": fma(sky, reference.combine_factors(light, moved["sky"]), sky_less_one),
-        "dark": fma(dark, exponential_less_one(moved["temperature"] * scene.stare_job["dark_slope"]), dark_less_one),
+        "dark": fma(dark, exponential_less_one(moved["temperature"] * job["dark_slope"]), dark_less_one),
         "neighbours": fma(near, light, near_less_one),
         "light": light,
     }
