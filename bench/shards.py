@@ -23,8 +23,9 @@ import numpy as np
 from astropy.table import Table
 from tables import write
 
+from mauvecl.detection.counts import Tally
 from mauvecl.detection.requests import DetectRequest, Shard
-from mauvecl.detection.snr import DetectionSums
+from mauvecl.detection.snr import add_detection
 from mauvecl.device.engine import Engine
 from mauvecl.runs.checkpoint import Checkpoint, fingerprint, shards
 from mauvecl.runs.cluster import DaskWorkers
@@ -89,8 +90,9 @@ def main() -> None:
         shard = engine.count(request, Shard(0, 0, size))
         bare = timed(lambda: engine.detect(quiet, flares, realisations=size, seed=1))[0]
         packing, sent = timed(lambda: pickle.dumps(shard))
-        sums = DetectionSums(request)
-        adding = timed(lambda: sums.add(0, pickle.loads(sent)))[0]
+        plan = request.plans[0][0]
+        sums = Tally(plan.grids), plan.tails()
+        adding = timed(lambda: add_detection(*sums, pickle.loads(sent)))[0]
         body = io.BytesIO()
         np.savez(body, **shard)
         key = fingerprint(request)

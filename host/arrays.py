@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 #: Arrays of doubles and of truth values.
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+#: Arrays by name, as workers send and checkpoints keep them.
+Arrays = dict[str, NDArray[Any]]
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -17,7 +17,7 @@ from mauvecl.detection.distributions import Interval
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Components
 from mauvecl.flares.shapes import shape_of
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Arrays, Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
@@ -36,7 +36,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.detection.snr import Arrays
     from mauvecl.flares.energies import Kind
     from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation

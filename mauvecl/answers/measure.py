@@ -23,7 +23,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, ReducedSums, usable_variance, variance_of
 from mauvecl.fits.profile import Profile
 from mauvecl.fits.spectrum import LEVELS, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
-from mauvecl.host.arrays import Float, true_runs
+from mauvecl.host.arrays import Arrays, Float, true_runs
 from mauvecl.host.stars import flare as spectra
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.noise.scene import drawn_factors
@@ -36,7 +36,6 @@ from mauvecl.study.questions import check_sweep, fitted_models
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from mauvecl.detection.snr import Arrays
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.fits.time_course import CoolingCourse, MeasuredBins
     from mauvecl.flares.frames import Components, StareExpectation

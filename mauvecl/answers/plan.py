@@ -19,11 +19,11 @@ from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.device.stares import Stares
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
 from mauvecl.flares.settings import Curve
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Arrays, Float
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE, Particles, Thermal
 from mauvecl.host.stars.library import nearest_spectrum
-from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES
+from mauvecl.noise.unknowns import COURSES
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, interval_columns, number, percent, records
@@ -42,7 +42,6 @@ from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
-    from mauvecl.detection.snr import Arrays
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.search.completeness import DurationLaw
 
@@ -517,7 +516,7 @@ class PlanAnswer(Answer):
             if case.neighbours is not None:
                 lines += case.neighbours.messages(case.label, case.instrument)
         lines += self._messages_on_rates
-        slow = any(getattr(study.stare, name) for name in (*COURSES, *STARE_PROCESSES))
+        slow = any(getattr(study.stare, name) for name in (*COURSES, "pointing"))
         if study.plan.completeness == "closed form" and (slow or study.nuisances.usual):
             text = (
                 "FALSE ALARMS may be more than stated: the closed form marginalises over what is unknown in each "

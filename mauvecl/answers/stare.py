@@ -25,7 +25,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.flares.stare import Event, Stare, coefficients, temperatures_of
 from mauvecl.host import VERSION
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Arrays, Float
 from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, kept
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from astropy.io import fits
     from astropy.table import QTable, Table
 
-    from mauvecl.detection.snr import Arrays
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.search.flare_fits import Factor
     from mauvecl.study.observation import SkyLight

@@ -75,7 +75,7 @@ def selftest(
 
     from mauvecl.answers.files import make_folder, write_document
     from mauvecl.device import selftest
-    from mauvecl.device.build import read_outcome, write_outcome
+    from mauvecl.device.build import write_outcome
     from mauvecl.device.engine import Engine
     from mauvecl.host.tables.files import json_text
 
@@ -85,17 +85,17 @@ def selftest(
         engine = Engine(device, progress=meter)
         checks = [asdict(check) for check in selftest.run(engine)]
     seconds = time.perf_counter() - started
-    write_outcome(engine.device, checks, seconds)
+    record = write_outcome(engine.device, checks, seconds)
     failed = sum(not check["passed"] for check in checks)
     if as_json:
-        print(json.dumps(read_outcome(engine.device) or checks, indent=2))
+        print(json.dumps(record, indent=2))
     else:
         title = f"Self-test of {engine.device_name}, driver {engine.driver}"
         show_view(View(title, selftest.CHECK_COLUMNS, checks))
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:
-        write_document(f"{json_text(read_outcome(engine.device))}\n".encode, folder / "selftest.json")
+        write_document(f"{json_text(record)}\n".encode, folder / "selftest.json")
     if failed:
         raise typer.Exit(1)
 

@@ -188,7 +188,6 @@ class Session(flags.Options):
         if not self.draws:
             with self.metered(verb.counts) as meter:
                 return verb.ask(self.study, progress=meter)
-        from mauvecl.runs.pool import Pool
 
         def prepare() -> None:
             # Modules for tables and pictures are imported in advance, which saves 0.75 s at the end.
@@ -201,16 +200,37 @@ class Session(flags.Options):
             if self.pictures and available():
                 style()
 
-        # The pool reports its own progress in realisations.
-        own = verb.counts == "realisations"
         with (
             self.checkpoint() as checkpoint,
-            self.metered(verb.counts) as meter,
-            working(self.device, self.cluster) as workers,
+            self.pool(verb.counts, checkpoint=checkpoint, meanwhile=prepare) as (self._pool, meter),
         ):
-            pool = Pool(workers, checkpoint=checkpoint, progress=meter if own else None, meanwhile=prepare)
-            self._pool, meter.standing = pool, lambda: pool.standing
-            return verb.ask(self.study, pool, None if own else meter)
+            return verb.ask(self.study, self._pool, None if verb.counts == "realisations" else meter)
+
+    @contextmanager
+    def pool(self, counts: str, **how: Any) -> Iterator[tuple[Pool, Meter]]:
+        """Yield a pool of the workers that the flags name, and its meter; it ends at once if the work ends early.
+
+        The pool itself reports progress in realisations; what else the meter `counts` is for others to report.
+        """
+        from mauvecl.runs.pool import LocalWorkers, Pool
+
+        with self.metered(counts) as meter:
+            if self.cluster is not None:
+                from mauvecl.runs.cluster import DaskWorkers
+
+                workers: LocalWorkers | DaskWorkers = DaskWorkers(self.cluster, self.device)
+            else:
+                words = [] if self.device is None else self.device.split(",")
+                workers = LocalWorkers([word.strip() for word in words] or [None])
+            try:
+                pool = Pool(workers, progress=meter if counts == "realisations" else None, **how)
+                meter.standing = lambda: pool.standing
+                yield pool, meter
+            except BaseException:
+                workers.stop()
+                raise
+            finally:
+                workers.close()
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""
@@ -272,26 +292,6 @@ class Session(flags.Options):
         from mauvecl.host.tables.files import json_text
 
         print(json_text(content))
-
-
-@contextmanager
-def working(device: str | None, cluster: str | None) -> Iterator[LocalWorkers | DaskWorkers]:
-    """Open the requested workers; release them at the end, immediately if the work ended early."""
-    from mauvecl.runs.pool import LocalWorkers
-
-    if cluster is not None:
-        from mauvecl.runs.cluster import DaskWorkers
-
-        workers: LocalWorkers | DaskWorkers = DaskWorkers(cluster, device)
-    else:
-        workers = LocalWorkers([None] if device is None else [word.strip() for word in device.split(",")])
-    try:
-        yield workers
-    except BaseException:
-        workers.stop()
-        raise
-    finally:
-        workers.close()
 
 
 @contextmanager
@@ -406,40 +406,11 @@ class Command:
         }
 
 
-#: Commands with a study by name, filled by `command_of`.
-COMMANDS: dict[str, Command] = {}
-
-
-def command_of(
-    verb: Verb, *, draws: bool | None = None, **how: Any
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function of the session the command of a verb; workers draw by default if the verb counts something."""
-
-    def decorate(run: Callable[..., None]) -> Callable[..., None]:
-        COMMANDS[verb.name] = Command(verb=verb, run=run, draws=bool(verb.counts) if draws is None else draws, **how)
-        return run
-
-    return decorate
-
-
 RowsFlag = Annotated[
     str | None, flags.option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")
 ]
 
 
-@command_of(
-    Verb(
-        "realise",
-        "",
-        (*OBSERVATION, "flare", *DRAWS, "nuisances.usual", "sweep", "bulk"),
-        group="simulate",
-        common=("realisations", "seed", "frames", "components", "resume"),
-        counts="spectra",
-        defaults=FEWER,
-    ),
-    pictures=False,
-    writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
-)
 def realise(session: Session) -> None:
     """Draw raw spectra in bulk: a Zarr store, a FITS or HDF5 file.
 
@@ -461,13 +432,8 @@ def realise(session: Session) -> None:
     question_room(Store(folder, session.study), insist=session.insist)
     with (
         report_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
-        session.metered("spectra") as meter,
-        working(session.device, session.cluster) as workers,
+        session.pool("spectra") as (pool, meter),
     ):
-        from mauvecl.runs.pool import Pool
-
-        pool = Pool(workers)
-        meter.standing = lambda: pool.standing
         draw = bulk.realise_file if one_file else bulk.realise
         store = draw(session.study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
     _tell(store, place, session)
@@ -585,7 +551,6 @@ def _rows_of(text: str | None) -> tuple[int, int] | None:
         raise InputError.of("rows", text, "a range such as 1000:2000") from error
 
 
-@command_of(VERBS["limit"])
 def limit(
     session: Session,
     assumptions: Annotated[
@@ -601,7 +566,6 @@ def limit(
     session.answer(answer)
 
 
-@command_of(VERBS["simulate"])
 def simulate(
     session: Session,
     given: dict[str, Any],
@@ -614,7 +578,6 @@ def simulate(
     session.answer(compute(session.study, realisation=number, flaring=bool(given["amplitude"])))
 
 
-@command_of(VERBS["plan"])
 def plan(session: Session) -> None:
     """Plan a campaign; a report needs matplotlib for PDF, and a closed form needs no pool."""
     from mauvecl.charts.matplotlib import available
@@ -626,7 +589,6 @@ def plan(session: Session) -> None:
     session.answer(session.ask())
 
 
-@command_of(VERBS["stare"], draws=False, resumes=True)
 def stare(session: Session, given: dict[str, Any], device: flags.DeviceFlag = None) -> None:
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
@@ -647,8 +609,26 @@ def ask(session: Session) -> None:
     session.answer(session.ask())
 
 
-# Verbs without a function of their own; an analysis counts frames, and draws nothing.
-command_of(VERBS["analyse"], draws=False)(ask)
-for verb in VERBS.values():
-    if verb.name not in COMMANDS:
-        command_of(verb)(ask)
+REALISE = Verb(
+    "realise",
+    "",
+    (*OBSERVATION, "flare", *DRAWS, "nuisances.usual", "sweep", "bulk"),
+    group="simulate",
+    common=("realisations", "seed", "frames", "components", "resume"),
+    counts="spectra",
+    defaults=FEWER,
+)
+#: Functions of the verbs that do more than `ask`.
+OWN: dict[str, Callable[..., None]] = {"limit": limit, "simulate": simulate, "plan": plan, "stare": stare}
+#: Commands with a study by name; an analysis counts frames, and draws nothing.
+COMMANDS = {
+    name: Command(
+        verb=verb, run=OWN.get(name, ask), draws=bool(verb.counts) and name not in ("analyse", "stare"),
+        resumes=name == "stare",
+    )
+    for name, verb in VERBS.items()
+} | {
+    "realise": Command(
+        verb=REALISE, run=realise, draws=True, pictures=False, writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5"
+    )
+}  # fmt: skip

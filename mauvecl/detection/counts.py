@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import check_probability
 from mauvecl.detection.distributions import Interval, central_counts
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Arrays, Float
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -83,6 +83,18 @@ class SparseCounts:
         self._counts = np.zeros(self._keys.size, np.int64)
         np.add.at(self._counts, place, counts)
         self._waiting, self._waits = [], 0
+
+    def pack(self, name: str) -> Arrays:
+        """Return the counts as arrays: differences of keys, in the smallest integer types."""
+        parts = {f"{name}-steps": np.diff(self.keys), name: self.counts}
+        packed = {key: each.astype(np.min_scalar_type(int(each.max(initial=0)))) for key, each in parts.items()}
+        return {f"{name}-first": self.keys[:1], **packed}
+
+
+def unpacked(name: str, arrays: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return keys and counts that `SparseCounts.pack` has packed."""
+    steps = np.concatenate([arrays[f"{name}-first"], arrays[f"{name}-steps"].astype(np.int64)])
+    return np.cumsum(steps, dtype=np.int64), arrays[name].astype(np.int64)
 
 
 def keys_of(values: NDArray[np.float32], *, above: bool) -> NDArray[np.int64]:
@@ -152,27 +164,17 @@ class FarCounts(SparseCounts):
         return np.where(above, lower, np.minimum(lower, upper)), np.where(above, np.maximum(lower, upper), upper)
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Bins of a histogram."""
-
-    channel: int  # channel whose values are counted
-    centre: float
-    sigma: float  # standard deviation to which the bins are scaled
-
-    @staticmethod
-    def pack(grids: Sequence[Grid]) -> NDArray[np.void]:
-        """Return the grids in the layout of the device, shape (n_grid,)."""
-        packed = np.zeros(len(grids), layout.GRID)
-        packed["channel"] = [grid.channel for grid in grids]
-        with np.errstate(over="ignore", divide="ignore"):
-            packed["centre"] = [grid.centre for grid in grids]
-            packed["steps_per_unit"] = layout.STEPS_PER_SIGMA / np.array([grid.sigma for grid in grids], float)
-        # If float32 cannot represent the steps, all values count as far.
-        scale = packed["steps_per_unit"]
-        bad = ~(np.isfinite(packed["centre"]) & np.isfinite(scale) & (scale >= np.finfo(np.float32).tiny))
-        packed["centre"][bad], scale[bad] = 0.0, np.nan
-        return packed
+def grids_of(channel: Sequence[int], centre: Sequence[float], sigma: Sequence[float]) -> NDArray[np.void]:
+    """Return the histograms of channels, `layout.GRID`, with bins scaled to a standard deviation, shape (n_grid,)."""
+    grids = np.zeros(len(channel), layout.GRID)
+    grids["channel"] = channel
+    with np.errstate(over="ignore", divide="ignore"):
+        grids["centre"], grids["steps_per_unit"] = centre, layout.STEPS_PER_SIGMA / np.asarray(sigma, float)
+    # If float32 cannot represent the steps, all values count as far.
+    scale = grids["steps_per_unit"]
+    bad = ~(np.isfinite(grids["centre"]) & np.isfinite(scale) & (scale >= np.finfo(np.float32).tiny))
+    grids["centre"][bad], scale[bad] = 0.0, np.nan
+    return grids
 
 
 #: First and last fine bin, and their range of steps.
@@ -181,11 +183,10 @@ LOW_STEP, HIGH_STEP = ((n - layout.BINS // 2) * 2**layout.FINE_BITS for n in (FI
 
 
 class Tally:
-    """Accumulator of the histograms and sums of many channels."""
+    """Accumulator of the histograms and sums of many channels, on grids as `grids_of` returns them."""
 
-    def __init__(self, grids: Sequence[Grid]) -> None:
-        self.grids = tuple(grids)
-        self.packed = Grid.pack(self.grids)
+    def __init__(self, grids: NDArray[np.void]) -> None:
+        self.grids = grids
         # Fine bins, by grid times BINS plus bin: few are filled. The first and the last of each grid stay empty.
         self.fine = SparseCounts()
         # Sums of steps in fine bins and of their squares; Python integers, since squares may exceed 64 bits.
@@ -207,7 +208,7 @@ class Tally:
 
     def add_far(self, index: int, values: NDArray[np.float32]) -> int:
         """Count the values of a grid's channel that lie outside its fine bins, and return their number."""
-        grid = self.packed[index]
+        grid = self.grids[index]
         with np.errstate(over="ignore", invalid="ignore"):
             steps = np.rint((values - grid["centre"]) * grid["steps_per_unit"])
         above = steps >= HIGH_STEP
@@ -222,10 +223,10 @@ class Tally:
 
     def distribution(self, index: int) -> Distribution:
         """Return the distribution of a grid."""
-        packed, start = self.packed[index], index * layout.BINS
+        grid, start = self.grids[index], index * layout.BINS
         mine, (first, second) = slice(*np.searchsorted(self.fine.keys, (start, start + layout.BINS))), self.sums[index]
         return Distribution(
-            float(packed["centre"]), 1.0 / float(packed["steps_per_unit"]), self.fine.keys[mine] - start,
+            float(grid["centre"]), 1.0 / float(grid["steps_per_unit"]), self.fine.keys[mine] - start,
             self.fine.counts[mine].copy(), int(first), int(second), self.n, self.far[index],
         )  # fmt: skip
 

@@ -205,7 +205,20 @@ class QuadraticForm:
             low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
             return float(brentq(lambda x: self.sf(x) - probability, low, high, xtol=1e-9 * self.std))
         upper = probability <= 0.5
-        return self._unit * self._quantile(probability if upper else 1.0 - probability, upper=upper)
+        tail = probability if upper else 1.0 - probability
+        # Start from a gamma distribution of the same mean and variance.
+        mean, variance = self.mean / self._unit, (self.std / self._unit) ** 2
+        start = (special.gammainccinv if upper else special.gammaincinv)(mean**2 / variance, tail)
+        at = float(np.log(max(start * variance / mean, 1e-300)))
+        # The logarithm of the tail is concave in that of the value, so Newton steps converge.
+        for _ in range(MAX_STEPS):
+            mass, ratio = self._tail(float(np.exp(at)), upper=upper)
+            # The derivative of the logarithm of the tail with respect to that of the value is -+ ratio * value.
+            step = (mass - float(np.log(tail))) / (ratio * float(np.exp(at))) * (1.0 if upper else -1.0)
+            if abs(step) <= STEP_TOLERANCE:
+                return self._unit * float(np.exp(at + step))
+            at += float(np.clip(step, -3.0, 3.0))
+        raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
 
     @cached_property
     def _chi_squared(self) -> bool:
@@ -259,24 +272,6 @@ class QuadraticForm:
             bend = bend / 4 if bend * scale > 1e-6 else 0.0
         probability, density = mass.tolist()
         return top + float(np.log(probability / np.pi)), density / probability
-
-    def _quantile(self, probability: float, *, upper: bool) -> float:
-        """Return the quantile of an upper or lower tail probability, by Newton steps in logarithms.
-
-        The logarithm of the tail is concave in that of the value, so the steps converge.
-        """
-        # Start from a gamma distribution of the same mean and variance.
-        mean, variance = self.mean / self._unit, (self.std / self._unit) ** 2
-        start = (special.gammainccinv if upper else special.gammaincinv)(mean**2 / variance, probability)
-        at = float(np.log(max(start * variance / mean, 1e-300)))
-        for _ in range(MAX_STEPS):
-            mass, ratio = self._tail(float(np.exp(at)), upper=upper)
-            # The derivative of the logarithm of the tail with respect to that of the value is -+ ratio * value.
-            step = (mass - float(np.log(probability))) / (ratio * float(np.exp(at))) * (1.0 if upper else -1.0)
-            if abs(step) <= STEP_TOLERANCE:
-                return float(np.exp(at + step))
-            at += float(np.clip(step, -3.0, 3.0))
-        raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
 
     def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> Float:
         """Integrate probability and density divided by exp(top); NaN if the integrand grows on the contour."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
-from mauvecl.detection.counts import Grid, TailSamples
+from mauvecl.detection.counts import TailSamples, grids_of
 from mauvecl.detection.distributions import Form
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
@@ -198,7 +198,7 @@ class ChannelPlan:
     pixels_end: NDArray[np.uint32]
     scales: NDArray[np.float32]  # of the statistic `paper` (see `Smoothing`), shape (n_smoothed, n_centre)
     scale_end: NDArray[np.uint32]  # one past the last smoothed statistic of each scenario, shape (n_scenario,)
-    grids: list[Grid]
+    grids: NDArray[np.void]  # layout.GRID, shape (n_grid,)
     keys: list[Key]  # distribution that each grid counts
     # Row of chi-squared, and first and one past the last row whose squares are subtracted from it, shape (3, n).
     subtractions: NDArray[np.uint32]
@@ -280,14 +280,14 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
             channel = channel_of(statistic, i + 1, flare)
             counted.append(((name, "flare_on_null_grid", flare), channel, null))
             counted.append(((name, "flare", flare), channel, hypotheses.closed_form(name, flare)))
+    keys, of_grids, forms = zip(*counted, strict=True)
     scene = hypotheses.scene
     weights = np.zeros((len(weighted), len(scene.pixels)), np.float32)
     weights[:, : scene.n_pixel] = np.reshape([*weighted.values()], (len(weighted), scene.n_pixel))
     scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
     return ChannelPlan(
         weights, linear_end, pixels_end, scales, scale_end,
-        grids=[Grid(channel, form.mean, form.std) for _, channel, form in counted],
-        keys=[key for key, _, _ in counted],
+        grids=grids_of(of_grids, [form.mean for form in forms], [form.std for form in forms]), keys=[*keys],
         subtractions=np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T,
     )  # fmt: skip
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import SparseCounts, TailSamples, Tally, steps_of
+from mauvecl.detection.counts import SparseCounts, TailSamples, Tally, steps_of, unpacked
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
-from mauvecl.host.arrays import ContentEquality, Float
+from mauvecl.host.arrays import Arrays, ContentEquality, Float
 from mauvecl.noise import layout
 from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
@@ -159,6 +159,18 @@ class Counts:
         bins = self.bins[kind].keys % (2 * MAX_BIN) - MAX_BIN
         return (bins >= FIRST_BIN) & (bins <= LAST_BIN)
 
+    def pack(self) -> Arrays:
+        """Return the counts as arrays."""
+        packed = self.bins["pixel"].pack("pixel") | self.bins["element"].pack("element")
+        return packed | {"clipped": self.clipped, "n": np.array(self.n)}
+
+    def merge(self, packed: Arrays) -> None:
+        """Add packed counts of other realisations."""
+        for kind, each in self.bins.items():
+            each.add(*unpacked(kind, packed))
+        self.clipped += packed["clipped"]
+        self.n += int(packed["n"])
+
 
 def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: np.float32) -> Floats:
     """Compute an element's S/N in the device's order, shape (n,), from DN above the base, shape (n_pixel, n)."""
@@ -236,86 +248,44 @@ class SnrResult(Drawable, ContentEquality):
         return table_of(columns, [values | clipped], realisations=self.counts.n, **about)
 
 
-Arrays = dict[str, NDArray[Any]]
+def counts_of(request: SnrRequest) -> Counts:
+    """Return the empty histograms of a request."""
+    return Counts(request.scene.n_pixel, request.expectation.element_wavelength_nm.size)
+
+
+def snr_of(request: SnrRequest, counts: Counts) -> SnrResult:
+    """Return the result of a request from its histograms."""
+    x, scene = request.expectation, request.scene
+    return SnrResult(x, scene, observers(x, scene), elements(x), counts)
+
+
+def detection_of(request: DetectRequest, sums: Iterable[tuple[Tally, Sequence[TailSamples | None]]]) -> Detection:
+    """Return the result of a request from the sums and extremes of its parts."""
+    detection = Detection.of(request.hypotheses, request.realisations, request.tails, request.seed)
+    for (plan, _), (tally, samples) in zip(request.plans, sums, strict=True):
+        detection.collect(plan, tally, samples)
+    return detection
 
 
 def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arrays:
     """Pack a shard of a detection as arrays."""
-    shard = _pack_counts("counts", tally.fine) | {"sums": tally.sums.astype(str), "n": np.array(tally.n)}
+    shard = tally.fine.pack("counts") | {"sums": tally.sums.astype(str), "n": np.array(tally.n)}
     for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
         if far.n or far.undefined:
-            shard |= _pack_counts(f"far-{number}", far)
+            shard |= far.pack(f"far-{number}")
             shard[f"far-{number}-sums"] = np.array([str(x) for x in (far.first, far.second, far.undefined)])
         if tail is not None:
             shard[f"values-{number}"], shard[f"realisations-{number}"] = tail.values, tail.realisations
     return shard
 
 
-def pack_snr(counts: Counts) -> Arrays:
-    """Pack a shard of an S/N as arrays."""
-    shard = {"clipped": counts.clipped, "n": np.array(counts.n)}
-    for kind, each in counts.bins.items():
-        shard |= _pack_counts(kind, each)
-    return shard
-
-
-class DetectionSums:
-    """Accumulator of the shards of a detection."""
-
-    def __init__(self, request: DetectRequest) -> None:
-        self._request = request
-        self._sums = [(Tally(plan.grids), plan.tails()) for plan, _ in request.plans]
-
-    def add(self, part: int, shard: Arrays) -> None:
-        """Add a shard of one part."""
-        tally, samples = self._sums[part]
-        sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
-        tally.merge(*_unpack_counts("counts", shard), sums, int(shard["n"]))
-        for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
-            if f"far-{number}" in shard:
-                far.add(*_unpack_counts(f"far-{number}", shard))
-                far.add_sums(*(int(value) for value in shard[f"far-{number}-sums"]))
-            if tail is not None:
-                tail.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])
-
-    def answer(self) -> Detection:
-        """Return the result, once all shards are added."""
-        asked = self._request
-        detection = Detection.of(asked.hypotheses, asked.realisations, asked.tails, asked.seed)
-        for (plan, _), (tally, samples) in zip(asked.plans, self._sums, strict=True):
-            detection.collect(plan, tally, samples)
-        return detection
-
-
-class SnrSums:
-    """Accumulator of the shards of an S/N."""
-
-    def __init__(self, request: SnrRequest) -> None:
-        self._request, self._elements = request, elements(request.expectation)
-        self._counts = Counts(request.scene.n_pixel, len(self._elements))
-
-    def add(self, part: int, shard: Arrays) -> None:
-        """Add a shard."""
-        for kind, each in self._counts.bins.items():
-            each.add(*_unpack_counts(kind, shard))
-        self._counts.clipped += shard["clipped"]
-        self._counts.n += int(shard["n"])
-
-    def answer(self) -> SnrResult:
-        """Return the result, once all shards are added."""
-        x, scene = self._request.expectation, self._request.scene
-        return SnrResult(x, scene, observers(x, scene), self._elements, self._counts)
-
-
-def _pack_counts(name: str, counted: SparseCounts) -> Arrays:
-    """Pack counts of ascending keys as differences of keys, in the smallest integer types."""
-    parts = {f"{name}-steps": np.diff(counted.keys), name: counted.counts}
-    packed = {key: each.astype(np.min_scalar_type(int(each.max(initial=0)))) for key, each in parts.items()}
-    return {f"{name}-first": counted.keys[:1], **packed}
-
-
-def _unpack_counts(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Unpack keys and counts."""
-    first = shard[f"{name}-first"]
-    keys = np.cumsum(np.concatenate([first, shard[f"{name}-steps"].astype(np.int64)]), dtype=np.int64)
-    return keys, shard[name].astype(np.int64)
+def add_detection(tally: Tally, samples: Sequence[TailSamples | None], shard: Arrays) -> None:
+    """Add a packed shard of a detection to the sums and extremes of its part."""
+    sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
+    tally.merge(*unpacked("counts", shard), sums, int(shard["n"]))
+    for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
+        if f"far-{number}" in shard:
+            far.add(*unpacked(f"far-{number}", shard))
+            far.add_sums(*(int(value) for value in shard[f"far-{number}-sums"]))
+        if tail is not None:
+            tail.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])

@@ -48,8 +48,8 @@ class DeviceRecord:
         return f"{self.platform}: {self.name}"
 
 
-def write_outcome(device: DeviceRecord, checks: list[dict[str, Any]], seconds: float) -> None:
-    """Write the checks of the self-test to the kernel cache, for run records of the same device, driver and version."""
+def write_outcome(device: DeviceRecord, checks: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
+    """Keep a self-test in the kernel cache, for records of the same device, driver and version; return what is kept."""
     record = {
         "mauvecl": VERSION,
         "device": asdict(device),
@@ -59,6 +59,7 @@ def write_outcome(device: DeviceRecord, checks: list[dict[str, Any]], seconds: f
         "checks": checks,
     }
     drivers.kernel_cache().write_text(_outcome_key(device), json.dumps(record))
+    return record
 
 
 def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:

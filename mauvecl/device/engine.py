@@ -12,11 +12,12 @@ from mauvecl.detection import DEFAULT_STATISTICS, Tails, requests, snr
 from mauvecl.detection.counts import TailSamples, Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.nuisances import Nuisances
-from mauvecl.detection.snr import Arrays, SnrResult
+from mauvecl.detection.snr import Counts, SnrResult
 from mauvecl.detection.statistics import Linear
 from mauvecl.device.build import Device, DeviceRecord, devices
 from mauvecl.device.drivers import DeviceError
 from mauvecl.device.launches import ELEMENT_CHUNK, Progress, Tile, Tiles, detection_launches, scene_launches
+from mauvecl.host.arrays import Arrays
 from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
@@ -199,9 +200,15 @@ class Engine:
             See `Drawing`.
         """
         request = requests.SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
-        sums = snr.SnrSums(request)
-        sums.add(0, self.count(request, requests.Shard(0, request.start, request.realisations)))
-        return sums.answer()
+        return snr.snr_of(request, self._snr(request, requests.Shard(0, request.start, request.realisations)))
+
+    def _snr(self, request: requests.SnrRequest, shard: requests.Shard) -> Counts:
+        x, scene, counts = request.expectation, request.scene, snr.counts_of(request)
+        with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
+            launches.observe(snr.observers(x, scene), snr.elements(x))
+            self._tiles.for_each(shard.start, shard.count, 0, lambda tile, _: launches.histogram(tile, counts))
+            launches.flush_counts(counts)
+        return counts
 
     def count(self, request: requests.Countable, shard: requests.Shard, *, out: NDArray[Any] | None = None) -> Arrays:
         """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
@@ -209,13 +216,7 @@ class Engine:
             case requests.DetectRequest():
                 return snr.pack_detection(*self._detection(request, shard))
             case requests.SnrRequest():
-                scene, observed = request.scene, snr.elements(request.expectation)
-                counts = snr.Counts(scene.n_pixel, len(observed))
-                with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
-                    launches.observe(snr.observers(request.expectation, scene), observed)
-                    self._tiles.for_each(shard.start, shard.count, 0, lambda tile, _: launches.histogram(tile, counts))
-                    launches.flush_counts(counts)
-                return snr.pack_snr(counts)
+                return self._snr(request, shard).pack()
             case requests.RealiseRequest():
                 x, seed, how = request.expectation, request.seed, vars(request.drawing)
                 rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
@@ -270,12 +271,10 @@ class Engine:
         """
         how = (start, Drawing(**drawing), comparison, tails, nuisances)
         request = requests.DetectRequest(quiet, flares, realisations, seed, statistics, *how)  # type: ignore[arg-type]
-        sums, each = snr.DetectionSums(request), request.realisations
-        total = request.parts * each
-        for part in range(request.parts):
-            shard = requests.Shard(part, request.start, each)
-            sums.add(part, snr.pack_detection(*self._detection(request, shard, before=part * each, total=total)))
-        return sums.answer()
+        each, total = request.realisations, request.parts * request.realisations
+        shards = [requests.Shard(part, request.start, each) for part in range(request.parts)]
+        sums = (self._detection(request, shard, before=shard.part * each, total=total) for shard in shards)
+        return snr.detection_of(request, sums)
 
     def _detection(
         self, request: requests.DetectRequest, shard: requests.Shard, *, before: int = 0, total: int | None = None
@@ -287,9 +286,9 @@ class Engine:
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
                 launches.tally(tile, tally)
-                for grid, samples_of_grid in zip(tally.grids, samples, strict=True):
-                    if samples_of_grid is not None:
-                        samples_of_grid.add(launches.channel(tile, grid.channel), shard.start + done)
+                for channel, extremes in zip(plan.grids["channel"].tolist(), samples, strict=True):
+                    if extremes is not None:
+                        extremes.add(launches.channel(tile, channel), shard.start + done)
 
             self._tiles.for_each(shard.start, shard.count, 4 * plan.n_rows, work, before=before, total=total)
             launches.flush(tally)

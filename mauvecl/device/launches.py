@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.chi2 import Paper
-from mauvecl.detection.counts import Grid, Tally
+from mauvecl.detection.counts import Tally
 from mauvecl.detection.requests import ChannelPlan, Hypotheses
 from mauvecl.detection.snr import Counts
 from mauvecl.device.build import VECTORS, Device, Variant, out_of_memory
@@ -293,7 +293,7 @@ class Launches:
         count = len(tally.grids)
         items = 1 if self.variant.width > 1 else ITEMS
         if "grids" not in self._named:
-            self._named["grids"] = self.upload(Grid.pack(tally.grids))
+            self._named["grids"] = self.upload(tally.grids)
             self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
             self._named["sums"] = self.upload(np.zeros((count, items, 2), np.int64))
             self._named["outside"] = self.upload(np.zeros(count, np.uint32))
@@ -304,7 +304,7 @@ class Launches:
         # The host counts values outside the device's bins.
         outside = self._take(self._named["outside"], (count,))
         for index in np.flatnonzero(outside).tolist():
-            outlying = tally.add_far(index, self.channel(tile, tally.grids[index].channel))
+            outlying = tally.add_far(index, self.channel(tile, int(tally.grids["channel"][index])))
             if outlying != outside[index]:
                 raise DeviceError(
                     f"{self._device.record.label} must have {outlying} values outside a histogram as the host, but has "

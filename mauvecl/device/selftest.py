@@ -8,12 +8,11 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import resources
-from itertools import chain
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from scipy import special
 
 from mauvecl.detection.counts import Distribution
 from mauvecl.detection.requests import STATISTICS
-from mauvecl.detection.snr import Arrays, Counts
+from mauvecl.detection.snr import Counts
 from mauvecl.device import drivers
 from mauvecl.device.build import SAME_BITS, choose_device
 from mauvecl.device.drivers import DeviceError
@@ -214,17 +213,6 @@ def stare_case(name: str, count: int) -> tuple[Components, Stare, NDArray[np.flo
     return components, stare, np.linspace(0.0, 2.0, count * stare.n_frames).reshape(count, stare.n_frames, 1)
 
 
-@dataclass(frozen=True)
-class Glow:
-    """Reduction that keeps the noise factors of flares."""
-
-    adds: ClassVar[bool] = False
-
-    def __call__(self, values: NDArray[np.float32], first: int, glow: NDArray[np.float32]) -> Arrays:
-        """Return the factors as ``glow``."""
-        return {"glow": glow.copy()}
-
-
 #: Probability that a statistical check fails on a correct device.
 FALSE_FAILURE_PROBABILITY = 1e-6
 
@@ -294,7 +282,7 @@ def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
             method: stares.frames(components, stare, given, method=method, processes=processes, **same)
             for method, processes in METHODS.items()
         }
-        request = StaresRequest(components, stare, count, SEED, start=START, reduction=Glow(), glow=True)
+        request = StaresRequest(components, stare, count, SEED, start=START, glow=True)
         return ours | {"noise of flares": stares.reduced(request)["glow"]}
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
@@ -469,11 +457,7 @@ def tiles(engine: Engine) -> Iterator[Check]:
     yield Check("same bits in pieces", bool(np.array_equal(whole, np.concatenate(parts))), "500 realisations in 3")
 
 
-def run(engine: Engine, report: Callable[[Check], None] = lambda check: None) -> list[Check]:
-    """Run all checks and call `report` with each outcome."""
-    checks: list[Check] = []
+def run(engine: Engine) -> list[Check]:
+    """Run all checks."""
     groups = (check_results, chance, closed_forms, tiles)
-    for check in chain([known_answers(engine)], *(group(engine) for group in groups)):
-        checks.append(check)
-        report(check)
-    return checks
+    return [known_answers(engine), *(check for group in groups for check in group(engine))]

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.requests import Shard
-from mauvecl.detection.snr import Arrays
 from mauvecl.device.build import Device, Variant
 from mauvecl.device.launches import TILE_BYTES, Launches, Progress, Tile, Tiles, contiguous, padded
 from mauvecl.flares import stare_scene
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
+from mauvecl.host.arrays import Arrays
 from mauvecl.noise.unknowns import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

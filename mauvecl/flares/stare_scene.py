@@ -20,15 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.requests import Countable
-from mauvecl.detection.snr import Arrays
 from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Arrays, Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants, joint_is_exact, truncation_distance
 from mauvecl.noise.scene import Scene, padded, prepare
-from mauvecl.noise.unknowns import NONE, Processes
+from mauvecl.noise.unknowns import CHANGING, NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Realisations, Seed
@@ -119,7 +118,7 @@ class StareScene:
     #: Star, sky, dark and neighbours, each followed by its value minus one; then all light. Shape (9, n_padded_frame).
     known: Floats
     curves: Floats  # of the stare's unknowns, times their standard deviations, shape (n_unknown, n_padded_frame)
-    kinds: NDArray[np.uint32]  # rows of `layout.MOVED`, shape (n_unknown,)
+    kinds: NDArray[np.uint32]  # indices of `CHANGING`, shape (n_unknown,)
     mixtures: NDArray[np.void]  # of `layout.MIXTURE`, shape (n_padded,)
     spectra: Floats  # DN of flares of unit amplitude, shape (n_flare, n_padded)
     weights: Floats  # shape (n_statistic, n_padded)
@@ -154,7 +153,7 @@ class StareScene:
         return cls(
             components, stare, scene, _padded(stare.numbers, np.uint32),
             _padded(np.stack([*factors, stare.light]), np.float32), _padded(curves, np.float32),
-            np.array([layout.MOVED.index(u.of) for u in stare.unknowns], np.uint32),
+            np.array([CHANGING.index(u.of) for u in stare.unknowns], np.uint32),
             _mixtures(components, scene.base_dn[0]), spectra, weights, constants.astype(np.float32),
         )  # fmt: skip
 
@@ -215,7 +214,7 @@ class StareScene:
     @property
     def _spreads(self) -> dict[str, Float]:
         """Standard deviations of the conditions that are drawn for each frame, shape (n_frame,) each."""
-        variances = {of: np.full(self.stare.n_frames, self.stare.jitters.get(of, 0.0) ** 2) for of in layout.MOVED}
+        variances = {of: np.full(self.stare.n_frames, self.stare.jitters.get(of, 0.0) ** 2) for of in CHANGING}
         for unknown in self.stare.unknowns:
             variances[unknown.of] += (unknown.sd * unknown.curve) ** 2
         return {of: np.sqrt(variance) for of, variance in variances.items()}
@@ -376,13 +375,14 @@ class StaresRequest(Countable):
 
 @dataclass(frozen=True)
 class KeepStatistics:
-    """Reduction that returns the statistics as they are."""
+    """Reduction that returns the statistics, and the draws for flares if there are any, as they are."""
 
     adds: ClassVar[bool] = False
 
-    def __call__(self, values: NDArray[np.float32], first: int) -> Arrays:
+    def __call__(self, values: Floats, first: int, glow: Floats | None = None) -> Arrays:
         """Return one row per stare, with scenarios on the second axis."""
-        return {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
+        kept = {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
+        return kept if glow is None else kept | {"glow": glow.copy()}
 
 
 class StareSums:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.arrays import Float
-from mauvecl.noise.disturbances import ADDITIVE
-from mauvecl.noise.unknowns import CHANGING, PROCESSES, STARE_PROCESSES
+from mauvecl.noise.disturbances import ADDITIVE, PointingDrifts
+from mauvecl.noise.unknowns import PROCESSES
 
 WORD_BITS = 32
 
@@ -31,7 +31,7 @@ STREAMS = {
     "stare_frame": 17,
     "stare_sums": 18,
     "stare_glow": 19,
-    **{f"stare_{name}": process.stream for name, process in STARE_PROCESSES.items()},
+    "stare_pointing": PointingDrifts.stream,
     **{name: process.stream for name, process in ADDITIVE.items()},
     **{name: process.stream for name, process in PROCESSES.items()},
 }
@@ -117,8 +117,6 @@ STARE_JOB = np.dtype([
     *_fields("u4", "scenario_count", "flare_rows", "amplitude_rows"),
 ])  # fmt: skip
 
-#: Parts of the signal that unknowns of a stare change, in the order of their numbers.
-MOVED = CHANGING
 #: Frames are padded to a multiple of this.
 FRAME_BLOCK = 16
 #: Taylor coefficients of q in exp(r) = 1 + r + r^2 q(r), with an error below 2e-8 for |r| <= ln(2) / 2; and ln(2) in

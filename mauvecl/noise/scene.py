@@ -159,19 +159,6 @@ def padded(n_pixel: int) -> int:
     return -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
 
 
-def detector_pixels(quiet: Expectation, used: NDArray[np.bool_]) -> NDArray[np.void]:
-    """Return the properties that all scenarios share: layout.PIXEL, shape (n_padded,)."""
-    n_pixel = used.size
-    pixels = np.zeros(padded(n_pixel), layout.PIXEL)
-    pixels["used"][:n_pixel] = used
-    pixels["element_end"][:n_pixel] = np.append(np.diff(quiet.element) > 0, True)
-    # Groups of four used pixels in one element are summed without tests of single pixels.
-    uneven = (pixels["element_end"] > 0) | (pixels["used"] == 0)
-    pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
-    pixels["electron_gain"][:n_pixel] = quiet.gain_dn_per_electron
-    return pixels
-
-
 def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasTable]) -> Float:
     """Fill `out` for draws of Poisson counts; return the integers to which counts are relative, shape (n_pixel,)."""
     centre = np.rint(mean)
@@ -307,6 +294,12 @@ def prepare(
         # Separate dark counts are relative to integers.
         mean = method.each * quiet.dark_dn / step
         dark_dn = step * fill_poisson_counts(darks[: used.size], mean, step, method.tables)
+    pixels = np.zeros(darks.size, layout.PIXEL)
+    pixels["used"][: used.size], pixels["electron_gain"][: used.size] = used, quiet.gain_dn_per_electron
+    pixels["element_end"][: used.size] = np.append(np.diff(quiet.element) > 0, True)
+    # Groups of four used pixels in one element are summed without tests of single pixels.
+    uneven = (pixels["element_end"] > 0) | (pixels["used"] == 0)
+    pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
     arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
         _fill_draw(arrays, k, x, method, dark_dn)
@@ -315,7 +308,7 @@ def prepare(
     tables = np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32)
     return Scene(
         used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons, clip=method.each == 1,
-        modulations=drawing.processes.modulations, job=job, pixels=detector_pixels(quiet, used), dark_counts=darks,
+        modulations=drawing.processes.modulations, job=job, pixels=pixels, dark_counts=darks,
         tables=tables, priors=method.factors.tables, medians=tuple(method.factors.medians.values()),
         references=compared, comparison=comparison, used=used, **arrays,
     )  # fmt: skip

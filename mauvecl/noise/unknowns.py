@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast, 
 
 from pydantic import create_model
 
-from mauvecl.noise.disturbances import ADDITIVE, Normal, ParticleRate, PointingDrifts, PriorField, Uniform
+from mauvecl.noise.disturbances import ADDITIVE, Normal, ParticleRate, PriorField, Uniform
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DetectorTemperature, Range, range_of
@@ -32,6 +32,7 @@ SIGNAL_PARTS: tuple[SignalPart, ...] = get_args(SignalPart)
 #: Quantities of a stare that change: the quiescent level of the star; the throughput for the light of star, flare and
 #: sky; the brightness of the sky; the temperature of the detector.
 Changing = Literal["star", "light", "sky", "temperature"]
+#: In the order of their numbers in kernels.
 CHANGING: tuple[Changing, ...] = get_args(Changing)
 #: Part of the signal that each of them changes; a nuisance parameter of this name takes its place in a frame.
 CHANGED_PART: dict[Changing, str] = {"star": "star", "light": "light", "sky": "sky", "temperature": "dark"}
@@ -142,10 +143,6 @@ def _tilt(quiet: Expectation) -> Float:
 def _by_name(*rows: Row) -> dict[str, Row]:
     return {row.name: row for row in rows}
 
-
-#: Processes of all light during a stare, which are drawn and marginalised: keys of studies' ``stare``, fields of
-#: `mauvecl.flares.stare.Stare`.
-STARE_PROCESSES: dict[str, type[PointingDrifts]] = {"pointing": PointingDrifts}
 
 #: Processes in the order of their tables in kernels: fields of `Processes`, keys of studies' ``processes``.
 PROCESSES = _by_name(

@@ -24,7 +24,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +32,9 @@ from pydantic import BaseModel
 
 from mauvecl.detection.requests import Countable, Shard
 from mauvecl.host import VERSION
+from mauvecl.host.arrays import Arrays
 from mauvecl.host.tables.files import UNFINISHED, read_bytes, write_whole
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    from mauvecl.detection.snr import Arrays
 
 
 @contextlib.contextmanager

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.detection.requests import Countable, Shard
-from mauvecl.detection.snr import Arrays
 from mauvecl.device.build import DeviceRecord
 from mauvecl.device.drivers import THREADS, DeviceError
 from mauvecl.host import VERSION
+from mauvecl.host.arrays import Arrays
 from mauvecl.host.tables.files import is_file, parsing, read_text
 from mauvecl.runs.checkpoint import ShardLost, Stopped, Task, code_identity
 from mauvecl.schema.calls import validated

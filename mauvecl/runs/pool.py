@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from numpy.typing import NDArray
 
+from mauvecl.detection.counts import Tally
 from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
-from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
+from mauvecl.detection.snr import add_detection, counts_of, detection_of, snr_of
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
-from mauvecl.host.arrays import map_in_threads
+from mauvecl.host.arrays import Arrays, map_in_threads
 from mauvecl.runs.checkpoint import Checkpoint, ShardLost, Stopped, Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range, Realisations
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.detection.detection import Detection
     from mauvecl.detection.snr import SnrResult
     from mauvecl.device.stares import Stares
-    from mauvecl.flares.stare_scene import StaresRequest, StareSums
+    from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.cluster import DaskWorkers
 
@@ -40,7 +41,6 @@ SHARDS_PER_WORKER = 2
 PREPARED = 1
 
 
-Sums = TypeVar("Sums", DetectionSums, SnrSums, "StareSums")
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
@@ -194,18 +194,24 @@ class Pool:
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
         request = DetectRequest.of(quiet, flares, **how)
-        return self._add_up(request, DetectionSums(request)).answer()
+        sums = [(Tally(plan.grids), plan.tails()) for plan, _ in request.plans]
+        self._add_up(request, lambda part, shard: add_detection(*sums[part], shard))
+        return detection_of(request, sums)
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """Compute distributions of the S/N; parameters as for `Engine.snr`."""
         request = SnrRequest.of(expectation, **how)
-        return self._add_up(request, SnrSums(request)).answer()
+        counts = counts_of(request)
+        self._add_up(request, lambda _, shard: counts.merge(shard))
+        return snr_of(request, counts)
 
     def stares(self, request: StaresRequest) -> Arrays:
         """Reduce all stares of a request; see `Stares.reduced`."""
         from mauvecl.flares.stare_scene import StareSums
 
-        return self._add_up(request, StareSums(request)).answer()
+        sums = StareSums(request)
+        self._add_up(request, sums.add)
+        return sums.answer()
 
     def realise(
         self, expectation: Expectation, *, count: Realisations, out: NDArray[Any] | None = None, **how: Any
@@ -223,8 +229,8 @@ class Pool:
         out[:] = rows
         return out
 
-    def _add_up(self, request: DetectRequest | SnrRequest | StaresRequest, sums: Sums) -> Sums:
-        """Count all shards of a request and return their sums."""
+    def _add_up(self, request: DetectRequest | SnrRequest | StaresRequest, add: Callable[[int, Arrays], None]) -> None:
+        """Count all shards of a request, and call `add` with the part of each and its arrays."""
         key, todo = fingerprint(request), shards(request)
         with self._lock:
             self._total += sum(shard.count for shard in todo)
@@ -232,22 +238,21 @@ class Pool:
         self._report_progress()
 
         def left() -> Iterator[Task]:
-            """Add shards of the checkpoint to the sums, and yield the others."""
+            """Add shards of the checkpoint, and yield the others."""
             for shard in todo:
                 task = Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}"))
                 resumed = None if self.checkpoint is None else self.checkpoint.get(task.name)
                 if resumed is None:
                     yield task
                 else:
-                    sums.add(shard.part, resumed)
+                    add(shard.part, resumed)
                     self._finished(task, resumed=True)
 
         for task, counted in self._counted(left()):
-            sums.add(task.shard.part, counted)
+            add(task.shard.part, counted)
             if self.checkpoint is not None:
                 self.checkpoint.put(task.name, counted)
             self._finished(task)
-        return sums
 
     def _counted(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Arrays]]:
         """Count tasks with all workers, and yield them with their arrays, in the order in which they are finished."""

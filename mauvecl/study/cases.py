@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 
 from mauvecl.noise.drawing import Cumulants, stack_is_exact
-from mauvecl.noise.unknowns import COURSES, PROCESSES, STARE_PROCESSES, Processes, default_processes
+from mauvecl.noise.unknowns import COURSES, PROCESSES, Processes, default_processes
 from mauvecl.schema.columns import Column, percent, short
 from mauvecl.schema.errors import Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
@@ -93,14 +93,15 @@ def _given_unknowns(study: Study) -> dict[Use, dict[str, str]]:
     n, s, draws = study.nuisances, study.stare, study.unknowns.draws
     changes = {f"stare.{name}": name for name in KNOWN_CHANGES if getattr(s, name) is not None}
     changes |= {f"stare.{course}": f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))}
-    processes = {name: process for name, process in STARE_PROCESSES.items() if getattr(s, name)}
+    if s.pointing is not None:
+        changes["stare.pointing"] = f"{s.pointing.label} (assumed)"
     return {
         "processes": {
             f"processes.{name}": name.replace("_", " ") for name, value in study.processes if value is not None
         },
         "nuisances": {f"nuisances.{name}": name for name in n.spreads()}
         | {f"nuisances.own.{name}": name for name in n.own},
-        "stare": changes | {f"stare.{name}": f"{process.label} (assumed)" for name, process in processes.items()},
+        "stare": changes,
         "values": {"unknowns.draws": f"{draws} draws of the instrument's unknowns"} if draws else {},
     }
 

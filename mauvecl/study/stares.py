@@ -16,7 +16,7 @@ from mauvecl.flares.stare import Event, Stare, check_contributions, temperatures
 from mauvecl.host.arrays import Float
 from mauvecl.host.tables.text_tables import read_columns
 from mauvecl.noise.disturbances import Normal, Prior
-from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, STARE_PROCESSES, Changing, Course
+from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, Changing, Course
 from mauvecl.schema.errors import InputError, Message, shortened
 from mauvecl.schema.fields import DAY_S
 from mauvecl.study.stare import KNOWN_CHANGES, EventChoice, StareQuestion
@@ -69,7 +69,7 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
     if study.nuisances.usual:
         spreads = {how: documented | spreads[how] for how, documented in DEFAULT_SPREADS.items()}
 
-    names = (*KNOWN_CHANGES, *STARE_PROCESSES, "orbit_s")
+    names = (*KNOWN_CHANGES, "pointing", "orbit_s")
     changes: dict[str, Any] = {name: getattr(q, name) for name in names} | spreads
     if q.along_orbit:
         stare = _along_orbit(study, instrument.frame_s, changes)

@@ -143,7 +143,7 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
     steps = [inner - 1, inner - 0.5, inner, -inner, -inner - 0.5, -inner - 1, end - 1, end, -end, -end - 1, 0]
     far = [np.nan, np.inf, -np.inf]
     values = np.array([*steps, *far, 0, 0, *steps, *far], np.float32)
-    tally = counts.Tally([counts.Grid(0, 0.0, float(layout.STEPS_PER_SIGMA))])
+    tally = counts.Tally(counts.grids_of([0], [0.0], [layout.STEPS_PER_SIGMA]))
     tile = any_width._tiles.at(0, values.size, 4096)
     with scene_launches(any_width.open_device, prepare([selftest.toy()]), 1) as launches:
         launches._named["values"] = launches.upload(np.resize(values, tile.size))
@@ -154,7 +154,7 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
     np.testing.assert_array_equal(found.counts, np.bincount(inside // fine + half, minlength=layout.BINS))
     assert (found.first, found.second) == (inside.sum(), (inside**2).sum())
     assert (found.far.n, found.far.undefined) == (values.size - inside.size - 6, 6)
-    histogram, sums, outside = numpy_kernels.tally(values[None], tally.packed)
+    histogram, sums, outside = numpy_kernels.tally(values[None], tally.grids)
     np.testing.assert_array_equal(histogram[0, 1:-1], found.counts[1:-1])
     assert (*sums[0], outside[0]) == (found.first, found.second, values.size - inside.size)
 

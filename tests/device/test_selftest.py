@@ -37,8 +37,7 @@ def other_kernels(monkeypatch: pytest.MonkeyPatch, cases: tuple[str, ...], old: 
 @pytest.mark.long
 def test_self_test_passes(engine: Engine) -> None:
     """Pass on a correct device; limits of p = 1e-6 and 5 standard errors fail for one in 1e5 seeds."""
-    reported: list[selftest.Check] = []
-    assert reported == selftest.run(engine, reported.append)
+    reported = selftest.run(engine)
     assert len(reported) > 20
     assert [check.name for check in reported if not check.passed] == []
 

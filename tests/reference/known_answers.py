@@ -40,9 +40,9 @@ def results(name: str, count: int) -> dict[str, np.ndarray]:
     sums = statistics.statistics(hypotheses, plan, index, seed)
     values = statistics.marginalise(sums, plan.subtractions)
     tally = counts.Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
-    counted, moments, _ = statistics.tally(values, tally.packed)
+    counted, moments, _ = statistics.tally(values, tally.grids)
     tally.add(counted, moments, count)
-    tally.add_far(0, values[tally.grids[0].channel])
+    tally.add_far(0, values[tally.grids["channel"][0]])
     seen = statistics.histograms(scene, snr.observers(quiet, scene), snr.elements(quiet), index, seed)
     return {
         "raw": reference.realise(scene, index, seed).astype(np.int32),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mauvecl.flares import stare_scene
-from mauvecl.noise import layout, reference
+from mauvecl.noise import layout, reference, unknowns
 
 Flares, StareScene, SumTable = stare_scene.Flares, stare_scene.StareScene, stare_scene.SumTable
 fma = reference.fma
@@ -28,7 +28,7 @@ def exponential_less_one(x: np.ndarray) -> np.ndarray:
 
 def strengths(scene: StareScene, numbers: np.ndarray, frame: int, seed: int, lost: np.ndarray) -> dict[str, np.ndarray]:
     """Draw steady components' coefficients and the factor on light in a frame, minus one, float32 (n_stare,) each."""
-    moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
+    moved = {str(name): np.zeros(len(numbers), np.float32) for name in unknowns.CHANGING}
     stare = scene.stare
     jitters = np.float32([stare.light_jitter, stare.sky_jitter, stare.temperature_jitter_c])
     if jitters.any():
@@ -36,7 +36,7 @@ def strengths(scene: StareScene, numbers: np.ndarray, frame: int, seed: int, los
         for name, z, jitter in zip(("light", "sky", "temperature"), drawn, jitters, strict=False):
             moved[name] = z * jitter
     for u, kind in enumerate(scene.kinds):
-        name = layout.MOVED[kind]
+        name = unknowns.CHANGING[kind]
         z = reference.four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
     star, star_less_one, sky, sky_less_one, dark, dark_less_one, near, near_less_one, _ = scene.known[:, frame]
