@@ -310,7 +310,7 @@ def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(tm
     shares = np.array([1.0, 0.8, 0.8])
     rise = shares * (np.array([electrons(one.flaring(1.0)) for one in stars]) - light) / (shares @ light)
     np.testing.assert_allclose(table["amplitude"], table["ampl_rec"] / np.tile(rise, n), rtol=1e-9)
-    duration = [one.equivalent_duration_s for one in answer.analysis.events for _ in stars]
+    duration = [one.fitted_s for one in answer.analysis.events for _ in stars]
     np.testing.assert_allclose(table["equivalent_duration"].to_value("s"), duration / np.tile(rise, n), rtol=1e-9)
     assert "neighbours.ecsv" in answer.files
     assert any("assumption: 80 % of it enters" in text for text in answer.messages)

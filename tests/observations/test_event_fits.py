@@ -83,7 +83,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(model: processes.Pr
         start = float(survey.stare.start_s[n // 2])
         one = searches.DetectedEvent(100.0, 120.0, start, 0, 20.0, n // 2 - 8, n // 2 + 120)
         taken = np.isin(np.arange(n), range(one.first, one.last + 1))
-        measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy)
+        measured.append(events.measure_event(survey, taken, np.full(n, LEVEL / SD), one))
         work.append(sizes[:])
         sizes.clear()
     assert work[0]
