@@ -229,10 +229,14 @@ def measure_event(
     chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
     of_star = float(plain.level_without(model))
     mixture = _posterior(window, taken, fits, scipy.stats.chi2.sf(chi2, dof) < POOR)
+    fitted_s = mixture.quantile(0.5)
     low, high = ([mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1))
     flares = [replace(f, amplitude=f.amplitude / of_star, equivalent_duration_s=f.equivalent_duration_s / of_star)
               for f in best.flares]  # fmt: skip
     summed, error = _summed(survey, taken, level, found)
+    kind = cause
+    if cause == "flare":
+        kind = _kind(window, [fit for fit in fits if fit.shape.name != GENERAL], summed, error)
     flux = (survey.flux[rows] - level[rows]) * survey.scale
     # In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not near its peak.
     near = np.abs(middle[rows] - found.peak_s) <= found.half_width_s + frame_s
@@ -246,10 +250,9 @@ def measure_event(
     gc.collect(1)
     return ObservedEvent(
         found.value, first, last, brightest, found.half_width_s, float(flux.max()) / survey.level / of_star,
-        int(numbers[last] - numbers[first] + 1 - flux.size), cut,
-        cause if cause != "flare" else _kind(window, [f for f in fits if f.shape.name != GENERAL], summed, error),
+        int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,
         missing_s >= min(found.half_width_s, flares[0].half_width_s), summed / of_star, error / of_star,
-        mixture.quantile(0.5), (low[0], low[1]), (high[0], high[1]), tuple(flares), best.shape.name, chi2, dof,
+        fitted_s, (low[0], low[1]), (high[0], high[1]), tuple(flares), best.shape.name, chi2, dof,
         bool((np.abs(middle[rows] - flares[0].peak_s) <= 1.5 * frame_s).any()), of_star,
     )  # fmt: skip
 
