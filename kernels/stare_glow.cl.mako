@@ -5,7 +5,7 @@
 %>\
 __kernel ${attributes}
 void stare_glow(__global const Job *restrict job, STARE, const uint first_low, const uint first_high, const uint frames_each,
-                const uint row_count, const uint first_row, __global float *restrict values)
+                const uint row_count, __global float *restrict values)
 {
     /* values[stare][statistic, then light minus one][frame] */
     const uint stare = get_global_id(0), stride = stare_job->padded_frames;
@@ -26,7 +26,7 @@ void stare_glow(__global const Job *restrict job, STARE, const uint first_low, c
 % endfor
         for (uint i = 0; i < ${4 * n_words}u; i += 2u) normal_pair(w + i, z + i);
         const Strengths strengths = strengths_of(STARE_PASSED, frame, z, unknown, LOST(stare));
-        __global float *out = values + (size_t)(first_row + stare) * ${sums + 1}u * stride + frame;
+        __global float *out = values + (size_t)stare * ${sums + 1}u * stride + frame;
 % for a in range(sums):
         STORE(z[${4 * jittered + a}u], out + ${a}u * stride);
 % endfor

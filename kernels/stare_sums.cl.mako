@@ -36,7 +36,7 @@
 %>\
 __kernel ${attributes}
 void stare_sums(__global const Job *restrict job, STARE, const uint first_low, const uint first_high, const uint frames_each,
-                __global const float *restrict table, const uint row_count, const uint first_row, __global float *restrict values)
+                __global const float *restrict table, const uint row_count, __global float *restrict values)
 {
     /* values[scenario][stare][statistic][frame] */
     const uint stare = get_global_id(0), stride = stare_job->padded_frames, scenario_count = stare_job->scenario_count;
@@ -130,7 +130,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
 % for a in range(sums):
             const floatv u${a} = ${cumulant(a)} + (${chain([(f"l{a}{i}", f"x{i}") for i in range(a + 1)])});
 % endfor
-            __global float *out = values + ((size_t)k * row_count + first_row + stare) * ${sums}u * stride + frame;
+            __global float *out = values + ((size_t)k * row_count + stare) * ${sums}u * stride + frame;
 % for a in range(sums):
             STORE(${chain([(f"(floatv)whole[{pairs.index((a, i))}]", f"u{i}") for i in range(a + 1)])}, out + ${a}u * stride);
 % endfor

@@ -480,8 +480,8 @@ MUTATIONS: dict[str, Mutation] = {
     "steps of two frames that scatter like one": (
         "test_gain_ignores_jitter_of_light",
         (
-            "np.mean(white**2, axis=0) / kept * scale**2 / 2, light",
-            "np.mean(white**2, axis=0) / kept * scale**2, light",
+            "np.sum(basis**2, axis=0)) * scale**2 / 2)",
+            "np.sum(basis**2, axis=0)) * scale**2)",
         ),
     ),
     "a dark current without noise": (

@@ -17,12 +17,12 @@ from mauvecl.fits.flare_model import FlareModel
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.stars.flare import check_scales
-from mauvecl.observations.analysis import Analysis, SpectralAnalysis, analyse_frames
+from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason, barycentric
-from mauvecl.observations.spectra import EventSpectrum
+from mauvecl.observations.spectra import EventSpectrum, SpectralSeries
 from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
@@ -95,13 +95,13 @@ class EventRow:
     @property
     def spectrum(self) -> EventSpectrum | None:
         """Its spectrum, in spectra that are searched with weights for flares."""
-        return None if self.analysis.spectra is None else self.analysis.spectra.found[self.number]
+        return None if self.analysis.spectra is None else self.analysis.found[self.number]
 
     @property
     def measured(self) -> Measurement | str:
         """The flare fitted to its spectrum, or the reason why none is."""
-        spectra = self.analysis.spectra
-        return "no spectra of the instrument are given" if spectra is None else spectra.measured[self.number]
+        analysis = self.analysis
+        return "no spectra of the instrument are given" if analysis.spectra is None else analysis.fitted[self.number]
 
     @property
     def unmeasured(self) -> str:
@@ -159,28 +159,28 @@ class EventRow:
     @property
     def peak_in_gap(self) -> bool:
         """True if the peak of the largest fitted flare is in a gap, or before or after all frames."""
-        if self.event.energy.peak_observed:
+        if self.event.peak_observed:
             return False
         stare = self.analysis.survey.stare
-        after = int(np.searchsorted(stare.start_s, self.event.energy.flares[0].peak_s))
+        after = int(np.searchsorted(stare.start_s, self.event.flares[0].peak_s))
         around = stare.numbers[max(after - 1, 0) : after + 1]
         return around.size < 2 or int(np.ptp(around)) > GAP_FRAMES
 
     @property
     def unclear(self) -> bool:
         """True if the frames of an event in a light curve are together fainter than the star."""
-        return self.event.energy.unclear and not self.analysis.survey.weighted
+        return self.event.unclear and not self.analysis.survey.weighted
 
     @property
     def fitted_s(self) -> tuple[float, float, float, float, float]:
         """Equivalent duration of the whole flare and the ends of its 68 and 95 % intervals; NaN if it is no flare."""
-        energy = self.event.energy
-        if self.event.kind != "flare":
+        event = self.event
+        if event.kind != "flare":
             return (float("nan"),) * 5
         # The level at the peak is that of the sum over wavelength.
-        times = energy.level * self.analysis.level_ratio if self.analysis.dark_misleads else 1.0
-        (low, low_95), (high, high_95) = energy.low_s, energy.high_s
-        return times * energy.fitted_s, times * low, times * high, times * low_95, times * high_95
+        times = event.level * self.analysis.level_ratio if self.analysis.dark_misleads else 1.0
+        (low, low_95), (high, high_95) = event.low_s, event.high_s
+        return times * event.fitted_s, times * low, times * high, times * low_95, times * high_95
 
     def in_white_light(self, value: float) -> float:
         """Return a value that follows from the sum over wavelength; NaN if the dark current changes this."""
@@ -204,11 +204,11 @@ class EventRow:
             notes.append("it reaches a gap or an end of the frames")
         frames = "1 missing frame is" if event.missing == 1 else f"{event.missing} missing frames are"
         notes += [f"{frames} interpolated"] if event.missing else []
-        if event.kind == "flare" and event.energy.poor:
+        if event.kind == "flare" and event.poor:
             notes.append("no shape fits it within its noise: its interval includes other shapes but may be too narrow")
         if event.kind == "flare" and self.unclear:
             notes.append("its frames are together fainter than the level by more than its error")
-        if event.kind == "flare" and not event.energy.peak_observed:
+        if event.kind == "flare" and not event.peak_observed:
             looks = ": light that settles after a gap looks alike" if self.peak_in_gap else ""
             notes.append(f"no frame shows its peak{looks}")
         elif event.kind == "flare" and event.gap_at_peak:
@@ -242,19 +242,19 @@ EVENTS = (
     *interval_columns("ed_{}", lambda row: row.fitted_s[1:3], "s", "its 68 % interval, which includes the errors of "
                       "level and shape", "68 %", interval(".4g")),
     *interval_columns("ed_{}_95", lambda row: row.fitted_s[3:], "s"),
-    Column("ed_rec", lambda row: row.in_white_light(row.event.energy.summed_s), "s", "equivalent duration in the "
+    Column("ed_rec", lambda row: row.in_white_light(row.event.summed_s), "s", "equivalent duration in the "
            "frames of the event: sum of the flux above the level, relative to the level at the peak; nan: the dark "
            "current changes the level", "ED in frames (s)", number(".4g"), detail=True),
-    Column("ed_rec_err", lambda row: row.in_white_light(row.event.energy.summed_error_s), "s", "its standard error, "
+    Column("ed_rec_err", lambda row: row.in_white_light(row.event.summed_error_s), "s", "its standard error, "
            "with that of the level", "error (s)", number(".2g"), detail=True),
     Column("ed_rec_limit", "event.is_limit", "", "whether it is a lower limit, because a gap or an end cuts the flare",
            kind=bool),
     Column("ed_fit", lambda row: row.fitted_s[0], "s", "the same as ed, by its older name"),
     *interval_columns("ed_fit_{}", lambda row: row.fitted_s[1:3], "s", "its 68 % interval"),
-    Column("shape", "event.energy.shape", "", "shape of the flares that fits best", kind=str),
-    Column("half_width", lambda row: row.event.energy.flares[0].half_width_s, "s",
+    Column("shape", "event.shape", "", "shape of the flares that fits best", kind=str),
+    Column("half_width", lambda row: row.event.flares[0].half_width_s, "s",
            "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)", number(".3g"), detail=True),
-    Column("components", lambda row: len(row.event.energy.flares), "", "flares fitted together", kind=int),
+    Column("components", lambda row: len(row.event.flares), "", "flares fitted together", kind=int),
     Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
     Column("rate_normal", lambda row: row.analysis.false_alarms(row.event)[0], "1 / d",
            "false alarms per star-day above this statistic in light curves of the fitted process"),
@@ -406,11 +406,11 @@ class AnalyseAnswer(Answer):
         when="_spectra", about=(),
     )  # fmt: skip
     #: One row per pixel of spectra: noise as stated and as measured.
-    pixels = TableOf("noise-per-pixel", PIXELS, lambda answer: [spectra.series.noise for spectra in answer._spectra],
+    pixels = TableOf("noise-per-pixel", PIXELS, lambda answer: [spectra.noise for spectra in answer._spectra],
                      when="_spectra", about=("analysis.frames.unit",))  # fmt: skip
     #: One row per sudden change of the light that all pixels of spectra share.
     throughput = TableOf("throughput", THROUGHPUT, lambda answer: [
-        (spectra.cleaned.frames, change) for spectra in answer._spectra for change in spectra.series.changes
+        (spectra.cleaned.frames, change) for spectra in answer._spectra for change in spectra.changes
     ], when="_spectra", about=())  # fmt: skip
     #: One row per event and star in the fibre: the flare of that star which would look like the event.
     neighbour_flares = TableOf("neighbour-flares", COLUMNS, "_flares_of_stars",
@@ -421,7 +421,7 @@ class AnalyseAnswer(Answer):
         return bool(np.isfinite(self.analysis.level_ratio))
 
     @property
-    def _spectra(self) -> list[SpectralAnalysis]:
+    def _spectra(self) -> list[SpectralSeries]:
         """The analysis of the spectra, if they are searched with weights for flares."""
         return [] if self.analysis.spectra is None else [self.analysis.spectra]
 
@@ -434,7 +434,7 @@ class AnalyseAnswer(Answer):
             yield {
                 "date": row.date, "ampl_rec": event.amplitude, "star": name, "separation": separation_arcsec,
                 "amplitude": amplitude,
-                "equivalent_duration": event.equivalent_duration_s / event.amplitude * amplitude,
+                "equivalent_duration": event.fitted_s / event.amplitude * amplitude,
             }  # fmt: skip
 
     @property

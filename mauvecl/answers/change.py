@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,7 +59,11 @@ class ChangeRow(InCell):
 class IndexRow(InCell):
     """One line index of one star, with its errors in one exposure."""
 
-    value: visits.IndexValue
+    index: visits.Index
+    weights: NDArray[np.float64]  # shape (n_pixel,); the index, erg s-1 cm-2, for one DN of the exposure in each pixel
+    value: float  # of the mean exposure; NaN, as its width, if a pixel saturates
+    equivalent_width_nm: float  # positive in emission
+    captured: float  # share of a line's flux that the index holds at Mauve's resolution
     error: float
     error_known: float
     wavelength_nm: NDArray[np.float64]  # of the pixels
@@ -115,19 +119,19 @@ COLUMNS = (
     Column("note", "note", "", "what limits the row: saturated pixels or unknowns", "note", kind=str),
 )  # fmt: skip
 INDEX_COLUMNS = (
-    Column("index", "value.index.name", "", "line or lines", "index", kind=str),
-    Column("flux", "value.value", "erg / (s cm2)", "flux in the band above the continuum; absorption is negative",
+    Column("index", "index.name", "", "line or lines", "index", kind=str),
+    Column("flux", "value", "erg / (s cm2)", "flux in the band above the continuum; absorption is negative",
            "flux", number(".3g")),
     Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
            "a free unknown changes it", "error", lambda value: "free" if np.isinf(value) else number(".2g")(value)),
     Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "ideal", number(".2g")),
-    Column("snr", lambda row: row.value.value / row.error_known, "", "index over its error with everything known; "
+    Column("snr", lambda row: row.value / row.error_known, "", "index over its error with everything known; "
            "negative in absorption", "ideal S/N", number(".3g"), detail=True),
-    Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
-    Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
+    Column("equivalent_width", "equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
+    Column("captured", "captured", "", "share of a line's flux that the index holds at this resolution",
            "captured", percent(".0f"), detail=True),
-    *interval_columns("band_{}", lambda row: row.value.index.band_nm, "nm", "the band"),
-    Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
+    *interval_columns("band_{}", lambda row: row.index.band_nm, "nm", "the band"),
+    Column("published", "index.published", "", "usual definition at higher resolution, with its source",
            kind=str),
     Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
 )  # fmt: skip
@@ -219,7 +223,7 @@ class ChangeAnswer(Answer):
         lines = collect_messages(self.inputs)
         hidden = dict.fromkeys(f"{row.title}: {row.change.name}" for row in self.changes if row.hidden)
         lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
-        left = [name for name in visits.INDICES if name not in {row.value.index.name for row in self.indices}]
+        left = [name for name in visits.INDICES if name not in {row.index.name for row in self.indices}]
         if left:
             lines.append(f"The pixels do not cover the line indices {', '.join(left)}.")
         lines.append(
@@ -293,11 +297,13 @@ def _indices(case: Case) -> list[IndexRow]:
     for index in visits.INDICES.values():
         if not first <= index.continuum_nm[0][0] < index.continuum_nm[-1][1] <= last:
             continue
-        value = visits.IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
-        error, known_error = (visits.error_of_index(value.weights, quiet, nuisances) for nuisances in (unknown, None))
-        lost = visits.pixels_of(value.weights, quiet)
+        order = case.study.observation.order
+        weights, value, width, captured = visits.index_of(index, quiet, case.instrument, order)
+        error, known_error = (visits.error_of_index(weights, quiet, nuisances) for nuisances in (unknown, None))
+        lost = visits.pixels_of(weights, quiet)
         if lost[0]:
-            value = replace(value, value=np.nan, equivalent_width_nm=np.nan)
+            value = width = np.nan
         flux = visits.flux_per_dn(quiet, case.instrument) * quiet.signal_dn
-        rows.append(IndexRow(case.label, case.at, value, error, known_error, quiet.wavelength_nm, flux, lost))
+        rows.append(IndexRow(case.label, case.at, index, weights, value, width, captured, error, known_error,
+                             quiet.wavelength_nm, flux, lost))  # fmt: skip
     return rows

@@ -292,14 +292,14 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     """Plot the searched spectra, in standard deviations from their median, and mark the events."""
     analysis, spectra = answer.analysis, answer.analysis.spectra
     assert spectra is not None
-    stare, noise = analysis.survey.stare, spectra.series.noise
-    sd = np.broadcast_to(noise.used, spectra.series.excess.shape)
+    stare, noise = analysis.survey.stare, spectra.noise
+    sd = np.broadcast_to(noise.used, spectra.excess.shape)
     marks = []
     for event in analysis.events:
         first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
         ends = np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0]
         marks.append((ends, _colour(analysis, event)))
-    panel, _ = spectra_panel(stare, spectra.series.excess, sd, noise.wavelength_nm, marks)
+    panel, _ = spectra_panel(stare, spectra.excess, sd, noise.wavelength_nm, marks)
     shown = {_colour(analysis, event) for event in analysis.events}
     marked = ", ".join(f"{EVENTS[colour]}s ({INKS[colour]})" for colour in EVENTS if colour in shown)
     return Picture([[panel]], (7.2, 3.6), analysis.frames.name, (f"marked above: {marked}" if marked else "",))
@@ -310,7 +310,7 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     """Plot the measured over the stated noise of each pixel, with the range of 95 % of normal noise."""
     spectra = answer.analysis.spectra
     assert spectra is not None
-    noise = spectra.series.noise
+    noise = spectra.noise
     nm, series = noise.wavelength_nm, list[Series]()
     series.append(Area("95 % of normal noise", at=(nm, noise.low / noise.stated, noise.high / noise.stated)))
     for name, which, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):

@@ -291,7 +291,7 @@ def line_indices(answer: ChangeAnswer) -> Picture:
     for index_row in answer.indices:
         if index_row.title != title:
             continue
-        index, nm = index_row.value.index, index_row.wavelength_nm
+        index, nm = index_row.index, index_row.wavelength_nm
         near = (nm > index.continuum_nm[0][0] - AROUND_NM) & (nm < index.continuum_nm[-1][1] + AROUND_NM)
         line = Line("mean spectrum", "star", at=(nm[near], index_row.flux[near]))
         band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T

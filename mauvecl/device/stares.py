@@ -254,7 +254,7 @@ class StareLaunches(Launches):
         """Launch a kernel whose lanes are frames, and which fills the first stares of `out`."""
         each = FRAMES_EACH if variant.width > 1 else 1
         kernel = self._device.kernel(("stare", name), variant, name)
-        items, place = (tile.wanted, -(-out.shape[3] // each)), (np.uint32(out.shape[1]), np.uint32(0))
+        items, number = (tile.wanted, -(-out.shape[3] // each)), np.uint32(out.shape[1])
         common = (self._arguments[0], *self._flares, *tile.narrow(1).address(), np.uint32(each))
         with self._output("values", out) as values:
-            kernel(self._queue, items, self._local, *common, *own, *place, values)
+            kernel(self._queue, items, self._local, *common, *own, number, values)

@@ -16,7 +16,7 @@ from mauvecl.flares.shapes import shape_of
 from mauvecl.host.arrays import Float
 from mauvecl.observations.detection import LONG_S, detect_events, most_events
 from mauvecl.observations.events import ObservedEvent, measure_events
-from mauvecl.observations.frame_model import CleanedSpectra, FrameModel, clean_spectra
+from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
@@ -156,16 +156,6 @@ DARK_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class SpectralAnalysis:
-    """Results that the analysis of spectra adds to that of a light curve."""
-
-    cleaned: CleanedSpectra
-    series: SpectralSeries
-    found: list[EventSpectrum]  # spectra of the events, in their order
-    measured: list[Measurement | str]  # flares fitted to the events, or the reason why none is
-
-
-@dataclass(frozen=True, eq=False)
 class Analysis:
     """Analysis of the frames of one star."""
 
@@ -186,7 +176,11 @@ class Analysis:
     residual: Float  # shape (n_quiet, n_sum); of quiescent frames given those before them, in standard deviations
     quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals
     likeness: Likeness  # of the residuals and independent noise
-    spectra: SpectralAnalysis | None = None  # of spectra that are searched with weights for flares
+    # Of spectra that are searched with weights for flares, spectra of the events, in their order, and flares fitted to
+    # these, or the reason why none is.
+    spectra: SpectralSeries | None
+    found: list[EventSpectrum]
+    fitted: list[Measurement | str]
 
     @cached_property
     def days(self) -> float:
@@ -196,7 +190,7 @@ class Analysis:
     @cached_property
     def light_misleads(self) -> bool:
         """True if the light that all pixels share changes suddenly and the search does not leave it out."""
-        series = None if self.spectra is None else self.spectra.series
+        series = self.spectra
         return series is not None and bool(series.changes) and bool(np.isfinite(series.jitters["light"]))
 
     @cached_property
@@ -237,14 +231,14 @@ class Analysis:
     @property
     def dark_misleads(self) -> bool:
         """True if the sum over wavelength changes with the dark current, so that its level is not the star's."""
-        return self.spectra is not None and self.spectra.series.dark_drift > DARK_SHARE
+        return self.spectra is not None and self.spectra.dark_drift > DARK_SHARE
 
     @property
     def level_ratio(self) -> float:
         """Level over the light of the star: 1, unless the dark current changes it; NaN if the star is not known."""
         if self.spectra is None or not self.dark_misleads:
             return 1.0
-        return 1.0 / self.spectra.series.star_level
+        return 1.0 / self.spectra.star_level
 
     @property
     def messages(self) -> list[str]:
@@ -307,11 +301,11 @@ class Analysis:
                 f"{100 * spread:.2g} %, by {terms}."
             )
         if self.spectra is not None and self.dark_misleads:
-            series = self.spectra.series
+            series, known = self.spectra, self.spectra.cleaned.model.star_is_known
             yield (
                 f"The dark current changes the sum over wavelength by {series.dark_drift:.2g} times its level, as in a "
                 "detector whose temperature changes: peaks are not stated, and equivalent durations "
-                + ("are relative to the light of the star by the shape of its spectrum." if series.model.star_is_known
+                + ("are relative to the light of the star by the shape of its spectrum." if known
                    else "only where the star is named, whose spectrum distinguishes its light from the dark current.")
             )  # fmt: skip
 
@@ -359,23 +353,20 @@ def analyse_frames(
     """
     parts = (Steps(report).part(first, last) for first, last in pairwise(STAGES))
     level_steps, rate_steps, search_steps, event_steps, injection_steps = parts
+    series: SpectralSeries | None = None
     if model is None:
         survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
     else:
-        cleaned = clean_spectra(frames, model)
-        frames = cleaned.frames
-        survey, series, level = survey_spectra(cleaned, shape_of(shape), rank, seed, jitters, level_steps)
+        survey, series, level = survey_spectra(frames, model, shape_of(shape), rank, seed, jitters, level_steps)
+        frames = series.cleaned.frames
     rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], wanted, seed, rate_steps)
     detected, taken = detect_events(survey, candidates, search_steps)
-    seen = [] if model is None else [event_spectrum(survey, series, taken, one) for one in detected]
+    seen = [] if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     events = measure_events(survey, taken, detected, [one.cause for one in seen], event_steps)
-    spectra = None
-    if model is not None:
-        measured = [
-            measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
-            for event, one in zip(events, detected, strict=True)
-        ]
-        spectra = SpectralAnalysis(cleaned, series, seen, measured)
+    fitted: list[Measurement | str] = [] if series is None else [
+        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
+        for event, one in zip(events, detected, strict=True)
+    ]  # fmt: skip
     quiet = ~taken
     residual = innovations(survey, quiet)
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
@@ -383,7 +374,7 @@ def analyse_frames(
     return Analysis(
         frames, *frames.white_light, level, survey, wanted, *rates, threshold, candidates, dip, events,
         inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
-        binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), spectra,
+        binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), series, seen, fitted,
     )  # fmt: skip
 
 
@@ -408,9 +399,9 @@ def _thresholds(
     return rates, threshold, candidates, dip
 
 
-def _spectral_messages(spectra: SpectralAnalysis) -> Iterator[str]:
+def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
     """Yield statements about the pixels of spectra that a reader must know."""
-    cleaned, noise = spectra.cleaned, spectra.series.noise
+    cleaned, noise = spectra.cleaned, spectra.noise
     if count := int(cleaned.rays.sum()):
         yield (
             f"{count} single values in {np.count_nonzero(cleaned.rays)} frames stand out from their spectrum, as "
@@ -424,19 +415,19 @@ def _spectral_messages(spectra: SpectralAnalysis) -> Iterator[str]:
             f"The noise of {many} of {ratio.size} pixels departs from what is stated: their measured noise is used, "
             f"{ratio.min():.2f} to {ratio.max():.2f} times it."
         )
-    if changes := spectra.series.changes:
+    if changes := spectra.changes:
         largest = max(changes, key=lambda one: abs(one.change))
         times = "once" if len(changes) == 1 else f"{len(changes)} times"
         yield (
             f"The light that all pixels share changes suddenly {times}, by up to {100 * abs(largest.change):.2g} %, as "
             "by pointing losses and re-acquisitions; the table of throughput states when."
         )
-    for name, sd in spectra.series.jitters.items():
+    for name, sd in spectra.jitters.items():
         if np.isfinite(sd):
             size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
             yield f"The {CAUSES[name]} of single frames changes: {size}, which the search marginalises over."
         elif name == "light":
-            left = f"{100 * spectra.series.kept:.2g} %"
+            left = f"{100 * spectra.kept:.2g} %"
             yield (
                 "The level of each frame is free in the search, because pointing losses change it: flares keep "
                 f"{left} of their S/N; search.frame.light states its standard deviation instead (1e-6: steady)."

@@ -147,26 +147,33 @@ class PhotonTransfer:
         return float(scipy.stats.chi2.sf(self.chi2, self.dof))
 
 
-def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> Float:
-    """Measure the variance of frames from differences of consecutive ones, without drifts.
+def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
+    """Return the variance of each pixel from differences of frames, shape (n_step, n_pixel), without drifts.
 
-    The best multiples of light and dark are subtracted from each, since jitter changes all pixels together. Returned
-    are variance, light and dark of each usable pixel, and the degrees of freedom of the variance, shape (4, n_pixel).
+    Changes that all pixels share, with some spectra, are fitted to each difference in units of the `scale` of pixels.
+    """
+    basis = np.linalg.svd(shared[shared.any(axis=1)] / scale, full_matrices=False)[2]
+    white = steps / scale
+    white = white - (white @ basis.T) @ basis
+    # The fit takes its share of the noise of each pixel.
+    return np.asarray(np.mean(white**2, axis=0) / (1.0 - np.sum(basis**2, axis=0)) * scale**2 / 2)
+
+
+def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> Float:
+    """Measure the variance of frames from differences of consecutive ones, where light and dark may jitter.
+
+    Returned are variance, light and dark of each usable pixel, and the degrees of freedom of the variance, shape
+    (4, n_pixel).
     """
     # A pixel that never changes is dead.
     usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
     steps = np.diff(raw_dn[:, usable], axis=0)
     light, dark = light_dn[usable], dark_dn[usable]
-    scale = np.sqrt(np.mean(steps**2, axis=0))
-    shared = np.column_stack([part for part in (light, dark) if part.any()]) / scale[:, None]
-    basis, _ = np.linalg.qr(shared)
-    white = steps / scale
-    white = white - (white @ basis) @ basis.T
-    kept = 1.0 - np.sum(basis**2, axis=1)
+    variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, dark]))
     n = len(steps)
     # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann 1941).
     dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
-    return np.array([np.mean(white**2, axis=0) / kept * scale**2 / 2, light, dark, dof])
+    return np.array([variance, light, dark, dof])
 
 
 def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_error_dn: float = 0.0) -> PhotonTransfer:
@@ -262,8 +269,7 @@ class DarkFit:
 
     def terms(self, frames: CalibrationFrames) -> tuple[float, float]:
         """Return the seconds of dark current at the reference in a mean frame, and their change with the slope."""
-        growth = self.growth(frames.temperature_c)
-        seconds = frames.exposure_s * growth
+        seconds = frames.exposure_s * self.growth(frames.temperature_c)
         return float(seconds.mean()), float((seconds * (frames.temperature_c - self.reference_c)).mean())
 
     def mean_dn(self, frames: CalibrationFrames) -> Float:

@@ -111,7 +111,6 @@ class Fit:
     mixture: NormalMixture
     shape: Profile  # the best of the family
     flares: list[FittedFlare]  # the best, of that shape
-    epsilon: float
 
 
 def fit_event(window: Window, searched: Shape) -> list[Fit]:
@@ -387,7 +386,7 @@ def _single(
         sd = np.sqrt(along**2 / grid.information + likelihood.left + mean**2 * likelihood.level_variance) / level
         constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
         prior = float(np.log(family.prior / len(family.epsilon)))
-        fits.append(Fit(NormalMixture(grid.log + constant + prior, mean, sd), shape, [flare], epsilon))
+        fits.append(Fit(NormalMixture(grid.log + constant + prior, mean, sd), shape, [flare]))
     return fits
 
 
@@ -425,5 +424,5 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
         # As the grid of a single flare, without the factor of one amplitude.
         log = likelihood.log_of(light) + prior
         log += 0.5 * float(np.linalg.slogdet(covariance)[1]) + (3 * n - 1) / 2 * np.log(2 * np.pi)
-        fits.append(Fit(NormalMixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares, epsilon))
+        fits.append(Fit(NormalMixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares))
     return fits

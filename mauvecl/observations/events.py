@@ -31,81 +31,12 @@ NEARBY = 10_000
 FAINTER_ERRORS = 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class Energy:
-    """Equivalent duration of an event."""
+Kind = Literal["flare", "step", "dip", "throughput", "dark current", "sky", "cosmic ray"]
 
-    summed_s: float  # sum of the light above the level over the frames of the event
-    summed_error_s: float
-    fitted_s: float  # of the whole flares; median of the posterior
-    low_s: tuple[float, float]  # lower ends of the intervals of `LEVELS`
-    high_s: tuple[float, float]
-    flares: tuple[FittedFlare, ...]  # of the shape of the largest weight, the largest first
-    shape: str
-    chi2: float  # of these without departures from the shape
-    dof: int
-    departure: float  # mean of epsilon
-    # Whether the frames lack the light of the best flares of the published shapes, since the level falls in them as by
-    # an eclipse, and whether a step of the level fits better than these: the general family can resemble both.
-    dips: bool
-    step: bool
-    peak_observed: bool  # the peak lies in or next to an observed frame
-    level: float  # of the star at the peak, in units of the survey's level
-
-    @property
-    def unclear(self) -> bool:
-        """True if the frames are together fainter than the level by more than its error: they show no light of a flare.
-
-        Where the level is uncertain, as in a gap of hours of a star that rotates, the sum says nothing.
-        """
-        return self.summed_s < -FAINTER_ERRORS * self.summed_error_s
-
-    @property
-    def p_value(self) -> float:
-        """Probability of a chi-squared at least as large."""
-        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
-
-    @property
-    def poor(self) -> bool:
-        """True if no shape fits without departures: the interval also includes the disagreement of the shapes."""
-        return self.p_value < POOR
-
-
-def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: DetectedEvent) -> Energy:
-    """Measure the equivalent duration of an event; the arguments are those of `measure_event`."""
-    peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
-    level = float(flux_level[peak]) * survey.scale / survey.level
-    window = replace(Window.of(survey, taken, one), quiet_level=level if level > 0 else 1.0)
-    fits = fit_event(window, survey.bank.shape)
-    totals = np.array([fit.mixture.log_total for fit in fits])
-    best = fits[int(np.argmax(totals))]
-    plain, model = _without_departures(window, best)
-    chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
-    mixtures = [fit.mixture for fit in fits]
-    if scipy.stats.chi2.sf(chi2, dof) < POOR:
-        # What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the
-        # event (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
-        place = log_time(window.middle[window.inside], best.flares[0])
-        power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
-        mixtures = [replace(m, log_weight=m.log_weight + (power - 1) * (m.log_total - totals.max())) for m in mixtures]
-    mixture = joined(mixtures)
-    share = np.exp(np.array([one.log_total for one in mixtures]) - mixture.log_total)
-    published = [fit for fit in fits if fit.shape.name != GENERAL]
-    # Flares of other temperatures have another light for the same sum.
-    mixture = joined([NormalMixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
-                      for weight, factor in _directions(survey, taken, one)])  # fmt: skip
-    level = float(plain.level_without(model))
-    summed, error = _summed(survey, taken, flux_level, one)
-    ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
-    apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - best.flares[0].peak_s)
-    observed = bool((apart_s <= 1.5 * survey.stare.frame_s).any())
-    return Energy(
-        summed / level, error / level, mixture.quantile(0.5), (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1]),
-        tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
-              for f in best.flares), best.shape.name, chi2, dof,
-        float(share @ np.array([fit.epsilon for fit in fits])),
-        _dips(window, published, summed, error), _is_step(window, published), observed, level,
-    )  # fmt: skip
+#: Number of missing frames next to an event from which it may have begun before or gone on after them.
+GAP_FRAMES = 3
+#: Share of a flare's light outside the frames of its event from which their sum is a lower limit.
+UNSEEN = 0.05
 
 
 def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
@@ -113,8 +44,12 @@ def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
     return Likelihood.of(window, fit.flares, fit.shape, 0.0), light_of(window, fit.shape, fit.flares)
 
 
-def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:
-    """Return whether the frames of an event, with the light `summed` above the level, lack that of the best fit."""
+def _kind(window: Window, fits: Sequence[Fit], summed: float, error: float) -> Kind:
+    """Return whether an event is a flare by its fits of published shapes, since the general family resembles all kinds.
+
+    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse. The sum
+    over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
+    """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
     plain, model = _without_departures(window, best)
     level = float(plain.level_without(model))
@@ -127,7 +62,9 @@ def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> b
     mixture = joined([fit.mixture for fit in fits])
     low, high = (mixture.quantile(0.5 + sign * LEVELS[0] / 2) for sign in (-1, 1))
     lacking, uncertain = (within - summed) / level, float(np.hypot(error / level, (high - low) / 2))
-    return lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level
+    if not survey.weighted and lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level:
+        return "dip"
+    return "step" if _is_step(window, fits) else "flare"
 
 
 def _directions(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> list[tuple[float, float]]:
@@ -211,17 +148,9 @@ def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
     return whole - float(gain.max()) < least - STEP_GAIN
 
 
-Kind = Literal["flare", "step", "dip", "throughput", "dark current", "sky", "cosmic ray"]
-
-#: Number of missing frames next to an event from which it may have begun before or gone on after them.
-GAP_FRAMES = 3
-#: Share of a flare's light outside the frames of its event from which their sum is a lower limit.
-UNSEEN = 0.05
-
-
 @dataclass(frozen=True, eq=False)
 class ObservedEvent:
-    """A measured event; frames are counted among the searched ones."""
+    """A measured event; frames are counted among the searched ones, and durations are equivalent durations."""
 
     value: float  # largest statistic of the search: the S/N of the best template
     first: int
@@ -232,18 +161,36 @@ class ObservedEvent:
     missing: int  # number of frames missing inside the event
     cut: bool  # true if the event reaches the first or last frame of the light curve or of the part before a longer gap
     kind: Kind  # a flare, or what resembles one; "step" and "dip" are those of the level
-    energy: Energy
     gap_at_peak: bool  # true if frames are missing next to the brightest, for as long as the half-width of the fit
-
-    @property
-    def equivalent_duration_s(self) -> float:
-        """Recommended equivalent duration."""
-        return self.energy.fitted_s
+    summed_s: float  # sum of the light above the level over the frames of the event
+    summed_error_s: float
+    fitted_s: float  # of the whole flares, the recommended one; median of the posterior
+    low_s: tuple[float, float]  # lower ends of the intervals of `LEVELS`
+    high_s: tuple[float, float]
+    flares: tuple[FittedFlare, ...]  # of the shape of the largest weight, the largest first
+    shape: str
+    chi2: float  # of these without departures from the shape
+    dof: int
+    peak_observed: bool  # the peak lies in or next to an observed frame
+    level: float  # of the star at the peak, in units of the survey's level
 
     @property
     def is_limit(self) -> bool:
         """True if the sum of the light in the frames is a lower limit: a gap or an end cuts the flare."""
-        return self.cut and self.energy.summed_s < (1 - UNSEEN) * self.energy.fitted_s
+        return self.cut and self.summed_s < (1 - UNSEEN) * self.fitted_s
+
+    @property
+    def unclear(self) -> bool:
+        """True if the frames are together fainter than the level by more than its error: they show no light of a flare.
+
+        Where the level is uncertain, as in a gap of hours of a star that rotates, the sum says nothing.
+        """
+        return self.summed_s < -FAINTER_ERRORS * self.summed_error_s
+
+    @property
+    def poor(self) -> bool:
+        """True if no shape fits without departures: the interval also includes the disagreement of the shapes."""
+        return bool(scipy.stats.chi2.sf(self.chi2, self.dof) < POOR)
 
 
 def measure_events(
@@ -271,26 +218,56 @@ def measure_event(
     survey: SeriesSurvey, taken: Bool, level: Float, found: DetectedEvent, cause: Kind = "flare"
 ) -> ObservedEvent:
     """Measure an event, given its cause, the frames of all events, `taken`, and the level in units of the scale."""
-    first, last = found.first, found.last
-    rows = slice(first, last + 1)
-    energy = measure_energy(survey, taken, level, found)
-    flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
+    first, last, frame_s = found.first, found.last, survey.stare.frame_s
+    rows, numbers, middle = slice(first, last + 1), survey.stare.numbers, survey.stare.middle_s
+    peak = int(np.clip(np.searchsorted(middle, found.peak_s), 0, survey.stare.n_frames - 1))
+    at_peak = float(level[peak]) * survey.scale / survey.level
+    window = replace(Window.of(survey, taken, found), quiet_level=at_peak if at_peak > 0 else 1.0)
+    fits = fit_event(window, survey.bank.shape)
+    best = max(fits, key=lambda fit: fit.mixture.log_total)
+    plain, model = _without_departures(window, best)
+    chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
+    of_star = float(plain.level_without(model))
+    mixture = _posterior(window, taken, fits, scipy.stats.chi2.sf(chi2, dof) < POOR)
+    fitted_s = mixture.quantile(0.5)
+    low, high = ([mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1))
+    flares = [replace(f, amplitude=f.amplitude / of_star, equivalent_duration_s=f.equivalent_duration_s / of_star)
+              for f in best.flares]  # fmt: skip
+    summed, error = _summed(survey, taken, level, found)
+    kind = cause
+    if cause == "flare":
+        kind = _kind(window, [fit for fit in fits if fit.shape.name != GENERAL], summed, error)
+    flux = (survey.flux[rows] - level[rows]) * survey.scale
     # In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not near its peak.
-    near = np.abs(survey.stare.middle_s[rows] - found.peak_s) <= found.half_width_s + survey.stare.frame_s
+    near = np.abs(middle[rows] - found.peak_s) <= found.half_width_s + frame_s
     several = flux if not (survey.weighted and near.any()) else np.where(near, flux, -np.inf)
     brightest = first + int(np.argmax(several))
     around = numbers[max(brightest - 1, 0) : brightest + 2]
-    missing_s = (int(np.diff(around).max()) - 1) * survey.stare.frame_s
+    missing_s = (int(np.diff(around).max()) - 1) * frame_s
     ends = (first == 0, last == survey.stare.n_frames - 1)
     cut = any(ends) or bool((np.diff(numbers[[first - 1, first, last, last + 1]])[::2] > GAP_FRAMES).any())
-    kind = cause
-    if cause == "flare":
-        # The sum over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
-        kind = "dip" if energy.dips and not survey.weighted else "step" if energy.step else cause
     # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.
     gc.collect(1)
     return ObservedEvent(
-        found.value, first, last, brightest, found.half_width_s,
-        float(flux.max()) / survey.level / energy.level, int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,
-        energy, missing_s >= min(found.half_width_s, energy.flares[0].half_width_s),
+        found.value, first, last, brightest, found.half_width_s, float(flux.max()) / survey.level / of_star,
+        int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,
+        missing_s >= min(found.half_width_s, flares[0].half_width_s), summed / of_star, error / of_star,
+        fitted_s, (low[0], low[1]), (high[0], high[1]), tuple(flares), best.shape.name, chi2, dof,
+        bool((np.abs(middle[rows] - flares[0].peak_s) <= 1.5 * frame_s).any()), of_star,
     )  # fmt: skip
+
+
+def _posterior(window: Window, taken: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixture:
+    """Return the posterior of an event's equivalent duration."""
+    mixtures = [fit.mixture for fit in fits]
+    totals = np.array([each.log_total for each in mixtures])
+    if poor:
+        # What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the
+        # event (a power likelihood as of Miller & Dunson 2019, doi 10.1080/01621459.2018.1469995).
+        place = log_time(window.middle[window.inside], fits[int(np.argmax(totals))].flares[0])
+        power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
+        mixtures = [replace(m, log_weight=m.log_weight + (power - 1) * (m.log_total - totals.max())) for m in mixtures]
+    mixture = joined(mixtures)
+    # Flares of other temperatures have another light for the same sum.
+    return joined([NormalMixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
+                   for weight, factor in _directions(window.survey, taken, window.one)])  # fmt: skip

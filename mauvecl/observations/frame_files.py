@@ -92,7 +92,7 @@ def read_frames(
             how = file.mapping(raw=True)
         if quality_bits is not None:
             how = how.model_copy(update={"quality_bits": quality_bits})
-        return _frames_in(file, Quantities.of(file, how), how, stem)
+        return _frames_in(file, _quantities(file, how), how, stem)
 
 
 def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any = None) -> Frames:
@@ -128,7 +128,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         mapping = FrameMapping(**dict(zip(columns, columns, strict=True)))
     file = MemoryTable(container, type(container).__name__)
     mapping = mapping or recognised(file)
-    return _frames_in(file, Quantities.of(file, mapping), mapping, str(container.meta.get("LABEL", "frames")))
+    return _frames_in(file, _quantities(file, mapping), mapping, str(container.meta.get("LABEL", "frames")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +154,11 @@ def reduce_frames(
     mapping : FrameMapping or path, optional
     """
     with _frame_file(path, mapping) as (file, how, stem):
-        found = Quantities.of(file, how)
+        found = _quantities(file, how)
         _, flux, error, _ = _light(found, how)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
-        quality = _masked(found.quality, QualityBits.of(file.header, how.quality_bits, file.what))
+        quality = _masked(found.get("quality"), QualityBits.of(file.header, how.quality_bits, file.what))
         lights, pixels = weighted_sums(flux, error, quality, weights)
         return ReducedFrames(tuple(_frames_in(file, found, how, stem, light) for light in lights), pixels)
 
@@ -216,65 +216,54 @@ def _opened(
     return open_table(path, what, check=check, large=large, of_fits=of_fits, of_hdf5=partial(open_stored, name=name))
 
 
-@dataclass(frozen=True, eq=False)
-class Quantities:
-    """Columns, arrays and values of a file that a mapping names."""
+#: Columns, arrays and values of a file by the quantities of its mapping; two times of a frame are "time" and "end".
+Quantities = dict[str, Values]
 
-    time: tuple[Values, ...]
-    flux: Values
-    error: Values | None
-    quality: Values | None
-    exposure: Values | None
-    temperature: Values | None
-    wavelength: Values | None
 
-    @classmethod
-    def of(cls, file: TableFile, mapping: FrameMapping) -> Quantities:
-        """Find the quantities of a mapping, and check their rows before any is read."""
-        times = tuple(file.axis(mapping.flux, 2) if name == "wcs" else file.find(name) for name in mapping.times)
-        names = {name: getattr(mapping, name) for name in ("flux", "error", "quality", "exposure", "temperature")}
-        found: dict[str, Any] = {key: None if name is None else file.find(name) for key, name in names.items()}
-        one = cls(times, **found, wavelength=_wavelength(file, mapping))
-        nm, flux, limit = one.wavelength, one.flux, "MAUVECL_LARGEST_CONTENT_MIB"
-        if nm is not None and nm.shape == flux.shape == times[0].shape and not isinstance(file, FolderFile):
-            if 32 * flux.n_rows > (most := limit_bytes(limit)):
-                fault = f"{file.what} must have at most {most // 32} rows of pixels, but has {flux.n_rows}"
+def _quantities(file: TableFile, mapping: FrameMapping) -> Quantities:
+    """Find the quantities of a mapping, and check their rows before any is read."""
+    found = {key: file.axis(mapping.flux, 2) if name == "wcs" else file.find(name)
+             for key, name in zip(("time", "end"), mapping.times, strict=False)}  # fmt: skip
+    names = {key: getattr(mapping, key) for key in ("flux", "error", "quality", "exposure", "temperature")}
+    found |= {key: file.find(name) for key, name in names.items() if name is not None}
+    if (nm := _wavelength(file, mapping)) is not None:
+        found["wavelength"], rows = nm, found["flux"].n_rows
+        if nm.shape == found["flux"].shape == found["time"].shape and not isinstance(file, FolderFile):
+            limit = "MAUVECL_LARGEST_CONTENT_MIB"
+            if 32 * rows > (most := limit_bytes(limit)):
+                fault = f"{file.what} must have at most {most // 32} rows of pixels, but has {rows}"
                 raise InputError(f"{fault}; {limit} sets the limit", key=limit)
-            one = replace(one, quality=_flags(one.quality))._of_frames(nm, file.what)
-        _check_rows(file, one)
-        # Those of pixels are left as they are.
-        return replace(one, quality=_flags(one.quality))
+            found = _of_frames(_with_flags(found), file.what)
+    _check_rows(file, found)
+    return _with_flags(found)
 
-    def _of_frames(self, wavelength: Values, what: str) -> Quantities:
-        """Return the quantities of a long table with a row for each frame; errors and flags for each pixel."""
-        frames, frame = np.unique(_keys(self.time[0]), return_inverse=True)
-        pixels, pixel = np.unique(wavelength.numbers(), return_inverse=True)
-        number = frame * pixels.size + pixel
-        counts = np.bincount(number, minlength=frames.size * pixels.size).reshape(frames.size, pixels.size)
-        if (counts != 1).any():
-            row, column = np.argwhere(counts != 1)[0]
-            raise InputError(
-                f"{what}: the frame at {frames[row]} must have one row of wavelength {pixels[column]:g}, "
-                f"not {counts[row, column]}",
-                key="wavelength",
-            )
-        place = np.argsort(number).reshape(counts.shape)
 
-        def spectra(values: Any) -> Any:
-            return values and Values.of(values.name, values.numbers()[place], values.unit, what)
-
-        def single(values: Any) -> Any:
-            if values is None:
-                return None
+def _of_frames(found: Quantities, what: str) -> Quantities:
+    """Return the quantities of a long table with a row for each frame; errors and flags for each pixel."""
+    frames, frame = np.unique(_keys(found["time"]), return_inverse=True)
+    pixels, pixel = np.unique(found["wavelength"].numbers(), return_inverse=True)
+    number = frame * pixels.size + pixel
+    counts = np.bincount(number, minlength=frames.size * pixels.size).reshape(frames.size, pixels.size)
+    if (counts != 1).any():
+        row, column = np.argwhere(counts != 1)[0]
+        raise InputError(
+            f"{what}: the frame at {frames[row]} must have one row of wavelength {pixels[column]:g}, "
+            f"not {counts[row, column]}",
+            key="wavelength",
+        )
+    place, made = np.argsort(number).reshape(counts.shape), {}
+    for key, values in found.items():
+        if key in ("flux", "error", "quality"):
+            rows = values.numbers()[place]
+        elif key == "wavelength":
+            rows = pixels
+        else:
             rows = _keys(values)[place]
             if (rows != rows[:, :1]).any():
                 raise InputError(f"{what}: {values.name!r} must not change within a frame", key=values.name)
-            return Values.of(values.name, rows[:, 0], values.unit, what)
-
-        flux, error, quality = map(spectra, (self.flux, self.error, self.quality))
-        exposure, temperature = map(single, (self.exposure, self.temperature))
-        nm = Values.of(wavelength.name, pixels, wavelength.unit, what)
-        return Quantities(tuple(map(single, self.time)), flux, error, quality, exposure, temperature, nm)
+            rows = rows[:, 0]
+        made[key] = Values.of(values.name, rows, values.unit, what)
+    return made
 
 
 def _keys(values: Values) -> NDArray[Any]:
@@ -283,21 +272,25 @@ def _keys(values: Values) -> NDArray[Any]:
     return np.asarray(values.numbers() if texts is None or not any(map(is_dated, texts)) else texts)
 
 
-def _flags(quality: Values | None) -> Values | None:
-    """Return the flags of frames as numbers, also those of words and those that lightkurve 2 writes into CSV."""
+def _with_flags(found: Quantities) -> Quantities:
+    """Return flags of frames as numbers, also those of words and those that lightkurve 2 writes into CSV."""
+    quality = found.get("quality")
+    # Those of pixels are left as they are.
     if quality is None or len(quality.shape) != 1:
-        return quality
+        return found
     texts = [text.lower() for text in quality.texts() or ()]
     # G and B are those of ASAS-SN.
     words = {"true": 1, "false": 0, "bad": 1, "good": 0, "b": 1, "g": 0}
     if texts and {*texts} <= {*words}:
-        return Values.of(quality.name, np.array([words[text] for text in texts]), what=quality.what)
-    values, place = np.unique(quality.numbers(), return_inverse=True)
-    digits = {value: f"{value:.0f}" for value in values[np.isfinite(values)].tolist()}
-    if max(digits, default=0.0) >= 2**32 and {*"".join(digits.values())} <= {"0", "1"}:
-        # Those of lightkurve are the digits of binary numbers.
-        values = np.array([float(int(digits[one], 2)) if one in digits else one for one in values.tolist()])
-    return Values.of(quality.name, values[place], what=quality.what)
+        flags = np.array([words[text] for text in texts])
+    else:
+        values, place = np.unique(quality.numbers(), return_inverse=True)
+        digits = {value: f"{value:.0f}" for value in values[np.isfinite(values)].tolist()}
+        if max(digits, default=0.0) >= 2**32 and {*"".join(digits.values())} <= {"0", "1"}:
+            # Those of lightkurve are the digits of binary numbers.
+            values = np.array([float(int(digits[one], 2)) if one in digits else one for one in values.tolist()])
+        flags = values[place]
+    return found | {"quality": Values.of(quality.name, flags, what=quality.what)}
 
 
 def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
@@ -320,12 +313,12 @@ def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
 
 def _check_rows(file: TableFile, found: Quantities) -> None:
     """Raise InputError unless all columns have one row, or spectrum, for each frame, before any is read."""
-    what, n = file.what, found.time[0].n_rows
+    what, n, flux = file.what, found["time"].n_rows, found["flux"]
     if not 0 < n <= MAX_FRAMES:
         expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
         raise InputError(f"{what} must have {expected}", key="frames")
     # A light curve is that of one star in one band.
-    groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS and found.wavelength is None]
+    groups = [file.find(name) for name in file.columns if key_of(name) in GROUPS and "wavelength" not in found]
     for group in (one for one in groups if len(one.shape) == 1):
         name, texts = group.name, group.texts()
         cells = map(str, np.unique(group.numbers())) if texts is None else texts
@@ -334,18 +327,19 @@ def _check_rows(file: TableFile, found: Quantities) -> None:
         if len(held) > 1 and (key_of(name) != "f" or all(map(str.isalpha, held))):
             fault = f"{what} must hold the light of one star in one band, but has rows of {len(held)} different"
             raise InputError(f"{fault} {name!r} ({shortened(', '.join(held), 80)}); divide the table", key="flux")
-    for values in (*found.time, found.flux, found.error, found.quality, found.exposure, found.temperature):
-        if values is not None and values.n_rows != n:
+    for key, values in found.items():
+        if key != "wavelength" and values.n_rows != n:
             fault = f"{what}: {values.name!r} must have {n} rows, as the times do, but has {values.n_rows}"
             raise InputError(fault, key=values.name)
-    single = found.time if found.wavelength is not None else (*found.time, found.flux)
-    if odd := next((one for one in single if len(one.shape) == 2 and one.shape[1] > 1), None):
+    single = ("time", "end") if "wavelength" in found else ("time", "end", "flux")
+    each = (one for key, one in found.items() if key in single)
+    if odd := next((one for one in each if len(one.shape) == 2 and one.shape[1] > 1), None):
         fault = f"{what}: {odd.name!r} holds {odd.shape[1]} values in each row"
         raise InputError(f"{fault}; give one, or name wavelengths in a mapping", key=odd.name)
-    if len(found.flux.shape) > 2:
-        pixels = " x ".join(map(str, found.flux.shape[1:]))
+    if len(flux.shape) > 2:
+        pixels = " x ".join(map(str, flux.shape[1:]))
         raise InputError(
-            f"{what}: {found.flux.name!r} holds images of {pixels} pixels, as target pixel files do; "
+            f"{what}: {flux.name!r} holds images of {pixels} pixels, as target pixel files do; "
             "give a light curve, such as lightkurve's `to_lightcurve` makes",
             key="flux",
         )
@@ -353,19 +347,19 @@ def _check_rows(file: TableFile, found: Quantities) -> None:
 
 def _conditions(file: TableFile, found: Quantities, mapping: FrameMapping, exposure: Float | None) -> dict[str, Any]:
     """Return exposure times, by default between edges, and temperatures, by columns, the mapping or the header."""
-    n, nominal = found.time[0].n_rows, file.header.get("CCD-TEMP")
+    n, nominal = found["time"].n_rows, file.header.get("CCD-TEMP")
     temperature = np.full(n, float(nominal)) if isinstance(nominal, int | float) else None
     try:
         # The header of BRITE's light curves has milliseconds for each image of a stack.
         stated = 1e-3 * float(file.header["ObsExpoT"]) * float(file.header.get("ObsStack", 1.0))
     except (KeyError, ValueError):
         stated = 0.0
-    if found.exposure is not None:
-        exposure = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+    if "exposure" in found:
+        exposure = converted(found["exposure"], mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
     elif 0.0 < (one := mapping.exposure_s or stated) < np.inf:
         exposure = np.full(n, one)
-    if found.temperature is not None:
-        celsius = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit")
+    if "temperature" in found:
+        celsius = converted(found["temperature"], mapping.temperature_unit, "deg_C", "temperature_unit")
         temperature = celsius.numbers().reshape(n)
     return {"exposure_s": exposure, "temperature_c": temperature}
 
@@ -393,10 +387,11 @@ def _frames_in(
 ) -> Frames:
     """Build frames from a file and its quantities; with `reduced` light, which is not read again."""
     what, header = file.what, file.header
-    time, between_edges_s, dates, remarks = times_of(found.time, file, mapping)
+    edges = tuple(found[key] for key in ("time", "end") if key in found)
+    time, between_edges_s, dates, remarks = times_of(edges, file, mapping)
     each = _conditions(file, found, mapping, between_edges_s)
     bits = QualityBits.of(header, mapping.quality_bits, what)
-    wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
+    wavelength = None if "wavelength" not in found else _vacuum_nm(found["wavelength"], mapping.wavelength_unit, file)
     light, sd, flags, unit, more = _read_light(file, found, mapping, bits, reduced)
     kept = np.isfinite(time)
     if not kept.any():
@@ -435,14 +430,14 @@ def _read_light(
 ) -> tuple[Float, Float | None, Float | None, str, tuple[str, ...]]:
     """Return light, errors, flags, the unit of the light, and remarks."""
     unit, flux, error, remarks = _light(found, mapping)
-    light, sd, flags, more = reduced or whole_or_reduced(flux, error, _masked(found.quality, bits))
-    if found.wavelength is None:
+    light, sd, flags, more = reduced or whole_or_reduced(flux, error, _masked(found.get("quality"), bits))
+    if "wavelength" not in found:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     light, sd = without_indefinite(light), None if sd is None else without_indefinite(sd)
     marks, said = marks_in(light, "values")
     light = np.where(np.isin(light, marks), np.nan, light) if marks else light
     unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
-    if found.quality is None and unused:
+    if "quality" not in found and unused:
         said = [*said, f"no flags are used; a mapping with quality names one of {', '.join(unused)}"]
     if len(light.shape) == 1:
         light, sd, unit, on_level = _of_level(light, sd, unit)
@@ -452,8 +447,8 @@ def _read_light(
         # lightkurve writes a column of NaN for errors that it does not know.
         sd = None
         remarks += (f"{file.what} has a column of errors without a number: it is left out",)
-    if found.quality is not None and len(found.quality.shape) == 1:
-        flags = found.quality.numbers()
+    if "quality" in found and len(found["quality"].shape) == 1:
+        flags = found["quality"].numbers()
     return light, sd, flags, unit, remarks
 
 
@@ -466,7 +461,7 @@ def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
 
 def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
     """Return the unit of the light, light and errors in it, and remarks."""
-    flux, error = found.flux, found.error
+    flux, error = found["flux"], found.get("error")
     remarks: tuple[str, ...] = ()
     stated = flux.unit or unit_in_name(flux.name)
     unit = mapping.flux_unit or stated

@@ -97,11 +97,6 @@ class FrameModel:
         """Rise of the variance with the light, shape (n_value,)."""
         return np.asarray(self.bins @ self.quiet.gain_dn_per_electron / self.bins.sum(axis=1) * self.per_dn)
 
-    @cached_property
-    def ceiling(self) -> float:
-        """Value at which a pixel saturates; infinite for sums of pixels."""
-        return self.quiet.n_frames * self.quiet.ceiling_dn if self.raw else np.inf
-
     def flares(self, temperatures_k: tuple[float, ...]) -> Float:
         """Return the light of flares of unit amplitude, shape (n_temperature, n_value)."""
         return np.asarray(self.flare.hot_spline(np.log(temperatures_k)) @ self.bins.T * self.per_dn)
@@ -274,7 +269,9 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     model = replace(model, bins=model.bins[fine], per_dn=model.per_dn[fine])
     assert frames.wavelength_nm is not None
     flux = frames.flux[:, fine]
-    saturated = usable & (flux >= model.ceiling).any(axis=1)
+    # Sums of pixels do not saturate.
+    ceiling = model.quiet.n_frames * model.quiet.ceiling_dn if model.raw else np.inf
+    saturated = usable & (flux >= ceiling).any(axis=1)
     flux = flux - model.offset
     good = usable & ~saturated
     if not good.any():

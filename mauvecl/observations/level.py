@@ -20,8 +20,6 @@ PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
 FAR = 5.0
 #: Largest distance of the neighbours of a single bright frame.
 NEAR = 3.0
-#: Number of frames whose median is the level around a single bright frame.
-AROUND = 9
 #: Rise in robust standard deviations from which a first guess of the flares begins, and the frames that it takes.
 JUMP, JUMP_FRAMES = 8.0, (1, 2, 3)
 #: A guessed flare ends at this share of its rise, or within this number of standard deviations of the level before it.
@@ -211,16 +209,6 @@ def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool
     low = (np.abs(sigmas[before]) < NEAR) & (np.abs(sigmas[after]) < NEAR)
     single[here] = adjacent & low & (sigmas[here] > FAR)
     return single
-
-
-def spikes(numbers: NDArray[np.int64], flux: Float, error: Float | None, fine: Bool) -> Bool:
-    """Return single frames, of those that are `fine`, far above the frames around them, without a known level."""
-    at, sigmas = np.flatnonzero(fine), np.zeros(flux.size)
-    around = scipy.ndimage.median_filter(flux[at], size=AROUND, mode="nearest")
-    scatter = noise_of_steps(numbers[at], flux[at])
-    sd = np.full(at.size, scatter) if error is None else np.maximum(error[at], scatter)
-    sigmas[at] = np.divide(flux[at] - around, sd, out=np.zeros(at.size), where=sd > 0)
-    return single_frames(numbers, sigmas, fine)
 
 
 #: Numbers of frames per bin at which the scatter is measured.

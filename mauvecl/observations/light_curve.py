@@ -26,7 +26,6 @@ from mauvecl.observations.level import (
     quiet_variance,
     relative_level,
     single_frames,
-    spikes,
 )
 from mauvecl.observations.process import UNREPORTED, Binned, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import SeriesSurvey, bank_of
@@ -216,6 +215,8 @@ def _bright(survey: SeriesSurvey) -> Bool:
 
 #: Smallest step from frame to frame as a share of the light; numbers of single precision are rounded by 1e-7.
 LEAST_NOISE = 1e-10
+#: Number of frames whose median is the level around a single bright frame.
+SPIKE_FRAMES = 9
 #: Smallest number of frames without a fault.
 MIN_USABLE = 10
 #: Largest number of times that single frames are left out and the rest is fitted again.
@@ -280,7 +281,13 @@ def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], 
     reasons, level = frames.faults.copy(), np.ones(flux.size)
     check_usable(frames, reasons)
     if counts is None:
-        reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
+        # Single frames far above the frames around them, as the level is not known yet.
+        fine, sigmas = reasons == 0, np.zeros(flux.size)
+        scatter = noise_of_steps(frames.numbers[fine], flux[fine])
+        sd = np.full(int(fine.sum()), scatter) if error is None else np.maximum(error[fine], scatter)
+        above = flux[fine] - median_filter(flux[fine], size=SPIKE_FRAMES, mode="nearest")
+        sigmas[fine] = np.divide(above, sd, out=np.zeros(sd.size), where=sd > 0)
+        reasons[single_frames(frames.numbers, sigmas, fine)] |= Reason.SPIKE
         if np.ptp(frames.time_s) > detection.LONG_S:
             at = np.flatnonzero(reasons == 0)
             relative = relative_level(frames.time_s[at], frames.numbers[at], flux[at], frames.cadence_s)

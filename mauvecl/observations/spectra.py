@@ -19,15 +19,17 @@ from mauvecl.fits.spectrum import Measurement, fit
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.observations.detection import fit_quiet_light
+from mauvecl.observations.detector import variance_of_steps
 from mauvecl.observations.frame_model import (
     CLEARLY,
     CleanedSpectra,
     FrameModel,
     LightChange,
     chi2_of_one,
+    clean_spectra,
     light_changes,
 )
-from mauvecl.observations.frames import Reason
+from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_curve import check_usable, quiescent_light
 from mauvecl.observations.process import UNREPORTED, Steps
@@ -83,7 +85,7 @@ class SpectralSeries:
     excess: Float  # shape (n_frame, n_pixel); spectra less that of the quiescent star
     light: Float  # shape (n_pixel,); spectrum of the quiescent star
     noise: PixelNoise
-    model: FrameModel
+    cleaned: CleanedSpectra
     jitters: Mapping[str, float]  # standard deviations of unknowns of frames; infinite if they are projected out
     changes: list[LightChange]  # sudden changes of the light that all pixels share
     kept: float  # S/N of flares over that with a steady level of the frames
@@ -95,10 +97,11 @@ class SpectralSeries:
 
         It excludes dark current and sky that the light includes; NaN if the star is not known.
         """
-        if not self.model.star_is_known:
+        model = self.cleaned.model
+        if not model.star_is_known:
             return float("nan")
-        star = self.model.star
-        others = [spectrum for name, spectrum in self.model.unknowns(self.light).items() if name != "light"]
+        star = model.star
+        others = [spectrum for name, spectrum in model.unknowns(self.light).items() if name != "light"]
         columns = np.array([star, *others]).T / self.noise.used[:, None]
         amplitude = np.linalg.lstsq(columns, self.light / self.noise.used, rcond=None)[0][0]
         return float(amplitude * star.sum() / abs(self.light.sum()))
@@ -110,25 +113,17 @@ def relative_error(differences: int) -> float:
 
 
 def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared: Float, nm: Float) -> PixelNoise:
-    """Measure the noise of each pixel from differences of the quiescent frames of `pairs` and their successors.
-
-    Changes that all pixels share, with the spectra `shared`, are fitted to each difference.
-    """
-    basis = np.linalg.svd(shared / stated, full_matrices=False)[2]
-    total = np.zeros(stated.size)
-    for first in range(0, pairs.size, BLOCK):
-        some = pairs[first : first + BLOCK]
-        steps = (excess[some + 1] - excess[some]) / stated
-        total += ((steps - steps @ basis.T @ basis) ** 2).sum(axis=0)
-    # The fit takes its share of the noise of each pixel.
-    left = 1.0 - (basis**2).sum(axis=0)
-    measured = stated * np.sqrt(total / (2.0 * pairs.size * left))
+    """Measure the noise of each pixel from differences of the quiescent frames of `pairs` and their successors."""
+    blocks = [pairs[first : first + BLOCK] for first in range(0, pairs.size, BLOCK)]
+    variances = [variance_of_steps(excess[some + 1] - excess[some], stated, shared) for some in blocks]
+    measured = np.sqrt(np.average(variances, axis=0, weights=[some.size for some in blocks]))
     reach = float(scipy.stats.norm.isf(0.025)) * relative_error(pairs.size)
     return PixelNoise(nm, stated, measured, stated * (1 - reach), stated * (1 + reach), int(pairs.size))
 
 
 def survey_spectra(
-    cleaned: CleanedSpectra,
+    frames: Frames,
+    model: FrameModel,
     shape: Shape,
     rank: int,
     seed: int,
@@ -140,7 +135,7 @@ def survey_spectra(
     Slow changes of what the weights let through are processes of the weighted sums. The level that is returned is that
     of the sum over wavelength, with flags of single frames that only the weighted sums show.
     """
-    fits = steps.part(0.0, 0.9)
+    fits, cleaned = steps.part(0.0, 0.9), clean_spectra(frames, model)
     frames = cleaned.frames
     flux, error = frames.white_light
     assert error is not None
@@ -153,7 +148,7 @@ def survey_spectra(
         series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
         lit, level = np.maximum(series.light, 0.0), float(np.median(flux[used & ~events]))
         # Frames without light, such as dark frames, have no photon noise to weight by.
-        photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
+        photon = float(np.average(cleaned.model.gain, weights=lit if lit.any() else None))
         # The noise of the sums follows that of the whole light in time.
         survey = SeriesSurvey.of(frames, flux, error**2, used, level, photon, shape, weighted=(templates, sums))
         survey, taken = fit_quiet_light(survey, events[used], None, fits)
@@ -213,7 +208,7 @@ def _weighted_sums(
     mixing = _independent(sums, pairs, quiet)
     templates, sums = templates.mixed(mixing), sums @ mixing.T
     drift *= abs(float(unknown["dark"].sum() / light.sum()))
-    return SpectralSeries(excess, light, noise, model, known, changes, kept, drift), templates, sums
+    return SpectralSeries(excess, light, noise, cleaned, known, changes, kept, drift), templates, sums
 
 
 def _independent(sums: Float, pairs: NDArray[np.intp], quiet: Bool) -> Float:
@@ -337,10 +332,20 @@ class EventSpectrum:
 
 
 def event_spectrum(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one: DetectedEvent) -> EventSpectrum:
-    """Compare the spectrum of an event with those of flares and of changes that resemble them."""
-    spectrum, variance = _weighted(survey, series, taken, one)
-    flares = series.model.flares(TEMPERATURES_K)
-    unknown = series.model.unknowns(series.light)
+    """Compare the spectrum of an event with those of flares and of changes that resemble them.
+
+    Its spectrum is that of the template of the search, which is fitted to each pixel with a straight line.
+    """
+    model, at = series.cleaned.model, _window(survey, taken, one)[0]
+    start = survey.stare.start_s[at]
+    edges = np.column_stack([start, start + survey.stare.frame_s])
+    shape = survey.bank.shape.mean_over(edges, one.peak_s, one.half_width_s)
+    middle = (start - start.mean()) / max(float(np.ptp(start)), 1.0)
+    weights = np.linalg.pinv(np.column_stack([shape, np.ones(at.size), middle]))[0]
+    spectrum = np.asarray(weights @ series.excess[at])
+    photons = model.gain * np.maximum(spectrum, 0.0) * float((weights**2) @ np.maximum(shape, 0.0))
+    variance = (weights**2).sum() * series.noise.used**2 + photons
+    flares, unknown = model.flares(TEMPERATURES_K), model.unknowns(series.light)
     causes: dict[Cause, Float] = {"flare": flares}
     causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
     fits = {cause: chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
@@ -377,23 +382,6 @@ def _window(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> tuple[NDAr
     return at, inside[at]
 
 
-def _weighted(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one: DetectedEvent) -> tuple[Float, Float]:
-    """Return the spectrum of an event, of the size of its peak, and its variance.
-
-    The template of the search is fitted to each pixel, with a straight line.
-    """
-    at, _ = _window(survey, taken, one)
-    start = survey.stare.start_s[at]
-    edges = np.column_stack([start, start + survey.stare.frame_s])
-    shape = survey.bank.shape.mean_over(edges, one.peak_s, one.half_width_s)
-    middle = (start - start.mean()) / max(float(np.ptp(start)), 1.0)
-    weights = np.linalg.pinv(np.column_stack([shape, np.ones(at.size), middle]))[0]
-    spectrum = weights @ series.excess[at]
-    quiet = (weights**2).sum() * series.noise.used**2
-    photons = series.model.gain * np.maximum(spectrum, 0.0) * float((weights**2) @ np.maximum(shape, 0.0))
-    return np.asarray(spectrum), np.asarray(quiet + photons)
-
-
 def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, n_frames: int) -> dict[str, float]:
     """Return the standard deviations by which star, dark current and sky differ in an event from its surroundings.
 
@@ -401,7 +389,7 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, n_frames: 
     of noise, and what noise may hide. With fewer than `MIN_PARTS` means, shorter ones are taken, and changes are
     assumed to grow in proportion to time. The sky has its documented prior.
     """
-    unknown = series.model.unknowns(series.light)
+    unknown = series.cleaned.model.unknowns(series.light)
     names = ("light", "dark")
     spectra = np.array([unknown[name] for name in names])
     amplitudes, covariance = fit_changes(series.excess, spectra, series.noise.used)
@@ -438,7 +426,7 @@ def measure_flare(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one
         return f"{base} frames around it show the quiescent star, {MIN_BASELINE} are needed"
     excess = series.excess[at]
     summed = excess[inside].sum(axis=0) - n * excess[~inside].mean(axis=0)
-    model = series.model
+    model = series.cleaned.model
     # The level is that of a finite number of frames.
     variance = series.noise.used**2 * (1 + n / base)
     exposure = model.exposure(series.light, variance, n)

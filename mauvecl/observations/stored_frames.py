@@ -305,11 +305,9 @@ def _piece(flux: Values, quality: Values | None, part: slice) -> Float:
 
 
 def _flags(quality: Values | None) -> Float | None:
-    """Return one flag for each frame; of flags for each pixel those of frames in which every pixel has one."""
-    if quality is None:
+    """Return one flag for each frame in which every pixel has one; None without flags of pixels."""
+    if quality is None or len(quality.shape) == 1:
         return None
-    if len(quality.shape) == 1:
-        return quality.numbers()
     rows = (quality.rows(part.start, part.stop) for part in quality.pieces)
     return np.concatenate([np.where((one != 0).all(axis=1), np.abs(one).max(axis=1), 0.0) for one in rows])
 

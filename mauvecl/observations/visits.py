@@ -463,32 +463,26 @@ def flux_per_dn(quiet: Expectation, instrument: Instrument) -> Float:
     return np.divide(10.0, per_flam, out=np.zeros_like(per_flam), where=per_flam > 0)
 
 
-@dataclass(frozen=True, eq=False)
-class IndexValue:
-    """A line index of a star in one exposure."""
+def index_of(
+    index: Index, quiet: Expectation, instrument: Instrument, order: Order
+) -> tuple[Float, float, float, float]:
+    """Return weights of the pixels, value, equivalent width and captured share of a line index; see `IndexRow`.
 
-    index: Index
-    weights: Float  # shape (n_pixel,); the index, erg s-1 cm-2, for one DN of the exposure in each pixel
-    value: float  # of the mean exposure
-    equivalent_width_nm: float  # positive in emission
-    captured: float  # share of a line's flux that the index holds at Mauve's resolution
-
-    @classmethod
-    def of(cls, index: Index, quiet: Expectation, instrument: Instrument, order: Order) -> Self:
-        """Compute an index; raises InputError if the instrument does not cover its bands."""
-        calibration = flux_per_dn(quiet, instrument)
-        nm = quiet.wavelength_nm
-        # The index is linear in the pixels near it.
-        windows = (index.band_nm, *index.continuum_nm)
-        near = (nm > min(low for low, _ in windows) - 1.0) & (nm < max(high for _, high in windows) + 1.0)
-        find = partial(line_index, nm[near], band_nm=index.band_nm, continuum_nm=index.continuum_nm)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            # Pixels of the band alone have no continuum, and no equivalent width.
-            part = find(np.eye(int(near.sum())))
-        weights = np.zeros(nm.size)
-        weights[near] = part.flux * calibration[near]
-        mean = find((calibration * quiet.signal_dn)[near])
-        lines = EmissionLine.named(index.name)
-        rate = electrons_per_second(instrument, lines.nodes_nm, lines.profile(lines.nodes_nm), order)
-        captured = float(weights @ (rate * exposure_dn_per_electron(quiet, instrument)))
-        return cls(index, weights, float(mean.flux), float(mean.equivalent_width_nm), captured)
+    Raises InputError if the instrument does not cover the bands.
+    """
+    calibration = flux_per_dn(quiet, instrument)
+    nm = quiet.wavelength_nm
+    # The index is linear in the pixels near it.
+    windows = (index.band_nm, *index.continuum_nm)
+    near = (nm > min(low for low, _ in windows) - 1.0) & (nm < max(high for _, high in windows) + 1.0)
+    find = partial(line_index, nm[near], band_nm=index.band_nm, continuum_nm=index.continuum_nm)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Pixels of the band alone have no continuum, and no equivalent width.
+        part = find(np.eye(int(near.sum())))
+    weights = np.zeros(nm.size)
+    weights[near] = part.flux * calibration[near]
+    mean = find((calibration * quiet.signal_dn)[near])
+    lines = EmissionLine.named(index.name)
+    rate = electrons_per_second(instrument, lines.nodes_nm, lines.profile(lines.nodes_nm), order)
+    captured = float(weights @ (rate * exposure_dn_per_electron(quiet, instrument)))
+    return weights, float(mean.flux), float(mean.equivalent_width_nm), captured

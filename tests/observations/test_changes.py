@@ -87,7 +87,7 @@ def test_errors_of_indices_are_those_of_drawn_exposures(engine: Engine, quiet: E
     rows = asked("change.of=['320-700']", "nuisances.light=0.05").indices
     assert len(rows) == 4
     for row in rows:
-        weights = row.value.weights
+        weights = row.weights
         assert row.error_known == pytest.approx((raw @ weights).std(), rel=0.02, abs=0)
         # Light that grows by 5 % makes the index grow by 5 %.
         expected = np.hypot(row.error_known, 0.05 * weights @ quiet.recorded_light_dn)
@@ -220,8 +220,8 @@ def test_rows_with_saturated_pixels_are_marked(magnitude: float, none: set[str],
         assert np.isnan(row.error) == (name in none)
         assert ("saturate" in row.note) == (name in none | marked), row.note
     for index in answer.indices:
-        lost = index.value.index.name in none | marked
-        assert np.isnan(index.value.value) == np.isnan(index.error) == lost
+        lost = index.index.name in none | marked
+        assert np.isnan(index.value) == np.isnan(index.error) == lost
         assert bool(index.note) == lost
     assert not any("HIDDEN" in text for text in answer.messages)
 
@@ -310,7 +310,7 @@ def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(tm
     shares = np.array([1.0, 0.8, 0.8])
     rise = shares * (np.array([electrons(one.flaring(1.0)) for one in stars]) - light) / (shares @ light)
     np.testing.assert_allclose(table["amplitude"], table["ampl_rec"] / np.tile(rise, n), rtol=1e-9)
-    duration = [one.equivalent_duration_s for one in answer.analysis.events for _ in stars]
+    duration = [one.fitted_s for one in answer.analysis.events for _ in stars]
     np.testing.assert_allclose(table["equivalent_duration"].to_value("s"), duration / np.tile(rise, n), rtol=1e-9)
     assert "neighbours.ecsv" in answer.files
     assert any("assumption: 80 % of it enters" in text for text in answer.messages)

@@ -68,7 +68,7 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
         level = survey.flux_level(~taken)
         for truth, at in zip(amplitude * width * SHAPE.equivalent_duration, peak, strict=True):
             near = (one for one in found if abs(one.peak_s - at) < 2000)
-            energy = events.measure_event(survey, taken, level, max(near, key=lambda one: one.value)).energy
+            energy = events.measure_event(survey, taken, level, max(near, key=lambda one: one.value))
             inside += [low <= truth <= high for low, high in zip(energy.low_s, energy.high_s, strict=True)]
             end = (energy.high_s if truth > energy.fitted_s else energy.low_s)[1]
             pulls.append(stats.norm.isf(0.025) * (truth - energy.fitted_s) / (end - energy.fitted_s))
@@ -151,10 +151,10 @@ def test_error_of_a_summed_duration_includes_that_of_its_level() -> None:
     """A star whose level is known to 1.3 %: the level is that of all frames outside of the event."""
     sd = 30.0
     (event,) = analysed(noisy(299, TIME, 100.0 * (1 + 40.0 * flare(15_000, 300.0)), sd)).analysis.events
-    energy, inside = event.energy, event.last - event.first + 1
-    error = np.sqrt(inside + (inside + energy.summed_s / CADENCE_S) ** 2 / (FRAMES - inside))
+    inside = event.last - event.first + 1
+    error = np.sqrt(inside + (inside + event.summed_s / CADENCE_S) ** 2 / (FRAMES - inside))
     expected = sd / 100.0 * CADENCE_S * error
-    assert energy.summed_error_s == pytest.approx(expected, rel=0.15)
+    assert event.summed_error_s == pytest.approx(expected, rel=0.15)
 
 
 SECTIONS: dict[str, Any] = {
@@ -178,16 +178,15 @@ def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: St
         answer = analyse(quiet, frames=read_frames(tmp_path / str(seed) / "light-curve-1.fits"))
         completeness, spectra = answer.analysis.completeness, answer.analysis.spectra
         assert spectra is not None
-        series = spectra.series
         # Sizes of inject are relative to the star in the flare's band, those of analyse to all light of the frames.
-        relative = float(series.model.flares((10_000.0,))[0].sum() / series.light.sum())
+        relative = float(spectra.cleaned.model.flares((10_000.0,))[0].sum() / spectra.light.sum())
         ratios.append(completeness.limit(1, 0.5) / answer.analysis.threshold / relative)
     width = float(completeness.half_widths_s[1])
     injections = {"of": "duration", "half_width_low_s": width, "half_width_high_s": width, "widths": 1, "sizes": 12,
                   "count": 200, "positions": 200, "fitted": 0}  # fmt: skip
     # Analyses leave out the level of each frame, and a dark current that drifts; inject assumes neither by itself. They
     # find a constant level over the whole stare, where inject expects slopes and cycles, which cost 6 % of the S/N.
-    free = {name: "free" for name, sd in series.jitters.items() if np.isinf(sd)}
+    free = {name: "free" for name, sd in spectra.jitters.items() if np.isinf(sd)}
     level = {"slope": False, "cycle": False, "window_s": 40_000.0}
     alike = SECTIONS["search"] | {"frame": free} | level
     expected = mauvecl.inject(Study(**sections | {"search": alike}, injections=injections), stares)
@@ -332,12 +331,12 @@ def test_recommended_energies_are_in_their_intervals(
         if not analysis.events:
             continue
         event = max(analysis.events, key=lambda one: one.value)
-        energy, truth = event.energy, size / 1e4 * width * shape.equivalent_duration
-        end = (energy.high_s if truth > energy.fitted_s else energy.low_s)[1]
-        pulls.append(stats.norm.isf(0.025) * (truth - energy.fitted_s) / (end - energy.fitted_s))
-        inside += [low <= truth <= high for low, high in zip(energy.low_s, energy.high_s, strict=True)]
+        truth = size / 1e4 * width * shape.equivalent_duration
+        end = (event.high_s if truth > event.fitted_s else event.low_s)[1]
+        pulls.append(stats.norm.isf(0.025) * (truth - event.fitted_s) / (end - event.fitted_s))
+        inside += [low <= truth <= high for low, high in zip(event.low_s, event.high_s, strict=True)]
         # That is 18 times the largest error when the test was written.
-        assert draw not in (triangle, other) or energy.fitted_s == pytest.approx(truth, rel=0.2)
+        assert draw not in (triangle, other) or event.fitted_s == pytest.approx(truth, rel=0.2)
         # A flare of another shape is one flare, and no process.
         assert draw is not other or detected(analysis, PER_MONTH) == [event]
         assert draw is not other or event.value > 0.6 * size * np.linalg.norm(light)

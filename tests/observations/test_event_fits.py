@@ -58,7 +58,7 @@ def measured_event(survey: searches.SeriesSurvey) -> Any:
     n = len(survey.stare.start_s)
     one = searches.DetectedEvent(100.0, 120.0, float(survey.stare.start_s[n // 2]), 0, 20.0, n // 2 - 8, n // 2 + 120)
     taken = np.isin(np.arange(n), range(one.first, one.last + 1))
-    return events.measure_event(survey, taken, np.full(n, LEVEL / SD), one).energy
+    return events.measure_event(survey, taken, np.full(n, LEVEL / SD), one)
 
 
 def watch(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, place: int, found: list[tuple[str, int]]) -> None:

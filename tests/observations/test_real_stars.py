@@ -165,7 +165,7 @@ def test_beginning_of_a_bright_flare_is_no_flare_of_its_own(peak_s: float, half_
     analysis = analysed(Frames.of(time, flux, exposure_s=5.0), per="month").analysis
     assert len(analysis.events) == 1
     whole = amplitude * half_width_s * DAVENPORT.equivalent_duration
-    energy = analysis.events[0].energy
+    energy = analysis.events[0]
     assert energy.low_s[1] < whole < energy.high_s[1]
 
 
@@ -175,9 +175,9 @@ def test_faint_star_with_a_great_flare_has_its_energy() -> None:
     time = (np.arange(340) + 0.5) * 5.0
     light = 30.4 * (1 + 120 * flare(time, 5.0, 900.0, 90.0))
     (event,) = analysed(noisy(403, time, light, 5.5)).analysis.events
-    error = (event.energy.high_s[0] - event.energy.low_s[0]) / 2
-    assert abs(event.energy.fitted_s - 19_730) < 3 * error
-    assert 0.005 < error / event.energy.fitted_s < 0.03
+    error = (event.high_s[0] - event.low_s[0]) / 2
+    assert abs(event.fitted_s - 19_730) < 3 * error
+    assert 0.005 < error / event.fitted_s < 0.03
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_edges_of_a_transit_are_no_flares_and_flares_of_its_star_are() -> None:
         assert one.kind == "flare"
         light = float(two_exponentials(time, frame_s, peak, width).sum()) * frame_s
         truth = size * light * 5400 / float(np.interp(peak, time, star))
-        assert one.energy.low_s[1] < truth < one.energy.high_s[1]
+        assert one.low_s[1] < truth < one.high_s[1]
 
 
 @pytest.mark.long
@@ -255,7 +255,7 @@ def test_files_that_once_failed_have_an_answer() -> None:
         analysed(read_frames(folder / "rise-in-gap.fits", folder / "rise-in-gap.toml")).analysis.events,
         key=lambda one: -one.value,
     )
-    assert np.isfinite([event.energy.fitted_s, *event.energy.low_s, *event.energy.high_s]).all()
+    assert np.isfinite([event.fitted_s, *event.low_s, *event.high_s]).all()
 
 
 @pytest.mark.parametrize("decay", [10, 20])
@@ -316,7 +316,7 @@ def test_few_counts_have_their_mean_and_pulls() -> None:
             near = (one for one in detected(analysis) if abs(time[one.brightest] - peak) < 300)
             one = max(near, key=lambda one: one.value)
             truth = float(light[one.first : one.last + 1].sum()) / 3.64 * 5.0
-            pulls.append((one.energy.summed_s - truth) / one.energy.summed_error_s)
+            pulls.append((one.summed_s - truth) / one.summed_error_s)
     # 3.3 standard errors of the mean of some 9000 counts outside of flares.
     assert np.mean(levels) == pytest.approx(3.64, abs=3.3 * np.sqrt(3.64 / 9000))
     low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], len(pulls) - 1) / (len(pulls) - 1))
@@ -340,4 +340,4 @@ def test_bins_of_gj_65_are_flagged_and_level_and_great_flare_are_those_of_the_co
     assert (great.kind, great.cut, great.missing) == ("flare", True, 1)
     assert max(one.value for one in analysis.events) == great.value
     # The peak of the published light curve: 838.6 counts per second over 5.5.
-    assert great.amplitude * great.energy.level * analysis.survey.level == pytest.approx(838.6 - 5.5, rel=0.005)
+    assert great.amplitude * great.level * analysis.survey.level == pytest.approx(838.6 - 5.5, rel=0.005)

@@ -58,9 +58,8 @@ def drawn(rng: np.random.Generator, added: np.ndarray | float = 0.0, scale: floa
 
 
 def prepared(frames: Frames, **how: Any) -> tuple[Any, Any, Any]:
-    cleaned = models.clean_spectra(frames, model())
-    survey, series, _ = spectra.survey_spectra(cleaned, SHAPES["davenport2014"], 3, 1, **how)
-    return cleaned, survey, series
+    survey, series, _ = spectra.survey_spectra(frames, model(), SHAPES["davenport2014"], 3, 1, **how)
+    return series.cleaned, survey, series
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +234,7 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
     added = flare(1800.0, 90.0, size) if not spectrum else size * np.outer(shape, model().unknowns(light())[spectrum])
     frames = drawn(np.random.default_rng(305), added)
     analysis = analyse(Study(star=STAR, search=OFTEN | {"frame": {"light": 1e-6}}), frames=frames).analysis
-    event, found = max(zip(analysis.events, analysis.spectra.found, strict=True), key=lambda pair: pair[0].value)
+    event, found = max(zip(analysis.events, analysis.found, strict=True), key=lambda pair: pair[0].value)
     assert abs(analysis.survey.time_s[event.brightest] - 1800.0) < 60
     assert (event.kind, found.cause) == (kind, kind)
     assert (found.reason == "") == (kind == "flare")

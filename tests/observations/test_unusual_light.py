@@ -30,7 +30,7 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     assert (event.first, event.cut, event.kind) == (0, True, "flare")
     assert event.value > analysis.threshold
     truth = amplitude * half_width_s * DURATION
-    assert abs(event.energy.fitted_s - truth) < 2.5 * (event.energy.high_s[0] - event.energy.low_s[0])
+    assert abs(event.fitted_s - truth) < 2.5 * (event.high_s[0] - event.low_s[0])
 
 
 @pytest.mark.parametrize("seed", long_but([1, 2], 1))
@@ -40,9 +40,9 @@ def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
     peaks, widths, sizes = (284.0, 406.0), (88.0, 102.0), (0.218, 0.191)
     light = sum(size * flare(time, 5.0, *one) for *one, size in zip(peaks, widths, sizes, strict=True))
     event = max(analysed(noisy([508, seed], time, 1 + light, 1.2e-3)).analysis.events, key=lambda one: one.value)
-    assert sorted(one.peak_s for one in event.energy.flares) == pytest.approx(peaks, abs=8.0)
+    assert sorted(one.peak_s for one in event.flares) == pytest.approx(peaks, abs=8.0)
     truth = DURATION * sum(size * width for size, width in zip(sizes, widths, strict=True))
-    assert abs(event.energy.fitted_s - truth) < 2.5 * (event.energy.high_s[0] - event.energy.low_s[0])
+    assert abs(event.fitted_s - truth) < 2.5 * (event.high_s[0] - event.low_s[0])
 
 
 @pytest.mark.long
