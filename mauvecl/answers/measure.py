@@ -167,7 +167,7 @@ class ExpectedMeasurement(InCell):
         def at(log_k: Float) -> tuple[Float, Ratio]:
             """Return what is left of the rise at temperatures, and the amplitude there."""
             x = log_k[None]
-            face = profile.face(x)
+            *_, face = profile.faces(x)
             return rise - gain + face.gain, face.ratio(np.moveaxis(amplitude(x), -1, 0), profile.factor_at(x))
 
         nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
