@@ -113,9 +113,6 @@ class Profile:
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        if not self.bounded:
-            *_, face = self.faces(log_k)
-            return np.asarray(face.gain - np.minimum(face.amplitude, 0.0) ** 2 * face.power)
         gain = np.zeros((len(self.sums), *log_k.shape[1:]))
         for face in self.faces(log_k):
             np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
