@@ -57,7 +57,7 @@ def estimate(values: np.ndarray, model: FlareModel, reduction: ReducedSums) -> N
         profile = Profile(reduction, sums[start : start + BATCH])
         best = with_bounds(reduction, profile.sums, profile.best())
         derived_values(model, best.log_k, best.linear, np.ones(1))
-        covariance(model, reduction, best, profile.factor(best.log_k, best.linear))
+        covariance(model, reduction, best, profile.factor(best))
 
 
 def main() -> None:

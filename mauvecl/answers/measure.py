@@ -20,8 +20,8 @@ from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson, clopper_pearson_ends
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, join_names
 from mauvecl.device.engine import Engine
-from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, ReducedSums, usable_variance, variance_of
-from mauvecl.fits.profile import Profile
+from mauvecl.fits.flare_model import FlareModel, Ranges, ReducedSums, usable_variance, variance_of
+from mauvecl.fits.profile import BestFit, Profile
 from mauvecl.fits.spectrum import LEVELS, Measurement, TwoTemperatures, fit, fit_two_temperatures, forecast_model
 from mauvecl.host.arrays import Arrays, Float, true_runs
 from mauvecl.host.stars import flare as spectra
@@ -163,27 +163,15 @@ class ExpectedMeasurement(InCell):
         amplitude = self.fitted.splines[self.fitted.names.index("amplitude")]
         assert amplitude is not None
 
-        def at(log_k: Float) -> tuple[Float, Ratio]:
-            """Return what is left of the rise at temperatures, and the amplitude there."""
-            x = log_k[None]
-            face = profile.face(x)
-            return rise - gain + face.gain, face.ratio(np.moveaxis(amplitude(x), -1, 0), profile.factor_at(x))
-
-        nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
-        inside = np.flatnonzero(at(nodes)[0][0] >= 0.0)
-        # From the outermost node inside to the next one, where the region ends, or from the fit.
-        known = nodes[inside[[0, -1]]] if inside.size else np.array([best[0], best[0]])
-        beyond = np.searchsorted(nodes, known[0]) - 1, np.searchsorted(nodes, known[1], side="right")
-        ends = [
-            scipy.optimize.brentq(lambda x: float(at(np.array([x]))[0][0, 0]), inner, nodes[k])
-            if 0 <= k < nodes.size else inner
-            for inner, k in zip(known, beyond, strict=True)
-        ]  # fmt: skip
+        fit = BestFit(best, linear[None], np.array([gain]))
+        low, high = (float(end[0]) for end in profile.ends(fit, profile.gain_at_nodes(), rise))
+        low, high = np.nan_to_num(low, nan=profile.nodes[0]), np.nan_to_num(high, nan=profile.nodes[-1])
         # Dense at the ends, where the two amplitudes converge like a root.
-        log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
-        left, ratio = at(log_k)
-        low, high = (ratio.end(left, sign)[0] for sign in (-1.0, 1.0))
-        return np.exp(log_k), np.maximum(low, 0.0), high
+        log_k = (low + high) / 2 + (high - low) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
+        *_, face = profile.faces(log_k[None])
+        ratio = face.ratio(np.moveaxis(amplitude(log_k[None]), -1, 0), profile.factor_at(log_k[None]))
+        least, most = (ratio.end(rise - gain + face.gain, sign)[0] for sign in (-1.0, 1.0))
+        return np.exp(log_k), np.maximum(least, 0.0), most
 
 
 def fit_model(

@@ -223,23 +223,6 @@ class FlareModel:
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 
     @cached_property
-    def multiples(self) -> tuple[tuple[int, float], ...]:
-        """Number of the first derived quantity of which each is a constant multiple, and the multiple.
-
-        A luminosity is a multiple of a flux, so that their intervals are computed once.
-        """
-        references: list[tuple[int, float]] = []
-        for k, derived in enumerate(self.derived):
-            references.append((k, 1.0))
-            for first, other in enumerate(self.derived[:k]):
-                if derived.factors is None or other.factors is None or references[first][0] != first:
-                    continue
-                times = float(np.sum(derived.factors * other.factors) / np.sum(other.factors**2))
-                if times > 0.0 and np.allclose(derived.factors, times * other.factors, rtol=1e-12, atol=0.0):
-                    references[k] = first, times
-        return tuple(references)
-
-    @cached_property
     def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
         """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
         factors = [derived.factors for derived in self.derived]
@@ -393,12 +376,6 @@ class LightFactor:
         by_prior = value[usable] * np.sqrt(self.prior_share) / (self.scale * factor[usable])
         share[usable] = np.clip(4.0 * allowed * (by_prior / width[usable]) ** 2, 0.0, 1.0)
         return np.asarray(np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed)
-
-    def estimate(self, sums: Float, log_k: Float, linear: Float) -> Float:
-        """Return the best factor, (n, ...), for sums (n,), temperatures (n, ...) and amplitudes (n, ..., n_linear)."""
-        flare = linear[..., 0] * self.spline(log_k) + linear[..., 1:] @ self.fixed
-        own = sums.reshape(sums.shape + (1,) * (log_k.ndim - 1))
-        return np.asarray(self.expected + (own - flare) / self.scale)
 
     def weights_of(self, log_k: Float) -> Float:
         """Return the decrease of the best factor per unit of each amplitude, shape (..., n_linear)."""

@@ -15,7 +15,7 @@ on the temperature, so each face has constant matrices.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import combinations
@@ -87,41 +87,34 @@ class Profile:
         light = None if self.light is None else self.light[rows]
         return Profile(reduction or self.reduction, self.sums[rows], light, bounded=True)
 
-    def products(self, log_k: Float) -> Products:
-        """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
+    def faces(self, log_k: Float) -> Iterator[Face]:
+        """Yield the unbounded fit of each face at temperatures (n, ...), or (1, ...) if common to all frames.
+
+        Fits without the blackbody come before those with it, and the last one is that of all components.
+        """
         hot, fixed = self.reduction.spline(log_k), self.reduction.fixed
         if log_k.shape[0] == 1:
             along = np.tensordot(self.sums, hot[0], (1, -1))
         else:
             along = np.einsum("n...k,nk->n...", hot, self.sums)
-        return Products(
-            along,
-            np.einsum("...k,...k->...", hot, hot),
-            np.moveaxis(hot @ fixed.T, -1, 0),
-            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *(1,) * (log_k.ndim - 1)),
-            fixed @ fixed.T,
-            self.bounded,
-        )
-
-    def face(self, log_k: Float) -> Face:
-        """Return the unbounded fit of all components at temperatures (n, ...), or (1, ...) if common to all frames."""
-        return self.products(log_k).face(range(len(self.reduction.fixed)), True)
-
-    def faces(self, products: Products) -> Iterator[Face]:
-        """Yield the unbounded fit of each face at the temperatures of some products."""
-        every = range(len(self.reduction.fixed))
-        for size in range(0 if self.bounded else len(every), len(every) + 1):
-            for some in combinations(every, size):
-                yield products.face(some, False)
-                yield products.face(some, True)
+        whole, cross = np.einsum("...k,...k->...", hot, hot), np.moveaxis(hot @ fixed.T, -1, 0)
+        of_fixed = (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *(1,) * (log_k.ndim - 1))
+        gram, every = fixed @ fixed.T, range(len(fixed))
+        for size in range(0 if self.bounded else len(fixed), len(fixed) + 1):
+            for some in map(list, combinations(every, size)):
+                inverse = _inverse(gram[some][:, some])
+                alone, share = (_product(inverse, each[some]) for each in (of_fixed, cross))
+                gain = np.sum(of_fixed[some] * alone, axis=0)
+                power = whole - np.sum(cross[some] * share, axis=0)
+                yield Face(some, False, self.bounded, inverse, alone, gain, np.zeros_like(power), power, share)
+                amplitude = (along - np.sum(cross[some] * alone, axis=0)) / power
+                others, gain = alone - amplitude * share, gain + amplitude**2 * power
+                yield Face(some, True, self.bounded, inverse, others, gain, amplitude, power, share)
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        if not self.bounded:
-            face = self.face(log_k)
-            return np.asarray(face.gain - np.minimum(face.amplitude, 0.0) ** 2 * face.power)
         gain = np.zeros((len(self.sums), *log_k.shape[1:]))
-        for face in self.faces(self.products(log_k)):
+        for face in self.faces(log_k):
             np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
         return gain
 
@@ -129,23 +122,35 @@ class Profile:
         """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
         return self.gain(self.nodes[None, ::every])
 
-    def factor(self, log_k: Float, linear: Float) -> Float:
-        """Return the best factor on all light, (n, ...), at temperatures and amplitudes; 1 if it is known."""
-        if self.reduction.light is None or self.light is None:
-            return np.ones(log_k.shape)
-        return self.reduction.light.estimate(self.light, log_k, linear)
-
     def factor_at(self, log_k: Float) -> FactorAt | None:
         """Return the best factor on all light at temperatures (n, ...) as a function of the amplitudes, if unknown."""
         light = self.reduction.light
         if light is None or self.light is None:
             return None
-        without = self.factor(log_k, np.zeros((*log_k.shape, 1 + len(self.reduction.fixed))))
-        return FactorAt(without, np.moveaxis(light.weights_of(log_k), -1, 0), light.scale**-2.0)
+        own = self.light.reshape(-1, *(1,) * (log_k.ndim - 1)) / light.scale
+        return FactorAt(light.expected + own, np.moveaxis(light.weights_of(log_k), -1, 0), light.scale**-2.0)
+
+    def factor(self, best: BestFit) -> Float:
+        """Return the factor on all light of best fits, shape (n,); 1 if it is known."""
+        factor_at = self.factor_at(best.log_k)
+        if factor_at is None:
+            return np.ones(best.log_k.shape)
+        return np.asarray(factor_at.without - np.sum(factor_at.falls * best.linear.T, axis=0))
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
         """Return the best fit of each frame, from `gain_at_nodes` if it is known."""
-        return self.solution(self._refined(at_nodes) if self.bounded else self._stationary(at_nodes))
+        log_k = self._refined(at_nodes) if self.bounded else self._stationary(at_nodes)
+        gain = np.zeros(len(self.sums))
+        amplitudes = np.zeros((1 + len(self.reduction.fixed), gain.size))
+        for face in self.faces(log_k):
+            better = (face.gain > gain) & face.positive(face.amplitude, face.others)
+            np.copyto(gain, face.gain, where=better)
+            amplitudes[:, better] = 0.0
+            for k, values in zip((0, *(1 + k for k in face.some)), (face.amplitude, *face.others), strict=True):
+                # Rounding may leave an amplitude below its bound.
+                own = np.maximum(values, 0.0) if self.bounded or k == 0 else values
+                np.copyto(amplitudes[k], own, where=better)
+        return BestFit(log_k, np.ascontiguousarray(amplitudes.T), gain)
 
     def _stationary(self, at_nodes: Float | None) -> Float:
         """Return the best temperatures without bounds on fixed components, shape (n,).
@@ -209,20 +214,6 @@ class Profile:
             x[rising] = there[np.arange(rising.size), np.argmax(own.gain(there), axis=1)]
             step /= 4.0
 
-    def solution(self, log_k: Float) -> BestFit:
-        """Return the best fits at temperatures (n,)."""
-        gain = np.zeros(len(self.sums))
-        amplitudes = np.zeros((1 + len(self.reduction.fixed), gain.size))
-        for face in self.faces(self.products(log_k)):
-            better = (face.gain > gain) & face.positive(face.amplitude, face.others)
-            np.copyto(gain, face.gain, where=better)
-            amplitudes[:, better] = 0.0
-            for k, values in zip((0, *(1 + k for k in face.some)), (face.amplitude, *face.others), strict=True):
-                # Rounding may leave an amplitude below its bound.
-                own = np.maximum(values, 0.0) if self.bounded or k == 0 else values
-                np.copyto(amplitudes[k], own, where=better)
-        return BestFit(log_k, np.ascontiguousarray(amplitudes.T), gain)
-
     def ends(self, best: BestFit, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
         """Return the log temperatures at which chi-squared has risen by `allowed`, low and high, each (n,).
 
@@ -266,9 +257,8 @@ def intervals(
     # Samples are even in the angle of a sine, because the remaining rise goes to zero at the ends like a root.
     angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
     x = (start + stop)[:, None] / 2 + (stop - start)[:, None] / 2 * np.sin(angle)
-    products, factor_at = profile.products(x), profile.factor_at(x)
-    faces, light = list(profile.faces(products)), profile.reduction.light
-    least, factor = best.gain[:, None] - allowed, profile.factor(best.log_k, best.linear)
+    faces, factor_at, light = list(profile.faces(x)), profile.factor_at(x), profile.reduction.light
+    least, factor = best.gain[:, None] - allowed, profile.factor(best)
 
     def ends_of_sum(spline: CubicSpline) -> tuple[Float, Float]:
         factors, own_least = np.moveaxis(spline(x), -1, 0), least
@@ -285,13 +275,19 @@ def intervals(
 
     kelvin = np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
     columns: list[tuple[Float, Float]] = []
-    for derived, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
-        if first < len(columns):
-            ends = columns[first]
-        elif spline is None:
+    known: dict[bytes, tuple[float, tuple[Float, Float]]] = {}
+    for derived, spline in zip(model.derived, model.splines, strict=True):
+        times = 1.0
+        if spline is None:
             ends = kelvin if derived.held is None else (np.full(low.size, derived.held),) * 2
-        elif derived.ratio is None:
-            ends = ends_of_sum(spline)
+        elif derived.factors is not None:
+            # A luminosity is a multiple of a flux, so that their intervals are computed once.
+            size = float(derived.factors.max())
+            alike = (derived.factors / size).astype(np.float32).tobytes()
+            if alike not in known:
+                known[alike] = size, ends_of_sum(spline)
+            first, ends = known[alike]
+            times = size / first
         else:
             lowest, highest = _ratio_ends(faces, spline(x), least)
             ends = derived.offset + lowest, derived.offset + highest
@@ -611,31 +607,6 @@ def _inverse(matrix: Float) -> Float:
 def _product(matrix: Float, values: Float) -> Float:
     """Return the product of a matrix (k, k) with values (k, ...)."""
     return matrix[0] * values if len(matrix) == 1 else np.tensordot(matrix, values, 1) if len(matrix) else values
-
-
-@dataclass(frozen=True, eq=False)
-class Products:
-    """Inner products of components and sums at temperatures (n, ...), or (1, ...) if common to all frames."""
-
-    along: Float  # of the blackbody with the sums, shape (n, ...)
-    power: Float  # of the blackbody with itself, shape (n or 1, ...)
-    cross: Float  # of the blackbody with the fixed components, shape (n_fixed, n or 1, ...)
-    fixed: Float  # of the fixed components with the sums, shape (n_fixed, n, 1, ...)
-    gram: Float  # of the fixed components with each other, shape (n_fixed, n_fixed)
-    bounded: bool  # whether amplitudes of fixed components are at least zero
-
-    def face(self, some: Sequence[int], hot: bool) -> Face:
-        """Fit some of the fixed components and, if `hot`, the blackbody, without bounds."""
-        which = list(some)
-        inverse = _inverse(self.gram[which][:, which])
-        alone, share = (_product(inverse, each[which]) for each in (self.fixed, self.cross))
-        gain = np.sum(self.fixed[which] * alone, axis=0)
-        power = self.power - np.sum(self.cross[which] * share, axis=0)
-        if not hot:
-            return Face(which, hot, self.bounded, inverse, alone, gain, np.zeros_like(power), power, share)
-        amplitude = (self.along - np.sum(self.cross[which] * alone, axis=0)) / power
-        others, gain = alone - amplitude * share, gain + amplitude**2 * power
-        return Face(which, hot, self.bounded, inverse, others, gain, amplitude, power, share)
 
 
 class FactorAt(NamedTuple):

@@ -387,7 +387,7 @@ class _Problem:
         chi2 = quiescent - best.gain
         n_used = int(np.count_nonzero(reduction.variance))
         dof = n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
-        factor, log_k = profile.factor(best.log_k, best.linear), best.log_k
+        factor, log_k = profile.factor(best), best.log_k
         spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])
         if second is not None:
             log_k = np.column_stack([log_k, np.full(log_k.size, second[0])])

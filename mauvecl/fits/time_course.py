@@ -207,7 +207,13 @@ def fit_bins(
     strengths, end = known_strengths(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
-        mean = [*strengths[a:b].mean(axis=0), *_spreads_of(stare, a, b)]
+        # Variances of the unknown changes, averaged over the bin.
+        variances = {of: sd**2 / (b - a) for of, sd in stare.jitters.items()} | {"star": 0.0}
+        for each in stare.unknowns:
+            variances[each.of] += (each.sd * float(each.curve[a:b].mean())) ** 2
+        if stare.pointing is not None:
+            variances["light"] += stare.pointing.depth**2
+        mean = [*strengths[a:b].mean(axis=0), *(float(np.sqrt(variances[of])) for of in CHANGING)]
         alike.setdefault((float(b - a), *np.round(mean, DIGITS).tolist()), []).append(k)
     parts = []
     for (length, star, sky, dark, light, *spreads), rows in alike.items():
@@ -231,16 +237,6 @@ def fit_bins(
         parts.append(fit(added, stacked, model.stacked(n, light), own, levels=levels, skipped_nm=skipped_nm))
     measurement = Measurement.joined(parts, list(alike.values()))
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, measurement)
-
-
-def _spreads_of(stare: Stare, first: int, end: int) -> list[float]:
-    """Return the standard deviations of the unknown changes of a stare, averaged over some frames, by `CHANGING`."""
-    variances = {of: sd**2 / (end - first) for of, sd in stare.jitters.items()} | {"star": 0.0}
-    for unknown in stare.unknowns:
-        variances[unknown.of] += (unknown.sd * float(unknown.curve[first:end].mean())) ** 2
-    if stare.pointing is not None:
-        variances["light"] += stare.pointing.depth**2
-    return [float(np.sqrt(variances[of])) for of in CHANGING]
 
 
 def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
@@ -470,13 +466,15 @@ def fit_cooling(
     scale = np.where([quantity.place == 0 for quantity in quantities], 1.0, estimates)
     slopes = scale[:, None] * slopes[:, free]
     spread = slopes @ covariance @ slopes.T
-    ends = fit.ends(quantities, estimates, [float(scipy.stats.chi2.ppf(level, 1)) for level in levels])
+    rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
+    each = [fit.end(sign, rise, quantity) for sign, rise, quantity in product((-1.0, 1.0), rises, quantities)]
+    low, high = np.reshape(each, (2, len(rises), 1, len(quantities)))
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     none = float(np.sum(data.whitening(theta, none=True)(data.sums[None]) ** 2))
     return Measurement(
         tuple(quantity.name for quantity in quantities), tuple(quantity.unit for quantity in quantities),
         (-np.inf,) + (0.0,) * (len(quantities) - 1),
-        estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
+        estimates[None], spread[None], tuple(levels), low, high, np.array([best]),
         np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
         theta[3:4], np.exp(theta[2:3])[None], np.ones(1),
     )  # fmt: skip
@@ -625,29 +623,14 @@ class _BestFit:
             theta = with_free(solution.x)
         return cls(data, whiten, theta, free, limits, 2 * float(solution.cost))
 
-    def ends(self, quantities: Sequence[_Quantity], estimates: Float, rises: Sequence[float]) -> Float:
-        """Return the ends of the intervals of all quantities, shape (2, n_rise, n_quantity), for rises of chi-squared.
-
-        An energy is a multiple of its fluence.
-        """
-        ends = np.full((2, len(rises), len(quantities)), np.nan)
-        names = [quantity.name for quantity in quantities]
-        for q, quantity in enumerate(quantities):
-            if quantity.name.startswith("energy"):
-                fluence = names.index(quantity.name.replace("energy", "fluence"))
-                ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
-                continue
-            for (side, sign), (k, rise) in product(enumerate((-1.0, 1.0)), enumerate(rises)):
-                ends[side, k, q] = self._end(quantity, sign, self.chi2 + rise)
-        return ends
-
-    def _end(self, quantity: _Quantity, sign: float, allowed: float) -> float:
+    def end(self, sign: float, rise: float, quantity: _Quantity) -> float:
         """Return the end of an interval on one side; infinite if chi-squared does not rise that far within the limits.
 
         Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals. A
         parameter that reaches a limit stays there.
         """
         data, free, (low, high), there = self.data, self.free, self.limits, self.theta.copy()
+        allowed = self.chi2 + rise
         for number in range(NEWTON_STEPS):
             residuals, every = data.residuals(there, self.whiten), data.jacobian(there, self.whiten)
             # A flare that does not cool leaves the cooling time without any effect.
@@ -660,7 +643,7 @@ class _BestFit:
                 break
             room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
             step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
-            length = float(np.linalg.norm(jacobian @ step)) / np.sqrt(allowed - self.chi2)
+            length = float(np.linalg.norm(jacobian @ step)) / np.sqrt(rise)
             # Steps across a kink, where the peak changes frames, would not become shorter.
             share = min(1.0, LONGEST / length) * 0.5 ** max(0, number - UNDAMPED)
             there[free] += share * step

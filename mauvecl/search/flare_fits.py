@@ -506,7 +506,7 @@ class SingleFlareFit:
         profile = Profile(self.templates.mean_sums, sums)
         given = np.log(self.templates.temperatures_k[self.templates.chosen[0]])
         x = profile.best().log_k if self.templates.coloured else np.full(len(sums), given)
-        face = profile.face(x)
+        *_, face = profile.faces(x)
         best = np.maximum(face.amplitude, 1e-12 * length)
         return x, best / length, (2 * face.amplitude - best) * best * face.power
 
