@@ -435,7 +435,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "days taken for seconds": (
         "test_files_are_read_as_they_say[extensions names that need no mapping fits1]",
-        ("np.asarray(((time - first) * unit).to_value(u.s)), ", "np.asarray(time - first), "),
+        ("np.asarray(((middles - first) * unit).to_value(u.s)), ", "np.asarray(middles - first), "),
     ),
     "light that reaches the barycentre earlier": (
         "test_barycentric_times_of_the_geocentre_are_those_of_erfa[2026-09-16T03:00:00]",

@@ -301,7 +301,15 @@ def choose(roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int,
     names = [role.name for role in roles]
     wanted = [_named(name, names) for name in asked]
     axes = [i for i in wanted if roles[i].kind in AXES] or (wanted[:1] if len(wanted) == 2 else [])
-    wavelength = (axes[0],) if axes else _wavelength(roles, names)
+    best, low, high = (_best(kind, roles) for kind in AXES)
+    wavelength: tuple[int, ...]
+    if axes or best:
+        wavelength = (axes[0] if axes else _only("wavelength", names, best),)
+    elif low or high:
+        wavelength = _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
+    else:
+        fault = f"no column is recognised as the wavelength among {listed(names) or 'none'}"
+        raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     rest = [i for i in wanted if i not in wavelength]
     if len(rest) > 1:
         raise InputError.of("columns", asked, "one flux, and one wavelength at most")
@@ -317,16 +325,6 @@ def _named(name: str, names: Sequence[str]) -> int:
         fault = f"{'several columns are' if indices else 'no column is'} named {shortened(name)}"
         raise InputError(f"{fault}; give one of {listed(names)}", key="columns")
     return indices[0]
-
-
-def _wavelength(roles: Sequence[Role], names: Sequence[str]) -> tuple[int, ...]:
-    best, low, high = (_best(kind, roles) for kind in AXES)
-    if best:
-        return (_only("wavelength", names, best),)
-    if low or high:
-        return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
-    fault = f"no column is recognised as the wavelength among {listed(names) or 'none'}"
-    raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
 
 
 def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ...]) -> int:

@@ -58,7 +58,6 @@ def add(
         "file_sha256": hashlib.sha256(content).hexdigest(),
         "spectrum_sha256": source.digest,
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "dereddened": any("dereddened" in note for note in source.notes),
         "notes": list(source.notes),
         "told": list(source.messages),
         "unscaled": source.unscaled,

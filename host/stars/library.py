@@ -50,26 +50,14 @@ class ModelStar:
     index: float = 0.0
 
 
-def _model_star(text: str) -> ModelStar | None:
-    """Return the star of a name such as "blackbody 9000 K" or "power law -2", or None for another name."""
-    found = _NAME.fullmatch(text)
-    if found is None:
-        return None
-    if found["body"] is not None:
-        kelvin = checked(Temperature, "temperature of the blackbody", float(found["kelvin"]))
-        return ModelStar(f"blackbody {kelvin:.15g} K", "Planck's law", kelvin)
-    index = number("index of the power law", float(found["index"]), "", INDEX)
-    return ModelStar(f"power law {index:.15g}", f"flux per wavelength proportional to its power {index:g}", None, index)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OwnStar:
-    """Metadata of a kept star; fields as in `Source`."""
+    """A kept star; fields as in `Source`, and the table of its file."""
 
     name: str
     origin: str
     notes: tuple[str, ...]
-    dereddened: bool
+    table: Table
     path: Path
     messages: tuple[str, ...] = ()
     measured_nm: tuple[float, float] | None = None
@@ -96,29 +84,24 @@ def find(name: str) -> OwnStar | None:
 
 
 def _described(path: Path) -> OwnStar | None:
-    meta = _read(path).meta
+    table = read_ecsv(path, "kept star", "use `mauvecl library remove` to take it away")
+    meta = table.meta
     if not {"name", "origin", "spectrum_sha256"} <= set(meta):
         return None
-    notes = tuple(str(note) for note in meta.get("notes", ()))
-    messages = tuple(str(text) for text in meta.get("told", ()))
+    notes, messages = (tuple(map(str, meta.get(key, ()))) for key in ("notes", "told"))
     measured = meta.get("measured_nm")
     return OwnStar(
-        str(meta["name"]), str(meta["origin"]), notes, bool(meta.get("dereddened")), path, messages,
+        str(meta["name"]), str(meta["origin"]), notes, table, path, messages,
         None if measured is None else (float(measured[0]), float(measured[1])), str(meta.get("unscaled", "")),
     )  # fmt: skip
-
-
-def _read(path: Path) -> Table:
-    return read_ecsv(path, "kept star", "use `mauvecl library remove` to take it away")
 
 
 def own_spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
     """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1; raises InputError if the file was changed."""
     import numpy as np
 
-    table = _read(star.path)
-    wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
-    if hashlib.sha256(wavelength.tobytes() + flux.tobytes()).hexdigest() != table.meta["spectrum_sha256"]:
+    wavelength, flux = (np.asarray(star.table[name], float) for name in ("wavelength", "flux"))
+    if hashlib.sha256(wavelength.tobytes() + flux.tobytes()).hexdigest() != star.table.meta["spectrum_sha256"]:
         fault = f"kept star {star.name!r} must be unchanged, but its digest differs: add or fetch it again"
         raise InputError(fault, key="name")
     return wavelength, flux
@@ -229,11 +212,6 @@ def library_names() -> list[str]:
     return [name for name in dict.fromkeys(each) if name and not name.startswith("Pickles ")]
 
 
-def _ratios(quality: str) -> str:
-    """Return the ratios of an entry on the ultraviolet: "190-210: 0.1 (S/N 5), ...; ..." gives "0.1, ..."."""
-    return ", ".join(part.split()[0] for part in quality.split("; ")[0].split(": ")[1].split(", "))
-
-
 #: Columns of the table of embedded spectra as people read it.
 COLUMNS = (
     Column("name", heading="name"),
@@ -241,7 +219,12 @@ COLUMNS = (
     Column("spectral_type", heading="type"),
     Column("star", heading="star"),
     Column("temperature_k", heading="K"),
-    Column("uv_quality", heading="UV at 190-210, 240-260, 290-310 nm", format=_ratios),
+    Column(
+        "uv_quality",
+        heading="UV at 190-210, 240-260, 290-310 nm",
+        # The ratios in "190-210: 0.1 (S/N 5), ...; ...".
+        format=lambda text: ", ".join(part.split()[0] for part in text.split("; ")[0].split(": ")[1].split(", ")),
+    ),
     Column("noisy_below_nm", heading="noisy below", format=lambda below: f"{below} nm" if below else ""),
     Column("licence", heading="licence"),
 )
@@ -334,8 +317,14 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     A text is a name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral
     type, or a formula ("blackbody 9000 K", "power law -2"). The user's own stars are searched if `own` is true.
     """
-    model = _model_star(text)
-    if model is not None:
+    if formula := _NAME.fullmatch(text):
+        if formula["body"] is not None:
+            kelvin = checked(Temperature, "temperature of the blackbody", float(formula["kelvin"]))
+            model = ModelStar(f"blackbody {kelvin:.15g} K", "Planck's law", kelvin)
+        else:
+            index = number("index of the power law", float(formula["index"]), "", INDEX)
+            origin = f"flux per wavelength proportional to its power {index:g}"
+            model = ModelStar(f"power law {index:.15g}", origin, None, index)
         return NamedStar(model.name, light=model)
     star = by_key().get(name_key(text))
     # The library may have the star under another of its names.

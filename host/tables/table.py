@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import re
 from abc import ABC, abstractmethod
@@ -38,16 +37,17 @@ def unquoted(cell: str) -> str:
 
 def number_in(cell: str) -> float:
     """Return the number in a cell, NaN for words such as "null"; raise ValueError for anything else."""
-    cell = unquoted(cell).replace("−", "-")
+    # Python takes 1_000 for a number.
     if "_" in cell:
         raise ValueError(cell)
     try:
         return float(cell)
     except ValueError:
-        if is_missing(cell):
-            return float("nan")
-        # Exponents of Fortran's double precision, and of three digits, which it writes without a letter.
-        return float(re.sub(r"([\d.])[dD](?=[+-]?\d)|^([+-]?\d*\.\d*)(?=[+-]\d{3}$)", r"\1\2e", cell))
+        cell = unquoted(cell).replace("−", "-")
+    if is_missing(cell):
+        return float("nan")
+    # Exponents of Fortran's double precision, and of three digits, which it writes without a letter.
+    return float(re.sub(r"([\d.])[dD](?=[+-]?\d)|^([+-]?\d*\.\d*)(?=[+-]\d{3}$)", r"\1\2e", cell))
 
 
 #: Values of at least the first, or equal to the second, mark missing measurements: IRAF's INDEF, NetCDF's 9.97e36.
@@ -80,15 +80,6 @@ def marks_in(values: Float, noun: str) -> tuple[list[float], list[str]]:
             marks += [mark, -mark]
             remarks.append(f"{n} {noun} of {mark:.7g} mark missing values and are left undefined")
     return marks, remarks
-
-
-def plain_numbers(texts: list[str]) -> Float | None:
-    """Return texts as numbers, or None if one of them has another form than Python's, as `number_in` allows."""
-    # Python takes 1_000 for a number.
-    if "_" not in "".join(texts):
-        with contextlib.suppress(ValueError):
-            return np.array(list(map(float, texts)))
-    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,17 +165,16 @@ class Values:
         texts = np.ma.filled(values, "").ravel().tolist()
         if values.dtype.kind == "S":
             texts = list(map(_plain, texts))
-        if (found := plain_numbers(texts)) is not None:
-            return found.reshape(values.shape)
-        parsed = np.empty(len(texts))
-        for place, text in enumerate(texts):
-            try:
-                parsed[place] = number_in(text)
-            except ValueError as error:
-                row = start + place // max(1, int(np.prod(values.shape[1:]))) + 1
-                fault = f"{self.what}: {self.name!r} in row {row} must be {expected}, not {shortened(text, 40)}"
-                raise InputError(fault, key=self.name) from error
-        return parsed.reshape(values.shape)
+        parsed: list[float] = []
+        try:
+            parsed.extend(map(number_in, texts))
+        except ValueError as error:
+            # The texts before the first that is not a number are parsed.
+            text = texts[len(parsed)]
+            row = start + len(parsed) // max(1, int(np.prod(values.shape[1:]))) + 1
+            fault = f"{self.what}: {self.name!r} in row {row} must be {expected}, not {shortened(text, 40)}"
+            raise InputError(fault, key=self.name) from error
+        return np.array(parsed, float).reshape(values.shape)
 
 
 def _plain(text: Any) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from mauvecl.host.arrays import Float
 from mauvecl.host.tables.files import check_cells, parse_ecsv, parsing, read_text, reading
 from mauvecl.host.tables.names import angle_unit, in_brackets, is_missing
-from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, plain_numbers, unit_in, unquoted
+from mauvecl.host.tables.table import REMARKS, Values, is_known, number_in, unit_in, unquoted
 from mauvecl.host.tables.units import is_dated, is_stated, time_unit, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
@@ -129,21 +129,17 @@ class NumberLines:
         return Values(name, (len(self.cells),), partial(self._numbers, place), unit)
 
     def _numbers(self, place: int, start: int, stop: int) -> Any:
-        rows = self.cells[start:stop]
-        with contextlib.suppress(IndexError):
-            if (found := plain_numbers([cells[place] for cells in rows])) is not None:
-                return found
-        values = np.empty(len(rows))
-        for k, cells in enumerate(rows):
-            try:
-                values[k] = number_in(cells[place])
-            except (IndexError, ValueError) as error:
-                number, line = self.lines[start + k]
-                n = "one column" if len(cells) == 1 else f"{len(cells)} columns"
-                fault = "is not numeric" if len(cells) > place else f"has {n}"
-                fault = f"line {number}: {shortened(line, 60)} {fault}, but must hold {self.expected}"
-                raise InputError(fault, key="columns") from error
-        return values
+        values: list[float] = []
+        try:
+            for cells in self.cells[start:stop]:
+                values.append(number_in(cells[place]))
+        except (IndexError, ValueError) as error:
+            number, line = self.lines[start + len(values)]
+            n = "one column" if len(cells) == 1 else f"{len(cells)} columns"
+            fault = "is not numeric" if len(cells) > place else f"has {n}"
+            fault = f"line {number}: {shortened(line, 60)} {fault}, but must hold {self.expected}"
+            raise InputError(fault, key="columns") from error
+        return np.array(values, float)
 
 
 def _remark(line: str) -> str:
@@ -273,7 +269,10 @@ def _divided(
         units, at = first, at + 2
     elif _are_dashes(first):
         at += 1
-    elif second and _are_units(first, second):
+    elif not any(_is_cell_of_row(cell) and not is_missing(cell) for cell in first) and any(
+        _is_unit(cell) for cell, number in zip(first, second, strict=False) if _is_finite(number)
+    ):
+        # Units of the numbers below them.
         units, at = first, at + 1
     if not mark and all(name.endswith(",") for name in names[:-1]):
         # Commas divide the names and blanks the rows.
@@ -441,13 +440,6 @@ def _is_finite(cell: str) -> bool:
 def _are_dashes(row: list[str]) -> bool:
     """Return whether the cells of a row are dashes."""
     return any(row) and all(re.fullmatch(r":?[-=]*:?", cell) for cell in row)
-
-
-def _are_units(cells: list[str], below: list[str]) -> bool:
-    """Return whether the cells below the names of columns are units of the numbers below them."""
-    above = [cell for cell, number in zip(cells, below, strict=False) if _is_finite(number)]
-    is_row = any(_is_cell_of_row(cell) and not is_missing(cell) for cell in cells)
-    return not is_row and any(map(_is_unit, above))
 
 
 def _is_unit(text: str) -> bool:

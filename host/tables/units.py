@@ -15,7 +15,6 @@ import numpy as np
 from mauvecl.host.arrays import Float
 from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import DAY_S
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -415,13 +414,3 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
             raise InputError(fault, key=name)
     found[filled] = days - hours / 24
     return found
-
-
-def seconds_from_first(time: Float, unit: Any) -> tuple[Float, float]:
-    """Return times in seconds from the first, and the first in days from time zero."""
-    import astropy.units as u
-
-    finite = time[np.isfinite(time)]
-    first = float(finite.min()) if finite.size else 0.0
-    # Days since a date far in the past lose digits as seconds: subtract before the unit is changed.
-    return np.asarray(((time - first) * unit).to_value(u.s)), float((first * unit).to_value(u.s)) / DAY_S

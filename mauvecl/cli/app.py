@@ -213,7 +213,7 @@ def _tell(star: OwnStar, quiet: bool) -> None:
     lines = [f"Kept {star.name}: --star {name}", *star.notes, *star.messages]
     if star.unscaled:
         lines.append(f"It needs --magnitude: {star.unscaled}.")
-    if star.dereddened:
+    if any("dereddened" in note for note in star.notes):
         lines.append("Without its dust it is too bright in the ultraviolet: --ebv reddens it again.")
     show(lines)
 

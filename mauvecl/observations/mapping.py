@@ -212,7 +212,11 @@ def times_of(
             f"{time[0].name} of {file.what} is in TT, as in all files of CHEOPS; UTC is the scale of its other dates"
         )
     exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
-    seconds, first_d = units.seconds_from_first(np.mean(edges, axis=0) + offset, unit)
+    middles = np.mean(edges, axis=0) + offset
+    first = float(np.min(middles, where=np.isfinite(middles), initial=np.inf))
+    first = first if np.isfinite(first) else 0.0
+    # Days since a date far in the past lose digits as seconds: subtract before the unit is changed.
+    seconds, first_d = np.asarray(((middles - first) * unit).to_value(u.s)), float((first * unit).to_value(u.s)) / DAY_S
     at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
     if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
         span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))

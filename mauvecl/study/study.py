@@ -552,7 +552,12 @@ def stars_of(
     if names:
         # A name of an existing file is a file; other names are searched for in the library.
         each = [star for name in names for star in ([name] if is_there(name) else map(str.strip, name.split(",")))]
-        data: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
+        data: list[dict[str, Any]] = []
+        for name in each:
+            # "K2.5V" and "power law -1.5" look like file names but are stars.
+            suffix = Path(name).suffix[1:]
+            is_file = is_there(name) or (bool(suffix) and not suffix.isupper() and resolve(name) is None)
+            data.append({"file" if is_file else "library": name})
     else:
         data = [entry.model_dump(exclude_none=True) for entry in stars]
     if magnitudes:
@@ -576,9 +581,3 @@ def is_there(name: str) -> bool:
     except (OSError, ValueError):
         # Impossible file names raise an error.
         return True
-
-
-def _is_file(name: str) -> bool:
-    # "K2.5V" and "power law -1.5" look like file names but are stars.
-    suffix = Path(name).suffix
-    return is_there(name) or (bool(suffix) and not suffix[1:].isupper() and resolve(name) is None)
