@@ -22,7 +22,7 @@ from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason, barycentric
-from mauvecl.observations.spectra import EventSpectrum, SpectralSeries
+from mauvecl.observations.spectra import EventSpectrum
 from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
@@ -386,6 +386,19 @@ class AnalyseAnswer(Answer):
     frames = TableOf("frames", FRAMES, "analysis", cached=False, about=lambda answer: {
         "star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit,
         **answer.analysis.frames.time_keywords})  # fmt: skip
+    #: One row per event and measured quantity, with intervals.
+    measured = TableOf(
+        "measured", MEASURED, lambda answer: [row for row in answer.rows if not isinstance(row.measured, str)],
+        when="analysis.spectra", about=(),
+        title=lambda answer: "Measured in the summed spectra of each event" if len(answer.measured) else "",
+    )  # fmt: skip
+    #: One row per event and star in the fibre: the flare of that star which would look like the event.
+    neighbour_flares = TableOf(
+        "neighbour-flares", COLUMNS, "_flares_of_stars", when="study.has_neighbours",
+        title=lambda answer: answer.analysis.events and "Flares of each star in the fibre that would look like these "
+        f"events: {answer.study.flare.light().describe()}, amplitudes in the {answer.study.flare.band} band, for light "
+        "that is that of all stars in the fibre",
+    )  # fmt: skip
     #: One row per half-width and size of injected flares.
     completeness = TableOf("completeness", COMPLETENESS, "analysis", when="_has_level",
                            about=("analysis.threshold",))  # fmt: skip
@@ -400,30 +413,17 @@ class AnalyseAnswer(Answer):
         "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), about=(),
         title="What was tried for the quiescent light",
     )  # fmt: skip
-    #: One row per event and measured quantity, with intervals.
-    measured = TableOf(
-        "measured", MEASURED, lambda answer: [row for row in answer.rows if not isinstance(row.measured, str)],
-        when="_spectra", about=(),
-    )  # fmt: skip
     #: One row per pixel of spectra: noise as stated and as measured.
-    pixels = TableOf("noise-per-pixel", PIXELS, lambda answer: [spectra.noise for spectra in answer._spectra],
-                     when="_spectra", about=("analysis.frames.unit",))  # fmt: skip
+    pixels = TableOf("noise-per-pixel", PIXELS, "analysis.spectra.noise", when="analysis.spectra",
+                     about=("analysis.frames.unit",))  # fmt: skip
     #: One row per sudden change of the light that all pixels of spectra share.
     throughput = TableOf("throughput", THROUGHPUT, lambda answer: [
-        (spectra.cleaned.frames, change) for spectra in answer._spectra for change in spectra.changes
-    ], when="_spectra", about=())  # fmt: skip
-    #: One row per event and star in the fibre: the flare of that star which would look like the event.
-    neighbour_flares = TableOf("neighbour-flares", COLUMNS, "_flares_of_stars",
-                               when="study.has_neighbours")  # fmt: skip
+        (answer.analysis.spectra.cleaned.frames, change) for change in answer.analysis.spectra.changes
+    ], when="analysis.spectra", about=())  # fmt: skip
 
     @property
     def _has_level(self) -> bool:
         return bool(np.isfinite(self.analysis.level_ratio))
-
-    @property
-    def _spectra(self) -> list[SpectralSeries]:
-        """The analysis of the spectra, if they are searched with weights for flares."""
-        return [] if self.analysis.spectra is None else [self.analysis.spectra]
 
     @property
     def _flares_of_stars(self) -> Iterator[dict[str, object]]:
@@ -485,17 +485,7 @@ class AnalyseAnswer(Answer):
             f"Events {where}; detected above {analysis.threshold:.2f} ({wanted}), "
             f"candidates above {analysis.candidates:.2f}"
         )
-        views = [AnalyseAnswer.events.view(self, title)]
-        if len(self.measured):
-            views.append(AnalyseAnswer.measured.view(self, "Measured in the summed spectra of each event"))
-        if self.study.has_neighbours:
-            flare = self.study.flare
-            title = (
-                f"Flares of each star in the fibre that would look like these events: {flare.light().describe()}, "
-                f"amplitudes in the {flare.band} band, for light that is that of all stars in the fibre"
-            )
-            views.append(AnalyseAnswer.neighbour_flares.view(self, title))
-        return [*views, *super().views]
+        return [AnalyseAnswer.events.view(self, title), *super().views]
 
     @property
     def remarks(self) -> list[str]:

@@ -67,7 +67,8 @@ class TableOf:
     # Table for the answer and a row, with those of the columns that are not the row's own.
     of: Callable[[Any, Any], Table] | None = None
     place: bool = False  # whether columns of the star and of swept quantities precede those that are given
-    title: str | Callable[[Any], str] = ""  # of the printed view; without one there is none
+    title: str | Callable[[Any], str] = ""  # of the printed view; without one, or if it is empty, there is none
+    shown: Callable[[Any], Any] = lambda table: table  # rows of the table that the printed view has
     key: str = ""  # in JSON
     # Whether the answer has the table: an attribute, or a function of the answer; every answer has it by default.
     when: str | Callable[[Any], object] = lambda answer: True
@@ -108,13 +109,14 @@ class TableOf:
 
     def columns_of(self, answer: Answer) -> tuple[Column, ...]:
         """Return the columns for an answer."""
-        columns = self.columns(answer) if callable(self.columns) else self.columns
-        return answer.placed(columns) if self.place else tuple(columns)
+        every = self.columns(answer) if callable(self.columns) else self.columns
+        columns = tuple(column for column in every if column.when is None or column.when(answer))
+        return answer.placed(columns) if self.place else columns
 
     def view(self, answer: Answer, title: str = "", table: Table | None = None) -> View:
         """Return the printed view for an answer, under another title or of other rows if they are given."""
         title = title or (self.title(answer) if callable(self.title) else self.title)
-        return View(title, self.columns_of(answer), getattr(answer, self.name) if table is None else table)
+        return View(title, self.columns_of(answer), self.shown(getattr(answer, self.name)) if table is None else table)
 
 
 def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
@@ -173,7 +175,8 @@ class Answer(Drawable, ContentEquality):
     @property
     def views(self) -> list[View]:
         """Printed tables, for the terminal and the page."""
-        return [table.view(self) for table in self._declared() if table.title]
+        views = [table.view(self) for table in self._declared() if table.title]
+        return [view for view in views if view.title]
 
     @property
     def json_tables(self) -> dict[str, Table]:
@@ -308,10 +311,11 @@ NEIGHBOUR_COLUMNS = (
 )  # fmt: skip
 
 
-def share_columns(study: Study, get: str) -> tuple[Column, ...]:
-    """Return the column of the dilution, or nothing for studies without neighbours; `get` names it in a row."""
+def share_column(get: str) -> Column:
+    """Return the column of the dilution, for answers with neighbours; `get` names it in a row."""
     text = "share of the star in the electrons of all stars in the fibre, without a flare (dilution)"
-    return (Column("target_share", get, "", text, "star's share", percent(".3g")),) if study.has_neighbours else ()
+    return Column("target_share", get, "", text, "star's share", percent(".3g"),
+                  when=lambda answer: answer.study.has_neighbours)  # fmt: skip
 
 
 Item = TypeVar("Item")

@@ -27,7 +27,7 @@ from mauvecl.observations import detector
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, ThroughputModel, fit_throughput
-from mauvecl.schema.columns import Column, View, number, percent
+from mauvecl.schema.columns import Column, number, percent
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -137,14 +137,17 @@ class CalibrateAnswer(Answer):
         title=lambda answer: f"{answer.nominal.name} fitted to {len(answer.stars)} standard star"
         f"{'s' if len(answer.stars) > 1 else ''}; dark current at {answer.dark.reference_c:.1f} C",
     )  # fmt: skip
+    #: One row per pixel: fitted and nominal throughput.
+    throughput_table = TableOf(
+        "throughput", THROUGHPUT_COLUMNS, lambda answer: answer, title="Throughput, electrons per photon",
+        shown=lambda table: table[np.linspace(0, len(table) - 1, 11).astype(int)],
+    )  # fmt: skip
     #: One row per fit: its goodness.
     fits = TableOf("fits", FIT_COLUMNS, lambda answer: [
         (name, fit) for name, fit in (
             ("throughput", answer.throughput), ("dark current", answer.dark), ("photon transfer", answer.transfer)
         ) if fit.dof > 0
     ], title="Goodness of fit", key="fits", about=())  # fmt: skip
-    #: One row per pixel: fitted and nominal throughput.
-    throughput_table = TableOf("throughput", THROUGHPUT_COLUMNS, lambda answer: answer)
     #: One row per pixel: dark current and bias.
     dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=("dark.reference_c",))
     #: One row per observation and usable pixel: the variance of frames.
@@ -194,14 +197,6 @@ class CalibrateAnswer(Answer):
             f"The throughput of {self.nominal.name} is fitted to {len(self.observations)} observations, with a "
             f"standard error of {100 * float(np.median(self.throughput.error)):.2g} % in the median pixel."
         )
-
-    @property
-    def views(self) -> list[View]:
-        """Values, the throughput of some pixels, and the goodness of the fits."""
-        values, fits = super().views
-        rows = self.throughput_table
-        some = rows[np.linspace(0, len(rows) - 1, 11).astype(int)]
-        return [values, CalibrateAnswer.throughput_table.view(self, "Throughput, electrons per photon", some), fits]
 
     @property
     def messages(self) -> list[str]:

@@ -12,7 +12,7 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations import visits
-from mauvecl.schema.columns import Column, View, formatted, interval_columns, number, percent
+from mauvecl.schema.columns import Column, formatted, interval_columns, number, percent
 from mauvecl.study.cases import Case, Use, cases, collect_messages
 from mauvecl.study.plan import targets_of
 
@@ -182,6 +182,9 @@ class ChangeAnswer(Answer):
     period_table = TableOf(
         "periods", PERIOD_COLUMNS, "periods", place=True, when="periods",
         about=lambda answer: {"fap": answer.study.change.period_fap},
+        title=lambda answer: f"Periods of {answer.periods[0].change.name} that {answer.study.change.visits} visits "
+        "recover",
+        shown=lambda table: table[table["change"] == table["change"][0]],
     )  # fmt: skip
 
     @property
@@ -208,15 +211,6 @@ class ChangeAnswer(Answer):
             f"{instrument} would see a change of {_amount(row.smallest.one, unit)}{ideal} in {where} with a chance of "
             f"{100 * self.study.limit.power:g} %; one visit measures it to {_amount(row.error, unit)}."
         )
-
-    @property
-    def views(self) -> list[View]:
-        if not self.periods:
-            return super().views
-        name = self.periods[0].change.name
-        title = f"Periods of {name} that {self.study.change.visits} visits recover"
-        first = self.period_table[self.period_table["change"] == name]
-        return [*super().views, ChangeAnswer.period_table.view(self, title, first)]
 
     @property
     def messages(self) -> list[str]:

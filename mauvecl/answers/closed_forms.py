@@ -103,7 +103,7 @@ def _size(sd: float | str, unit: str) -> str:
 
 #: Column of the answer with everything but the noise known, the bound of the realistic answer next to it.
 IDEAL = Column("ideal", "", "", "detection probability if everything but the noise were known, for Gaussian noise",
-               "ideal", number(".4f"))  # fmt: skip
+               "ideal", number(".4f"), when=lambda answer: not answer.study.nuisances.none)  # fmt: skip
 
 
 def ideal_chances(case: Case, flares: Sequence[Expectation], statistics: Sequence[Statistic]) -> Float | None:

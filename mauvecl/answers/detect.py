@@ -12,7 +12,7 @@ import numpy as np
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap, countable
 from mauvecl.detection.chi2 import Smoothing
@@ -57,9 +57,8 @@ def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
     place = [column.name for column in COLUMNS].index("high") + 1
-    ideal = () if answer.study.nuisances.none else (forms.IDEAL,)
-    share = share_columns(answer.study, "detection.quiet.target_share")
-    return (*share, amplitude, *COLUMNS[1:place], *ideal, *COLUMNS[place:])
+    share = share_column("detection.quiet.target_share")
+    return (share, amplitude, *COLUMNS[1:place], forms.IDEAL, *COLUMNS[place:])
 
 
 def _rows_of(star: StarDetection, fap: float) -> QTable:
@@ -396,51 +395,36 @@ class UnknownAnswer(Answer):
     USES = ("instrument", "sky", "flare", "nuisances", "seed")
 
     study: Study
-    costs: dict[tuple[str, float], dict[str, forms.Cost]]  # by (star, amplitude), then by unknown
+    rows: list[dict[str, Any]]  # S/N of each flare under each unknown, by the names of columns
     messages: list[str]
     inputs: list[Expectation]  # the stars without a flare
 
     #: One row per star, flare and unknown.
     table = TableOf(
-        "unknowns", UNKNOWN_COLUMNS, "_rows",
+        "unknowns", UNKNOWN_COLUMNS, "rows",
         title="What unknowns cost: S/N of the matched statistic, by closed forms",
         about=("study.run.fap", "study.limit.power", "study"),
     )  # fmt: skip
 
-    def of_star(self, star: str) -> tuple[float, dict[str, forms.Cost]]:
-        """Return the amplitude of the first flare of a star, and its costs by unknown."""
-        return next((amplitude, costs) for (name, amplitude), costs in self.costs.items() if name == star)
-
-    def smallest(self, star: str, unknown: str | None) -> float:
-        """Return the flare amplitude detected with the study's power at its false-alarm probability, marginalised.
-
-        `unknown` is None for everything known. S/N grows with the amplitude; the flare's own photon noise is left out.
-        """
-        amplitude, costs = self.of_star(star)
-        snr = next(iter(costs.values())).known if unknown is None else costs[unknown].marginal
-        needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
-        return float(amplitude * needed / snr) if snr > 0 else float("inf")
-
-    @property
-    def _rows(self) -> Iterator[dict[str, Any]]:
-        for (star, amplitude), costs in self.costs.items():
-            for unknown, cost in costs.items():
-                detected = float(power(cost.marginal, self.study.run.fap))
-                yield vars(cost) | {"star": star, "amplitude": amplitude, "unknown": unknown, "detected": detected,
-                                    "smallest": self.smallest(star, unknown)}  # fmt: skip
-
 
 def unknown_table(study: Study) -> UnknownAnswer:
-    """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`."""
-    prepared, comparison = cases(study, swept=False), study.run.comparison()
-    costs = dict[tuple[str, float], dict[str, forms.Cost]]()
+    """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`.
+
+    S/N grows with the amplitude; the photon noise of the smallest flare is left out.
+    """
+    prepared, run, rows = cases(study, swept=False), study.run, list[dict[str, Any]]()
+    needed = special.ndtri(study.limit.power) - special.ndtri(run.fap)
     for case in prepared:
-        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
-            of = case.label, case.quiet, flare
-            each = {name: forms.unknown_cost(*of, choice, comparison) for name, choice in SHOWN.items()}
-            costs[case.label, amplitude] = each
+        flares = zip(case.amplitudes, case.flares, strict=True)
+        for (amplitude, flare), (unknown, choice) in product(flares, SHOWN.items()):
+            cost = forms.unknown_cost(case.label, case.quiet, flare, choice, run.comparison())
+            rows.append(vars(cost) | {
+                "star": case.label, "amplitude": amplitude, "unknown": unknown,
+                "detected": float(power(cost.marginal, run.fap)),
+                "smallest": float(amplitude * needed / cost.marginal) if cost.marginal > 0 else float("inf"),
+            })  # fmt: skip
     quiet = [case.quiet for case in prepared]
-    return UnknownAnswer(study, costs, collect_messages(quiet), quiet)
+    return UnknownAnswer(study, rows, collect_messages(quiet), quiet)
 
 
 def power(snr: float | Float, fap: float) -> Float:

@@ -161,16 +161,15 @@ def _words(column: Any) -> list[str] | None:
         return None
     if values.dtype.kind == "U":
         names, place = np.unique(values, return_inverse=True)
-        return np.array([_quoted(str(name)) for name in names], object)[place].tolist()  # type: ignore[no-any-return]
+        words = []
+        for name in names:
+            # Quoted if necessary, by the rules of `csv`.
+            line = io.StringIO()
+            csv.writer(line, delimiter=" ", lineterminator="").writerow([str(name), "end"])
+            words.append(line.getvalue().removesuffix(" end") or '""')
+        return np.array(words, object)[place].tolist()  # type: ignore[no-any-return]
     # A shorter float's digits are its own.
     return list(map(str, values.tolist() if values.dtype.kind != "f" or values.dtype == np.float64 else values))
-
-
-def _quoted(word: str) -> str:
-    """Quote a word if necessary, by the rules of `csv`."""
-    line = io.StringIO()
-    csv.writer(line, delimiter=" ", lineterminator="").writerow([word, "end"])
-    return line.getvalue().removesuffix(" end") or '""'
 
 
 def write_document(content: Callable[[], bytes], path: Path) -> Path:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.stares import Stares
@@ -126,7 +126,9 @@ DIFFERS = 4.0
 LEAST_CHANCE = 1e-5
 
 
+SHARE = share_column("survey.components.quiet.target_share")
 SEARCH_COLUMNS = (
+    SHARE,
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
     *interval_columns("threshold_{}", "threshold.{}", heading=INTERVAL, format=interval(".3f")),
     Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
@@ -241,10 +243,6 @@ class StarCompleteness(InCell):
         return messages
 
 
-def _share(answer: InjectAnswer) -> tuple[Column, ...]:
-    return share_columns(answer.study, "survey.components.quiet.target_share")
-
-
 def _search(answer: InjectAnswer) -> dict[str, object]:
     choice, flare = answer.study.search, answer.study.flare
     return {
@@ -265,11 +263,11 @@ class InjectAnswer(Answer):
     messages: list[str]
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
-    table = TableOf("limits", _share, "stars", of=lambda _, star: star.limits, place=True, about=_search)
+    table = TableOf("limits", (SHARE,), "stars", of=lambda _, star: star.limits, place=True, about=_search)
     #: One row per star, cell of the sweep, half-width and size.
-    completeness = TableOf("completeness", _share, "stars", of=lambda _, star: star.cells, place=True, about=_search)
+    completeness = TableOf("completeness", (SHARE,), "stars", of=lambda _, star: star.cells, place=True, about=_search)
     #: One row per star and cell of the sweep: thresholds, false alarms.
-    search = TableOf("search", lambda answer: (*_share(answer), *SEARCH_COLUMNS), "stars", place=True, about=_search)
+    search = TableOf("search", SEARCH_COLUMNS, "stars", place=True, about=_search)
 
     @property
     def headline(self) -> str:

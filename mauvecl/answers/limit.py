@@ -5,7 +5,7 @@ A limit is the value at which a detection probability crosses a power: the root 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import pairwise, product
@@ -17,7 +17,7 @@ import numpy as np
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.detection.distributions import Interval, smallest_integer
@@ -290,10 +290,30 @@ def what_matters(study: Study) -> QTable:
     """Compute the closed-form limits of a study with each assumption at both ends of its range.
 
     The table has one row per star, flare, statistic and assumption; for each limit, that which changes it most first.
+    Normal priors extend to one standard deviation (documentation: what is nominal).
     """
-    rows, flares = [], _single_flares(cases(study, swept=False))
-    for single, statistic in product(flares, study.run.statistics):
-        rows += sorted(_moves(single, statistic), key=lambda row: -row["span"])
+    rows = list[dict[str, Any]]()
+    for case, statistic in product(_single_flares(cases(study, swept=False)), study.run.statistics):
+        payload, nominal, moves = case.instrument, LimitSearch(case, statistic).root(), list[dict[str, Any]]()
+        values, changes = values_of(payload), dict[str, dict[str, Mapping[str, Any]]]()
+        for name, prior in Unknowns().priors(payload).items():
+            if isinstance(prior, Uniform):
+                ends = (prior.low, prior.high)
+            else:
+                ends = (prior.mean - prior.sd, prior.mean + prior.sd)
+            value = values[name]
+            changes[value.label] = {f"{end:g}": value.changes(payload, float(f"{end:.12g}")) for end in ends}
+        changes["dark counts are Poisson in"] = {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
+        for label, of_ends in changes.items():
+            changed = (replace(case, study=case.study.with_instrument(change)) for change in of_ends.values())
+            low, high = (LimitSearch(each, statistic).root(near=nominal) for each in changed)
+            low_end, high_end = of_ends
+            moves.append({
+                "star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0],
+                "statistic": statistic, "assumption": label, "low_end": low_end, "high_end": high_end,
+                "nominal": nominal, "at_low_end": low, "at_high_end": high, "span": abs(high - low),
+            })  # fmt: skip
+        rows += sorted(moves, key=lambda row: -row["span"])
     columns = assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
     for name in (study.limit.of, "at_low_end", "at_high_end", "span"):
@@ -326,29 +346,6 @@ def assumption_columns(of: str) -> tuple[Column, ...]:
         Column("at_high_end", "", "", "closed-form limit with the assumption at its upper end", "to", LIMIT),
         Column("span", "", "", f"how far the closed-form limit of {of} moves from end to end", "moves by", LIMIT),
     )  # fmt: skip
-
-
-def _moves(case: Case, statistic: str) -> Iterator[dict[str, Any]]:
-    """Yield the change of a limit with each assumption at both ends of its range, by the names of columns.
-
-    Normal priors extend to one standard deviation (documentation: what is nominal).
-    """
-    payload, nominal = case.instrument, LimitSearch(case, statistic).root()
-    values, changes = values_of(payload), dict[str, dict[str, Mapping[str, Any]]]()
-    for name, prior in Unknowns().priors(payload).items():
-        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
-        value = values[name]
-        changes[value.label] = {f"{end:g}": value.changes(payload, float(f"{end:.12g}")) for end in ends}
-    changes["dark counts are Poisson in"] = {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
-    limit = {"star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0], "statistic": statistic}
-    for label, of_ends in changes.items():
-        changed = (replace(case, study=case.study.with_instrument(change)) for change in of_ends.values())
-        low, high = (LimitSearch(each, statistic).root(near=nominal) for each in changed)
-        low_end, high_end = of_ends
-        yield limit | {
-            "assumption": label, "low_end": low_end, "high_end": high_end, "nominal": nominal, "at_low_end": low,
-            "at_high_end": high, "span": abs(high - low),
-        }  # fmt: skip
 
 
 #: Steps in which the progress of a limit is reported, since its number of simulations is not known beforehand.
@@ -420,16 +417,15 @@ STATISTIC_COLUMN = Column("statistic", description="detection statistic", headin
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], QUANTITIES[answer.study.limit.of].unit
     unknown = _unknown_columns(digits) if answer.study.unknowns.draws else ()
-    known = "the same for Gaussian noise if everything but the noise were known"
-    ideal = () if answer.study.nuisances.none else (Column("ideal", "", unit, known, "ideal", number(digits)),)
     return (
         *answer.flare_columns,
-        *share_columns(answer.study, "quiet.target_share"),
+        share_column("quiet.target_share"),
         Column(of, "value.value", unit, "where the flare is detected with the wanted probability",
                "exposure (s)" if of == "exposure" else of, digits),
         *interval_columns("{}", "value.{}", unit, "its 95 % interval, with the threshold's own", INTERVAL,
                           interval(digits)),
-        *ideal,
+        Column("ideal", "", unit, "the same for Gaussian noise if everything but the noise were known", "ideal",
+               number(digits), when=forms.IDEAL.when),
         Column("closed_form", "", unit, "the same for Gaussian noise", "closed form", digits, detail=True),
         Column("check", "check.probability.value", "", "detection probability there, with a fresh seed",
                "detected there, simulated again", ".4f", detail=True),

@@ -48,6 +48,7 @@ COLUMNS = (
     Column("probability", description="detection probability"),
     *interval_columns("{}", of="its 95 % interval, with the threshold's own"),
     Column("closed_form", description="the same for Gaussian noise"),
+    forms.IDEAL,
 )
 #: Arrays of the answer: chances and both ends of their interval, those of the closed form, and with everything known.
 NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
@@ -59,7 +60,6 @@ def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
         quantity_column(x, lambda answer: np.array(answer.x)),
         quantity_column(y, lambda answer: np.array(answer.y)[:, None]),
         *COLUMNS,
-        *(() if answer.study.nuisances.none else (forms.IDEAL,)),
     )
 
 

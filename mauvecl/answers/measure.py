@@ -29,7 +29,7 @@ from mauvecl.host.stars.spectrum import photons
 from mauvecl.noise.scene import drawn_factors
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of
+from mauvecl.schema.columns import Column, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case, Use, amplitude_column, cases, collect_messages
 from mauvecl.study.questions import check_sweep, fitted_models
@@ -358,6 +358,9 @@ COLUMNS = (
     Column("error_known", "known.errors", "", "standard error in advance, everything known", "ideal", number(".3g")),
     Column("error", "ahead.errors", "", "standard error in advance, unknowns marginalised over", "error",
            number(".3g")),
+    Column("error_throughput", "of_throughput", "",
+           "standard error by the calibration of the throughput, which all exposures share", "by throughput",
+           number(".4g"), when=lambda answer: any(flare.of_throughput is not None for flare in answer.flares)),
     Column("perfect", lambda row: row.perfect.estimates[0], "", "estimate from an exposure without noise",
            "fit without noise", number(".4g"), detail=True),
     *interval_columns("{}_68", lambda row: (row.perfect.low[0, 0], row.perfect.high[0, 0]), "",
@@ -378,12 +381,6 @@ COLUMNS = (
     Column("one_sided", lambda row: row.found.one_sided[-1].mean(axis=0), "", "share of 95 % intervals with one end",
            "one-sided", percent(".0f"), detail=True),
 )  # fmt: skip
-#: Column of errors that all exposures share, after the standard errors of one exposure.
-THROUGHPUT_COLUMN = Column("error_throughput", "of_throughput", "",
-                           "standard error by the calibration of the throughput, which all exposures share",
-                           "by throughput", number(".4g"))  # fmt: skip
-
-
 FIT_COLUMNS = (
     Column("snr", lambda row: row.snr[0], "", "S/N of the flare in one exposure, everything known", "ideal S/N", ".2f"),
     Column("snr_marginal", lambda row: row.snr[1], "", "the same, unknowns marginalised over", "S/N", ".2f"),
@@ -400,13 +397,6 @@ FIT_COLUMNS = (
     *interval_columns("detected_{}", "detected.{}"),
 )  # fmt: skip
 MODEL_COLUMN = Column("model", description="model that is fitted", heading="model", detail=True)
-
-
-def _quantity_columns(answer: MeasureAnswer) -> tuple[Column, ...]:
-    place = [column.name for column in COLUMNS].index("error") + 1
-    calibrated = any(flare.of_throughput is not None for flare in answer.flares)
-    by_throughput = (THROUGHPUT_COLUMN,) if calibrated else ()
-    return (amplitude_column(), MODEL_COLUMN, *COLUMNS[:place], *by_throughput, *COLUMNS[place:])
 
 
 #: Columns of joint fits of shape and spectrum.
@@ -448,18 +438,29 @@ class MeasureAnswer(Answer):
     stares: list[MeasuredStare] = field(default_factory=list)
 
     #: Errors, bias and coverage; one row per star, cell, flare, model and quantity.
-    table = TableOf("measure", _quantity_columns, "flares", place=True, key="rows")
-    #: Goodness of fit and detection; one row per star, cell, flare and model.
-    fits = TableOf("fits", (amplitude_column(), MODEL_COLUMN, *FIT_COLUMNS), "flares", place=True, key="fits")
+    table = TableOf(
+        "measure", (amplitude_column(), MODEL_COLUMN, *COLUMNS), "flares", place=True, key="rows",
+        title=lambda answer: f"Measured in one exposure; {answer.study.measure.fits} simulated fits of each flare",
+        shown=lambda table: table[table["unit"] != "erg / s"],
+    )  # fmt: skip
     #: Measurements against time; one row per star, cell and bin of its stare.
     temperatures = TableOf(
-        "temperatures", (MODEL_COLUMN,), lambda answer: answer.binned or QTable(), place=True, key="temperatures",
+        "temperatures",
+        lambda answer: [replace(MODEL_COLUMN, heading=""), *chain(*(_bin_columns(one) for one in answer.binned[:1]))],
+        lambda answer: answer.binned or QTable(), place=True, key="temperatures", when="study.measure.snr_per_bin",
         of=lambda _, stare: table_of(_bin_columns(stare), [stare]),
-        when="study.measure.snr_per_bin",
+        title=lambda answer: answer.binned and f"Measured along the stare, in bins of S/N "
+        f"{answer.study.measure.snr_per_bin:g}",
     )  # fmt: skip
     #: Joint fits of shape and spectrum; one row per star, cell and quantity.
-    joint = TableOf("joint", JOINT_COLUMNS, "stares", place=True, key="joint",
-                    when="study.measure.joint_fit")  # fmt: skip
+    joint = TableOf(
+        "joint", JOINT_COLUMNS, "stares", place=True, key="joint", when="study.measure.joint_fit",
+        title="One stare: shape and spectrum of the flare, fitted to all frames together",
+        shown=lambda table: table[table["unit"] != "erg / cm2"],
+    )  # fmt: skip
+    #: Goodness of fit and detection; one row per star, cell, flare and model.
+    fits = TableOf("fits", (amplitude_column(), MODEL_COLUMN, *FIT_COLUMNS), "flares", place=True, key="fits",
+                   title="Goodness of fit")  # fmt: skip
 
     @property
     def uses(self) -> tuple[Use, ...]:
@@ -483,19 +484,6 @@ class MeasureAnswer(Answer):
             f"{100 * flare.amplitude:g} % on {flare.title} in {flare.quiet.exposure_s:g} s with a standard error of "
             f"{error:.3g} {unit}{ideal}."
         )
-
-    @property
-    def views(self) -> list[View]:
-        title = f"Measured in one exposure; {self.study.measure.fits} simulated fits of each flare"
-        views = [MeasureAnswer.table.view(self, title, self.table[self.table["unit"] != "erg / s"])]
-        if self.binned:
-            title = f"Measured along the stare, in bins of S/N {self.study.measure.snr_per_bin:g}"
-            views.append(View(title, self.placed(_bin_columns(self.binned[0])), self.temperatures))
-        if self.study.measure.joint_fit:
-            title = "One stare: shape and spectrum of the flare, fitted to all frames together"
-            shown = self.joint[self.joint["unit"] != "erg / cm2"]
-            views.append(MeasureAnswer.joint.view(self, title, shown))
-        return [*views, MeasureAnswer.fits.view(self, "Goodness of fit")]
 
     @property
     def inputs(self) -> list[Expectation]:

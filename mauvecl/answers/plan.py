@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_columns
+from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_column
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.answers.verbs import Progress, by_keywords
@@ -313,7 +313,16 @@ def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float
     return np.asarray(np.clip(p @ (weights / weights.sum()), 0.0, 1.0))
 
 
-#: Columns of the table of targets, without false alarms, which precede the last.
+def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
+    """Return the column of errors by a calibrated throughput, for answers that have such an error."""
+    return Column(
+        name, lambda row: row.of_throughput[k] if row.of_throughput else np.nan, "",
+        f"relative standard error of {of} by the calibration of the throughput", heading, percent(".2g"),
+        when=lambda answer: any(target.of_throughput is not None for target in answer.planned),
+    )  # fmt: skip
+
+
+#: Columns of the table of targets.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
     Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f", detail=True),
@@ -332,16 +341,13 @@ COLUMNS = (
                       lambda low, high: "" if low is None else f"{low} to {high}", kind=int),
     Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f"), detail=True),
+    Column("false_alarms", lambda row: row.observation.case.study.search.rate * row.hours / 24, "", "expected of noise",
+           "false alarms", two_digits, detail=True),
+    share_column("observation.quiet.target_share"),
+    _throughput_column("E50_error", 0, "E50", "E50 by throughput"),
+    _throughput_column("expected_error", 1, "the recovered flares", "flares by throughput"),
     Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months",
            months, detail=True),
-)  # fmt: skip
-#: Columns of errors by a calibrated throughput.
-THROUGHPUT_COLUMNS = (
-    Column("E50_error", lambda row: row.of_throughput[0] if row.of_throughput else np.nan, "",
-           "relative standard error of E50 by the calibration of the throughput", "E50 by throughput", percent(".2g")),
-    Column("expected_error", lambda row: row.of_throughput[1] if row.of_throughput else np.nan, "",
-           "relative standard error of the recovered flares by the calibration of the throughput",
-           "flares by throughput", percent(".2g")),
 )  # fmt: skip
 #: Columns of the table of inputs.
 STAR_COLUMNS = (
@@ -382,14 +388,6 @@ ENERGY_COLUMNS = (
 )
 
 
-def _target_columns(answer: PlanAnswer) -> tuple[Column, ...]:
-    alarms = Column("false_alarms", lambda row: answer.study.search.rate * row.hours / 24, "", "expected of noise",
-                    "false alarms", two_digits, detail=True)  # fmt: skip
-    share = share_columns(answer.study, "observation.quiet.target_share")
-    calibrated = any(target.of_throughput is not None for target in answer.planned)
-    return (*COLUMNS[:-1], alarms, *share, *(THROUGHPUT_COLUMNS if calibrated else ()), COLUMNS[-1])
-
-
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
     """Answer of `plan`."""
@@ -401,7 +399,7 @@ class PlanAnswer(Answer):
     planned: tuple[Planned, ...]
 
     #: One row per target.
-    table = TableOf("plan", _target_columns, "planned", title=lambda answer: answer.heading, about=lambda answer: {
+    table = TableOf("plan", COLUMNS, "planned", title=lambda answer: answer.heading, about=lambda answer: {
         "start": answer.seen.times.iso(0.0), "days": answer.seen.times.days,
         "false_alarms_per_day": answer.study.search.rate, "study": answer.study.text()})  # fmt: skip
     #: Inputs, one row per target.

@@ -185,17 +185,15 @@ COLUMNS = (
     Column("frame_noise", lambda row: float(np.median(row.light.sd[:, 0] / row.light.mean[:, 0])), "",
            "standard deviation of a frame's own noise, relative to its light", "noise of a frame", percent(".3g")),
     Column("flares", lambda row: len(row.flares), "", "flares put into it"),
-)  # fmt: skip
-#: Additional columns if stares are searched.
-SEARCHED_COLUMNS = (
-    Column("threshold", "", "", "value of the search's statistic from which on it alarms"),
+    Column("threshold", "", "", "value of the search's statistic from which on it alarms",
+           when=lambda answer: answer.study.stare.search),
     Column("found", lambda row: -1 if np.isnan(row.threshold) else len(row.found), "",
-           "flares found; -1: not searched"),
+           "flares found; -1: not searched", when=lambda answer: answer.study.stare.search),
+    Column("saturated_frames", lambda row: np.count_nonzero(row.staring.quality), "",
+           "frames in which the mean of a used pixel reaches saturation", "saturated"),
+    Column("drifting_frames", "", "", "frames that lost light in pointing drifts, which are assumptions",
+           "drifting", when=lambda answer: answer.study.stare.pointing is not None),
 )  # fmt: skip
-SATURATED_COLUMN = Column("saturated_frames", lambda row: np.count_nonzero(row.staring.quality), "",
-                          "frames in which the mean of a used pixel reaches saturation", "saturated")  # fmt: skip
-POINTING_COLUMN = Column("drifting_frames", "", "", "frames that lost light in pointing drifts, which are assumptions",
-                         "drifting")  # fmt: skip
 #: Columns of the table of flares, for `StareFlare`.
 EVENT_COLUMNS = (
     Column("peak_time", "event.peak_s", "s", "from the start of the stare; tau = 0 of the shape", "peak at (s)", ".6g"),
@@ -290,10 +288,7 @@ class StareAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
-    table = TableOf("stare", lambda answer: (
-        *COLUMNS, *(SEARCHED_COLUMNS if answer.study.stare.search else ()), SATURATED_COLUMN,
-        *(() if answer.study.stare.pointing is None else (POINTING_COLUMN,)),
-    ), "stares", place=True, title="One stare each", key="stares", about=SEED)  # fmt: skip
+    table = TableOf("stare", COLUMNS, "stares", place=True, title="One stare each", key="stares", about=SEED)
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),

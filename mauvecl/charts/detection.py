@@ -241,22 +241,27 @@ def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable) -> 
 @picture_of("UnknownAnswer", "unknowns")
 def unknowns(answer: UnknownAnswer) -> Picture:
     """Plot closed-form power per star (dashed plain, solid marginalised), and the smallest amplitudes."""
+    from scipy.special import ndtri
+
     from mauvecl.answers.detect import power
 
-    stars = list(dict.fromkeys(star for star, _ in answer.costs))
-    fap, above, below = answer.study.run.fap, list[Panel](), list[Panel]()
+    stars, fap = list(dict.fromkeys(row["star"] for row in answer.rows)), answer.study.run.fap
+    needed, above, below = ndtri(answer.study.limit.power) - ndtri(fap), list[Panel](), list[Panel]()
     for star in stars:
-        amplitude, costs = answer.of_star(star)
-        relative = np.geomspace(0.03, 300.0, 200) * answer.smallest(star, None)
-        known_snr = next(iter(costs.values())).known
-        at = relative, power(known_snr * relative / amplitude, fap)
+        # Those of its first flare.
+        own = [row for row in answer.rows if row["star"] == star]
+        known, amplitude = own[0]["known"], own[0]["amplitude"]
+        least = amplitude * needed / known if known > 0 else float("inf")
+        relative = np.geomspace(0.03, 300.0, 200) * least
+        at = relative, power(known * relative / amplitude, fap)
         series: list[Series] = [Line("everything known", "text", width=4, at=at)]
-        smallest = [Dots("", "text", size=12, at=([0], [answer.smallest(star, None)]))]
-        for k, (colour, (unknown, cost)) in enumerate(zip(cycle(COLOURS), costs.items(), strict=False), 1):
-            marginal, plain = (power(snr * relative / amplitude, fap) for snr in (cost.marginal, cost.plain))
-            series.append(Line(unknown.replace("+-", "±"), colour, at=(relative, marginal)))
+        smallest = [Dots("", "text", size=12, at=([0], [least]))]
+        first = [row for row in own if row["amplitude"] == amplitude]
+        for k, (colour, row) in enumerate(zip(cycle(COLOURS), first, strict=False), 1):
+            marginal, plain = (power(row[name] * relative / amplitude, fap) for name in ("marginal", "plain"))
+            series.append(Line(row["unknown"].replace("+-", "±"), colour, at=(relative, marginal)))
             series.append(Line("", colour, dash="dashed", at=(relative, plain)))
-            smallest.append(Dots("", colour, size=12, at=([k], [answer.smallest(star, unknown)])))
+            smallest.append(Dots("", colour, size=12, at=([k], [row["smallest"]])))
         y = Axis("detection probability", limits=(-0.02, 1.02))
         above.append(Panel(Axis(QUANTITIES["amplitude"].label, log=True), y, series, star))
         below.append(Panel(Axis(ticks=((), ())), Axis("smallest flare amplitude", log=True), smallest))

@@ -39,6 +39,7 @@ class Column:
     # Type of the values, where it does not follow from them: in a table without rows, or with missing values.
     kind: type | None = None
     detail: bool = False  # whether people see the column only on request where the table is too wide
+    when: Callable[[Any], object] | None = None  # whether an answer has the column; without it, every answer does
 
     def value(self, row: object) -> Any:
         """Return the value or values of a row."""

@@ -417,7 +417,7 @@ def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
 def columns_of_plan(question: FieldValues) -> list[list[str]]:
     """Return the targets, and the columns that a plan will have."""
     names = [target["name"] for target in question.targets] or ["each target"]
-    headings = [column.heading for column in COLUMNS if column.heading]
+    headings = [column.heading for column in COLUMNS if column.heading and column.when is None]
     return [headings, *([name, *("·" for _ in headings[1:])] for name in names)]
 
 
