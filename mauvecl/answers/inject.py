@@ -308,9 +308,14 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
         raise InputError(f"the sweep needs quantities that injections have, but has {idle!r}", key="sweep")
     engine = engine or Stares()
     prepared = cases(study)
-    for case in prepared:
-        # Raise InputError for energies of stars of unknown size before the first search.
-        Sizes.chosen(case)
+    # Raise InputError for energies of stars of unknown size before the first search.
+    chosen = {Sizes.chosen(case).of: case.source.name for case in prepared}
+    if len(chosen) > 1:
+        raise InputError(
+            "injections.of must be 'amplitude' for stars of which some have no known size, such as "
+            f"{chosen['amplitude']}; or give its distance_pc",
+            key="injections.of",
+        )
     q = study.injections
     each = q.count * q.sizes * q.widths
 
