@@ -249,11 +249,14 @@ def measure_event(
     # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.
     gc.collect(1)
     return ObservedEvent(
-        found.value, first, last, brightest, found.half_width_s, float(flux.max()) / survey.level / of_star,
-        int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,
-        missing_s >= min(found.half_width_s, flares[0].half_width_s), summed / of_star, error / of_star,
-        fitted_s, (low[0], low[1]), (high[0], high[1]), tuple(flares), best.shape.name, chi2, dof,
-        bool((np.abs(middle[rows] - flares[0].peak_s) <= 1.5 * frame_s).any()), of_star,
+        value=found.value, first=first, last=last, brightest=brightest, half_width_s=found.half_width_s,
+        amplitude=float(flux.max()) / survey.level / of_star,
+        missing=int(numbers[last] - numbers[first] + 1 - flux.size), cut=cut, kind=kind,
+        gap_at_peak=missing_s >= min(found.half_width_s, flares[0].half_width_s),
+        summed_s=summed / of_star, summed_error_s=error / of_star,
+        fitted_s=fitted_s, low_s=(low[0], low[1]), high_s=(high[0], high[1]),
+        flares=tuple(flares), shape=best.shape.name, chi2=chi2, dof=dof,
+        peak_observed=bool((np.abs(middle[rows] - flares[0].peak_s) <= 1.5 * frame_s).any()), level=of_star,
     )  # fmt: skip
 
 
