@@ -298,6 +298,8 @@ def _indices(case: Case) -> list[IndexRow]:
         if lost[0]:
             value = width = np.nan
         flux = visits.flux_per_dn(quiet, case.instrument) * quiet.signal_dn
-        rows.append(IndexRow(case.label, case.at, index, weights, value, width, captured, error, known_error,
-                             quiet.wavelength_nm, flux, lost))  # fmt: skip
+        rows.append(IndexRow(
+            case.label, case.at, index, weights, value=value, equivalent_width_nm=width, captured=captured, error=error,
+            error_known=known_error, wavelength_nm=quiet.wavelength_nm, flux=flux, saturated=lost,
+        ))  # fmt: skip
     return rows

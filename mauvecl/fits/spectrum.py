@@ -393,8 +393,8 @@ class _Problem:
             log_k = np.column_stack([log_k, np.full(log_k.size, second[0])])
         return Measurement(
             model.names, model.units, model.bounds, derived_values(model, best.log_k, best.linear, factor), spread,
-            self.levels, *ends, chi2, np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain), log_k,
-            undimmed(best.linear, factor), factor,
+            self.levels, *ends, chi2=chi2, p_value=np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof=dof,
+            snr=np.sqrt(best.gain), log_k=log_k, amplitudes=undimmed(best.linear, factor), factor=factor,
         )  # fmt: skip
 
 

@@ -474,9 +474,10 @@ def fit_cooling(
     return Measurement(
         tuple(quantity.name for quantity in quantities), tuple(quantity.unit for quantity in quantities),
         (-np.inf,) + (0.0,) * (len(quantities) - 1),
-        estimates[None], spread[None], tuple(levels), low, high, np.array([best]),
-        np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
-        theta[3:4], np.exp(theta[2:3])[None], np.ones(1),
+        estimates[None], spread[None], tuple(levels), low, high,
+        chi2=np.array([best]), p_value=np.array([float(scipy.stats.chi2.sf(best, dof))]), dof=dof,
+        snr=np.array([np.sqrt(max(none - best, 0.0))]),
+        log_k=theta[3:4], amplitudes=np.exp(theta[2:3])[None], factor=np.ones(1),
     )  # fmt: skip
 
 

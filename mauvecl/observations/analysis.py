@@ -372,9 +372,11 @@ def analyse_frames(
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
     numbers = survey.stare.numbers[quiet]
     return Analysis(
-        frames, *frames.white_light, level, survey, wanted, *rates, threshold, candidates, dip, events,
-        inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
-        binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), series, seen, fitted,
+        frames, *frames.white_light, level, survey, wanted, *rates,
+        threshold=threshold, candidates=candidates, dip=dip, events=events,
+        completeness=inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
+        scatter=binned_scatter(numbers, residual @ middle), residual=residual, quiet=quiet,
+        likeness=likeness(numbers, residual), spectra=series, found=seen, fitted=fitted,
     )  # fmt: skip
 
 

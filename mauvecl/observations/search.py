@@ -387,8 +387,9 @@ class SeriesSurvey:
             templates, sums = weighted[0], weighted[1][used]
             directions = templates.directions[list(templates.chosen)]
         return cls(
-            stare, bank_of(stare, directions, shape), templates, sums, part, (WHITE,) * sums.shape[1], net, WHITE,
-            scale, typical, photon, frames.time_s[used], counts, weighted is not None,
+            stare, bank_of(stare, directions, shape), templates, sums,
+            variance=part, processes=(WHITE,) * sums.shape[1], flux=net, flux_process=WHITE, scale=scale, level=typical,
+            photon=photon, time_s=frames.time_s[used], counts=counts, weighted=weighted is not None,
         )  # fmt: skip
 
     @cached_property

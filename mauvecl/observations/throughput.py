@@ -336,8 +336,10 @@ def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) 
         Value(scale * float(shape[k] + (k == 2)), scale * float(sd[k])) if k < m else None
         for k, scale in enumerate((1.0, 1.0, fwhm, fwhm))
     )
-    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, chi2, dof,
-                         best.smoothing, apart or error, structure, tuple(assumed))  # fmt: skip
+    return ThroughputFit(
+        nm, log_factor, joint, shift, stretch, width, change, residual=residual, chi2=chi2, dof=dof,
+        smoothing=best.smoothing, spectrum_error=apart or error, structure=structure, assumed=tuple(assumed),
+    )  # fmt: skip
 
 
 def _iterated(model: ThroughputModel, error: float) -> _Linearised:
