@@ -56,7 +56,7 @@ $(PAGE)/.stamp: tools/page/package-lock.json
 check: .venv/test.stamp .venv/lint.stamp
 	@$(MAKE) --no-print-directory -j 2 lint quick
 
-QUICK := $(addprefix tests/,kernels noise statistics schema host study test_golden.py test_corpus.py)
+QUICK := $(addprefix tests/,kernels noise detection host study test_golden.py test_corpus.py)
 quick: .venv/test.stamp
 	$(PYTEST) -n 2 -q -m 'not long' $(QUICK)
 

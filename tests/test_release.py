@@ -134,6 +134,8 @@ def test_workflow_tests_every_python_and_pins_what_it_runs() -> None:
         run = set(jobs[job]["strategy"]["matrix"]["python"])
         assert run | {jobs["all"]["steps"][1]["with"]["python-version"]} == declared
     targets = set(re.findall(r"^([\w-]+):", text_of("Makefile"), re.MULTILINE))
+    (quick,) = re.findall(r"addprefix tests/,(.*)\)", text_of("Makefile"))
+    assert not [name for name in quick.split() if not (ROOT / "tests" / name).exists()]
     called = set(re.findall(r"run: (?:sudo )?make ([\w-]+)", text))
     assert {"quick", "lowest", "coverage", "dist", "try-wheel", "docs"} <= called <= targets
     # A tag can be moved to other code; a commit cannot.
