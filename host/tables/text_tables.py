@@ -248,8 +248,7 @@ def _divided(
     at = next((k for k, n in enumerate(widths) if (n > 1 if mark else n == width)), 0)
     head, rows = cells[at], cells[at + 1 :]
     # The last mark ends the lines, unless it is that of an empty column which has a name.
-    trailing = bool(mark and rows) and not any(row[-1] for row in rows)
-    trailing = trailing and (not head[-1] or len(rows[0]) > len(head))
+    trailing = bool(mark and rows) and not any(row[-1] for row in rows) and (not head[-1] or len(rows[0]) > len(head))
     if trailing:
         cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
     n = len(cells[at])

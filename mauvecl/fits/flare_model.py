@@ -162,21 +162,14 @@ class FlareModel:
         nodes = [BalmerFlare().nodes_nm, np.ravel(bands_nm), *(line.nodes_nm for line in chosen)]
         grid = np.unique(np.concatenate([GRID_NM, *nodes]))
         bodies = np.array([blackbody(grid, float(k)) for k in kelvin])
-        in_band = photons(star.wavelength_nm, star.flux_flam, band)
-        if not in_band > 0.0:
-            raise InputError(f"the star must have light in the band {band}, but has none", key="band")
-        # Flux at the telescope over that at the surface for an amplitude of one.
-        nm = star.wavelength_nm
-        scale = np.array([in_band / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
+        scale = _flux_ratios(star, band, kelvin)
         balmer = [balmer_continuum(grid, electron_temperature_k)] if jump else []
         names = ("amplitude", *(["balmer"] if jump else []), *(f"line {line.name}" for line in chosen))
         fluxes = np.vstack([scale[:, None] * bodies, *balmer, *(line.profile(grid) for line in chosen)])
         dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
         counts = np.asarray((response_matrix(instrument, grid, order) @ fluxes.T).T) * dn
         # Flux of each component in each range, and over all wavelengths, for an amplitude of one.
-        ranges = [(low, high, (grid >= low) & (grid <= high)) for low, high in bands_nm]
-        light = [(f"{low:g}-{high:g} nm", 10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
-                 for low, high, inside in ranges]  # fmt: skip
+        light = [(f"{low:g}-{high:g} nm", _light_between(grid, fluxes, low, high)) for low, high in bands_nm]
         edge = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
         whole = [(edge.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(edge.edge_flux)] if jump else []
         bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
@@ -279,6 +272,21 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
             values[:, q] = derived.offset + ratio(log_k) * over
     return values
+
+
+def _flux_ratios(star: Source, band: str, kelvin: Float) -> Float:
+    """Return flux at the telescope over that at the surface of flares with an amplitude of one, shape of `kelvin`."""
+    nm = star.wavelength_nm
+    light = photons(nm, star.flux_flam, band)
+    if not light > 0.0:
+        raise InputError(f"the star must have light in the band {band}, but has none", key="band")
+    return np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
+
+
+def _light_between(grid: Float, fluxes: Float, low: float, high: float) -> Float:
+    """Return the integrals of fluxes on a grid in nm over a range of wavelength, erg s-1 cm-2, shape (n_flux,)."""
+    inside = (grid >= low) & (grid <= high)
+    return np.asarray(10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
 
 
 def _derived(

@@ -275,9 +275,8 @@ def intervals(
 
     kelvin = np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
     columns: list[tuple[Float, Float]] = []
-    known: dict[bytes, tuple[float, tuple[Float, Float]]] = {}
+    known: dict[bytes, list[Float]] = {}
     for derived, spline in zip(model.derived, model.splines, strict=True):
-        times = 1.0
         if spline is None:
             ends = kelvin if derived.held is None else (np.full(low.size, derived.held),) * 2
         elif derived.factors is not None:
@@ -285,15 +284,14 @@ def intervals(
             size = float(derived.factors.max())
             alike = (derived.factors / size).astype(np.float32).tobytes()
             if alike not in known:
-                known[alike] = size, ends_of_sum(spline)
-            first, ends = known[alike]
-            times = size / first
+                known[alike] = [end / size for end in ends_of_sum(spline)]
+            ends = size * known[alike][0], size * known[alike][1]
         else:
             lowest, highest = _ratio_ends(faces, spline(x), least)
             ends = derived.offset + lowest, derived.offset + highest
         # Light that contradicts every factor above zero limits nothing.
         none = ends[0] > ends[1]
-        columns.append((times * np.where(none, -np.inf, ends[0]), times * np.where(none, np.inf, ends[1])))
+        columns.append((np.where(none, -np.inf, ends[0]), np.where(none, np.inf, ends[1])))
     lows, highs = (np.column_stack(side) for side in zip(*columns, strict=True))
     # A parabola through the outermost samples may exceed a bound.
     return np.maximum(lows, model.bounds) if profile.bounded else lows, highs

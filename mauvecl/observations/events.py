@@ -234,9 +234,8 @@ def measure_event(
     flares = [replace(f, amplitude=f.amplitude / of_star, equivalent_duration_s=f.equivalent_duration_s / of_star)
               for f in best.flares]  # fmt: skip
     summed, error = _summed(survey, taken, level, found)
-    kind = cause
-    if cause == "flare":
-        kind = _kind(window, [fit for fit in fits if fit.shape.name != GENERAL], summed, error)
+    published = [fit for fit in fits if fit.shape.name != GENERAL]
+    kind = _kind(window, published, summed, error) if cause == "flare" else cause
     flux = (survey.flux[rows] - level[rows]) * survey.scale
     # In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not near its peak.
     near = np.abs(middle[rows] - found.peak_s) <= found.half_width_s + frame_s
