@@ -65,7 +65,11 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 else:
                     hashed.update(repr(value).encode())
             given.call = arguments, named
-            return computed(hashed.digest())
+            try:
+                return computed(hashed.digest())
+            finally:
+                # The arguments may be large, and are not needed any more.
+                given.call = None
 
         return wrapper
 

@@ -1,6 +1,7 @@
 """Sources: photometry, dust-free flares and their spectra, extensions, and noise of measured spectra."""
 
 import re
+import tracemalloc
 import warnings
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,17 @@ def test_vega_has_its_catalogued_magnitude_and_ten_is_fainter() -> None:
     for band in ("Kepler", "GALEX NUV"):
         assert vega.magnitude(band) == vega.magnitude(band, "ab")
     np.testing.assert_allclose(SUN.at_magnitude(9.9).flux_flam, 0.1 * SUN.at_magnitude(7.4).flux_flam, rtol=1e-9)
+
+
+def test_spectra_are_released_after_their_magnitude_is_computed() -> None:
+    n = 500_000
+    star = Source(np.linspace(180.0, 1100.0, n), np.full(n, 1e-13), "mine", "made up")
+    Source.from_library("G2V").magnitude("V")
+    tracemalloc.start()
+    star.magnitude("V")
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert held < n, "bytes, of which the spectrum has 16 a point"
 
 
 def test_flares_do_not_depend_on_the_system_of_magnitudes() -> None:
