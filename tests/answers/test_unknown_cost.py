@@ -14,10 +14,9 @@ from commands import run
 from scenes import instrument
 from scipy import stats
 
-from mauvecl import Engine, Nuisances, Processes, Sky, Source, Study, detect, expect
+from mauvecl import Engine, Nuisances, Processes, Sky, Source, Study, detect, expect, unknown_table
 from mauvecl import limit as limiting_magnitude
 from mauvecl import map as detection_map
-from mauvecl.answers.detect import unknown_table
 from mauvecl.noise import unknowns
 from mauvecl.noise.scene import prepare
 
