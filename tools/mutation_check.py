@@ -79,6 +79,10 @@ MUTATIONS: dict[str, Mutation] = {
         "test_sky_follows_its_level[level0]",
         ('factors.medians["light"] * factors.medians["sky"] * sky_share(x) / light', "0.0 * sky_share(x) / light"),
     ),
+    "photons of neighbours taken for noise": (
+        "test_components_have_correct_sum_and_moments[mauve-apart]",
+        ("counted) - source - sky - neighbours", "counted) - source - sky"),
+    ),
     "unknowns marginalised without their prior": (
         "test_cost_equals_that_of_the_methods[nuisances1-5.65-5.91-the dark level (+-0.003 deg C)]",
         ("np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),

@@ -5,6 +5,7 @@ import os
 import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -141,7 +142,8 @@ def test_components_have_correct_sum_and_moments(engine: Engine, name: str, reci
     rays = recipe == "joint"
     sections = {"observation": {"instrument": name, "recipe": recipe}, "run": {"seed": 5}}
     sections |= {"processes": {"cosmic_rays": {}}} if rays else {}
-    study = Study.build({"star": [{"library": "G2V", "magnitude": 7.4}]} | sections, "test")
+    near = {"neighbours": str(Path(__file__).parents[1] / "data" / "studies" / "near.csv"), "neighbour_share": 0.5}
+    study = Study.build({"star": [{"library": "G2V", "magnitude": 7.4} | near]} | sections, "test")
     ((_, x, table),) = simulate(study, realisation=7).observations
     raw = engine.realise(x, start=7, count=1, seed=5, recipe=recipe, processes=study.processes)[0]
     assert ("cosmic_rays" in table.colnames) == rays
