@@ -163,10 +163,15 @@ def fitted_throughput(answer: CalibrateAnswer) -> Picture:
 
 
 def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
-    """Return name, wavelengths and averaged residuals of each star, without pixels that were not used."""
-    nm, each = answer.throughput.binned_residuals(BIN)
-    stars = zip(answer.stars, each, strict=True)
-    return [(star.name, nm[finite], row[finite]) for star, row in stars for finite in [np.isfinite(row)]]
+    """Return name, wavelengths and averaged residuals of each star, without groups of which no pixel was used."""
+    fit, rows = answer.throughput, list[tuple[str, Any, Any]]()
+    n = fit.wavelength_nm.size // BIN
+    nm = fit.wavelength_nm[: n * BIN].reshape(n, BIN).mean(axis=1)
+    for star, residual in zip(answer.stars, fit.residual[:, : n * BIN].reshape(-1, n, BIN), strict=True):
+        count = np.isfinite(residual).sum(axis=1)
+        used = count > 0
+        rows.append((star.name, nm[used], np.nansum(residual[used], axis=1) / np.sqrt(count[used])))
+    return rows
 
 
 @picture_of("CalibrateAnswer", "residuals")
