@@ -86,22 +86,12 @@ ANY_STAR = Star(library="G2V", magnitude=12.0)
 
 @dataclass(frozen=True, eq=False)
 class EventRow:
-    """An event, by its number, with the analysis that it belongs to."""
+    """An event with the analysis that it belongs to."""
 
     analysis: Analysis
-    number: int
     event: ObservedEvent
-
-    @property
-    def spectrum(self) -> EventSpectrum | None:
-        """Its spectrum, in spectra that are searched with weights for flares."""
-        return None if self.analysis.spectra is None else self.analysis.found[self.number]
-
-    @property
-    def measured(self) -> Measurement | str:
-        """The flare fitted to its spectrum, or the reason why none is."""
-        analysis = self.analysis
-        return "no spectra of the instrument are given" if analysis.spectra is None else analysis.fitted[self.number]
+    spectrum: EventSpectrum | None  # in spectra that are searched with weights for flares
+    measured: Measurement | str  # the flare fitted to its spectrum, or the reason why none is
 
     @property
     def unmeasured(self) -> str:
@@ -454,7 +444,9 @@ class AnalyseAnswer(Answer):
     @property
     def rows(self) -> list[EventRow]:
         """Events in order of time."""
-        return [EventRow(self.analysis, number, event) for number, event in enumerate(self.analysis.events)]
+        analysis = self.analysis
+        each = zip(analysis.events, analysis.found, analysis.fitted, strict=True)
+        return [EventRow(analysis, *one) for one in each]
 
     @property
     def json_tables(self) -> dict[str, Table]:

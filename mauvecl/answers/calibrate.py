@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
     from mauvecl.study.study import Study
 
-#: Change of temperature, deg C, within which consecutive dark frames are compared for their variance.
-SAME_TEMPERATURE_C = 0.05
 #: Knots of the written throughput factor, nm apart.
 KNOT_NM = 2.0
 #: Bands of equal width whose light the first modes of the throughput's errors determine.
@@ -437,7 +435,8 @@ def calibrate(
     for _ in range(2 if without else 1):
         dark = detector.fit_dark(without, nominal, noise)
         error = float(np.sqrt(dark.shared[0, 0]))
-        transfer = detector.fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
+        variances = detector.measured_variances(observations, dark, nominal)
+        transfer = detector.fit_photon_transfer(variances, nominal, error)
         noise = transfer.noise
     model = ThroughputModel(
         lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
@@ -471,21 +470,3 @@ def _observations(
             raise InputError.of("observations", observation.name, "frames that no other observation has")
         observations.append(observation)
     return nominal, tuple(observations)
-
-
-def _variances(
-    observations: tuple[detector.CalibrationFrames, ...], dark: detector.DarkFit, nominal: Instrument
-) -> list[NDArray[np.float64]]:
-    """Measure the variances of all observations, of dark frames apart for each temperature."""
-    variances = []
-    for observation in observations:
-        usable = observation.usable(nominal)
-        breaks = np.flatnonzero(np.abs(np.diff(observation.temperature_c)) > SAME_TEMPERATURE_C) + 1
-        for part in np.split(np.arange(observation.n_frames), breaks if observation.star is None else []):
-            if part.size < 3:
-                continue
-            same = replace(observation, raw_dn=observation.raw_dn[part], temperature_c=observation.temperature_c[part])
-            mean = dark.mean_dn(same)
-            light = np.zeros(mean.size) if observation.star is None else same.raw_dn.mean(axis=0) - mean
-            variances.append(detector.measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
-    return variances

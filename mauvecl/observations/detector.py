@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
@@ -90,6 +90,8 @@ class GoodnessOfFit:
         return float(scipy.stats.chi2.sf(self.chi2, self.dof))
 
 
+#: Change of temperature, deg C, within which consecutive dark frames are compared for their variance.
+SAME_TEMPERATURE_C = 0.05
 #: Variance of rounding to whole DN.
 ROUNDING = 1.0 / 12.0
 #: Iterations of the weights, which follow the fitted variances.
@@ -166,30 +168,38 @@ def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
     return np.asarray(np.mean(white**2, axis=0) / (1.0 - np.sum(basis**2, axis=0)) * scale**2 / 2)
 
 
-def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> Float:
+def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit, nominal: Instrument) -> Float:
     """Measure the variance of frames from differences of consecutive ones, where light and dark may jitter.
 
-    Returned are variance, light and dark of each usable pixel, and the degrees of freedom of the variance, shape
-    (4, n_pixel).
+    Returned are variance, light and dark of each usable pixel of each observation, of dark frames at each temperature,
+    and the degrees of freedom of the variance, shape (4, n_value).
     """
-    # A pixel that never changes is dead.
-    usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
-    steps = np.diff(raw_dn[:, usable], axis=0)
-    light, dark = light_dn[usable], dark_dn[usable]
-    variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, dark]))
-    n = len(steps)
-    # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann 1941).
-    dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
-    return np.array([variance, light, dark, dof])
+    measured = []
+    for one in observations:
+        breaks = np.flatnonzero(np.abs(np.diff(one.temperature_c)) > SAME_TEMPERATURE_C) + 1
+        for part in np.split(np.arange(one.n_frames), breaks if one.star is None else []):
+            if part.size < 3:
+                continue
+            same = replace(one, raw_dn=one.raw_dn[part], temperature_c=one.temperature_c[part])
+            # A pixel that never changes is dead.
+            usable = one.usable(nominal) & np.any(same.raw_dn != same.raw_dn[0], axis=0)
+            mean, steps = dark.mean_dn(same)[usable], np.diff(same.raw_dn[:, usable], axis=0)
+            light = np.zeros(mean.size) if one.star is None else same.raw_dn[:, usable].mean(axis=0) - mean
+            counts, n = mean - dark.bias_dn[usable], len(steps)
+            variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, counts]))
+            # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann
+            # 1941).
+            measured.append([variance, light, counts, np.full(light.size, 2 * n**2 / (3 * n - 1))])
+    return np.concatenate(measured, axis=1)
 
 
-def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_error_dn: float = 0.0) -> PhotonTransfer:
-    """Fit gain, read noise and the unit of dark counts to variances of `measured_variance` by weighted least squares.
+def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: float = 0.0) -> PhotonTransfer:
+    """Fit gain, read noise and the unit of dark counts to `measured_variances` by weighted least squares.
 
     The nominal values are kept where the data determine none. The standard error of the dark of a mean frame,
     `dark_error_dn`, moves the read noise.
     """
-    variance, light, dark, dof = np.concatenate(measured, axis=1)
+    variance, light, dark, dof = measured
     fits = {
         "DN": _fit(light, dark, variance, dof),
         "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof),

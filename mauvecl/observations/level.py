@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import scipy
@@ -13,6 +14,9 @@ from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
 from mauvecl.schema.fields import DAY_S
+
+if TYPE_CHECKING:
+    from mauvecl.observations.search import SeriesSurvey
 
 #: Standard deviation of a normal distribution in units of its median absolute deviation.
 PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
@@ -55,6 +59,20 @@ class QuiescentLevel:
     reasons: NDArray[np.int64]  # shape (n_frame,); why frames are not searched; see `frames.Reason`
     process: Process  # in standard deviations of the noise of a typical frame
     changes: tuple[tuple[int, float], ...] = ()  # first frames after steps of the level, and its relative changes
+
+    @classmethod
+    def of(
+        cls, frames: Frames, survey: SeriesSurvey, reasons: NDArray[np.int64], outside: Bool, seed: int, steps: Steps
+    ) -> Self:
+        """Return the level of all frames from those that are searched and `outside` of events."""
+        used, process = reasons == 0, survey.flux_process
+        quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
+        error = level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
+        level, sd, noise = (
+            np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
+            for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
+        )
+        return cls(level, sd, noise, excess, used & outside, reasons, process)
 
     def times(self, relative: Float) -> QuiescentLevel:
         """Return the level of light that was divided by one which changes in steps, shape (n_frame,)."""
@@ -111,25 +129,19 @@ def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) ->
     for rise_of, start, _ in sorted(rises, reverse=True):
         if inside[start]:
             continue
-        last = _first_faint(flux, start, float(flux[start]) + max(WITHIN * noise, DECAYED * rise_of))
+        # The first frames belong to the rise; it ends at the first of two faint frames in a row.
+        faint = float(flux[start]) + max(WITHIN * noise, DECAYED * rise_of)
+        first, size, last = start + 4, FIRST_PIECE, flux.size
+        while first + 1 < last:
+            below = flux[first : first + size + 1] < faint
+            ends = np.flatnonzero(below[:-1] & below[1:])
+            last = first + int(ends[0]) if ends.size else last
+            first, size = first + size, 2 * size
         more = int(np.count_nonzero(~inside[start + 1 : last + 1]))
         if n_inside + more <= MOST_GUESSED * flux.size:
             inside[start + 1 : last + 1] = True
             n_inside += more
     return inside
-
-
-def _first_faint(flux: Float, start: int, limit: float) -> int:
-    """Return the first of two frames in a row below a limit, from the fourth after `start` on, or the end."""
-    # The first frames belong to the rise.
-    first, size = start + 4, FIRST_PIECE
-    while first + 1 < flux.size:
-        faint = flux[first : first + size + 1] < limit
-        ends = np.flatnonzero(faint[:-1] & faint[1:])
-        if ends.size:
-            return first + int(ends[0])
-        first, size = first + size, 2 * size
-    return flux.size
 
 
 def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tuple[Float, float]:

@@ -62,7 +62,6 @@ class ThroughputFit(GoodnessOfFit):
     residual: Float  # shape (n_star, n_pixel); observed less fitted counts in standard deviations; NaN if not used
     chi2: float
     dof: float  # pixels less the effective number of parameters
-    smoothing: float  # weight of the squared second derivative
     spectrum_error: float  # relative error of the stars' spectra at each of `ERROR_KNOTS` knots
     structure: float  # relative standard deviation of the pixels about the spline; 0 if it follows the throughput
     assumed: tuple[str, ...]  # quantities that these stars do not determine
@@ -113,13 +112,13 @@ class _Linearised:
         n, pull = len(penalty), np.zeros_like(covariance)
         pull[:, :n] = self.smoothing * covariance[:, :n] @ penalty
         noise = covariance - pull @ covariance
-        variance = _diagonal(basis, covariance[:n, :n])
 
-        def mean(values: Float) -> float:
-            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
+        def spread(values: Float) -> Float:
+            """Return the variance of a curve at the pixels from the covariance of its coefficients."""
+            return np.asarray(np.einsum("pi,pi->p", basis @ values[:n, :n], basis))
 
-        bias = basis @ (pull @ self.found)[:n]
-        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
+        variance, bias = spread(covariance), basis @ (pull @ self.found)[:n]
+        of_noise, expected = (float(np.mean(spread(each) / variance)) for each in (pull @ noise @ pull.T, pull @ noise))
         if not expected > of_noise:
             return covariance
         scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
@@ -312,7 +311,7 @@ def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) 
     return ThroughputFit(
         nm, log_factor, joint, scale * (np.append(shape, np.zeros(4 - m)) + [0, 0, 1, 0]), scale * errors,
         residual=residual, chi2=chi2, dof=dof,
-        smoothing=best.smoothing, spectrum_error=apart or error, structure=structure, assumed=tuple(assumed),
+        spectrum_error=apart or error, structure=structure, assumed=tuple(assumed),
     )  # fmt: skip
 
 
@@ -348,11 +347,6 @@ def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
     second = BSpline(full, np.eye(knots + 3), 3).derivative(2)(nodes.ravel())
     weight = np.repeat(half, 2, axis=1).ravel()
     return design, np.asarray((second * weight[:, None]).T @ second)
-
-
-def _diagonal(basis: Float, covariance: Float) -> Float:
-    """Return the variance of a curve at the pixels from the covariance of its coefficients, shape (n_pixel,)."""
-    return np.asarray(np.einsum("pi,pi->p", basis @ covariance, basis))
 
 
 def _linear_basis(nm: Float) -> Float:
