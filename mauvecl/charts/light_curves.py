@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from mauvecl.charts import chart
 from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
@@ -377,7 +378,7 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     return Picture([row], (9.6, 2.9), title, ("grey: 95 % of independent, normal noise",), widths=(2, 1, 1))
 
 
-SCATTER = Chart(
+@Chart(
     "scatter", "Noise of quiescent frames", Axis("frames in a mean", log=True),
     Axis("scatter (noise of one frame)", log=True),
     (
@@ -385,21 +386,23 @@ SCATTER = Chart(
         Line("independent frames", name="white"),
         Dots("measured", "star", size=8, tips=("frames", "scatter")),
     ),
-)  # fmt: skip
-
-
-def scatter_series(answer: AnalyseAnswer) -> dict[str, Any]:
-    """Return the data of `SCATTER`, or nothing if there are too few quiescent frames."""
+).data("analyse", "Analyse checks the noise.")  # fmt: skip
+def scatter_of_means(closed: Any, answer: AnalyseAnswer) -> chart.ChartData:
+    """Return the scatter of means of quiescent frames against that of independent ones."""
     rows = answer.analysis.scatter
     if len(rows) < 2:
-        return {}
+        return chart.ChartData("Too few consecutive quiescent frames for means.")
+    text = "Quiescent frames are independent."
+    if red := next((row for row in rows if row.red), None):
+        of = "Single frames" if red.frames == 1 else f"Means of {red.frames} frames"
+        text = f"{of} scatter {red.measured / red.white:.2f} times as much as independent frames."
     x, low, high, white, measured = np.array([(r.frames, r.low, r.high, r.white, r.measured) for r in rows]).T
-    return {"range": (x, low, high), "white": (x, white), "measured": (x, measured)}
+    return chart.ChartData(text, {"range": (x, low, high), "white": (x, white), "measured": (x, measured)})
 
 
 @picture_of("AnalyseAnswer", "noise", when=lambda answer: len(answer.analysis.scatter) > 1)
 def observed_noise(answer: AnalyseAnswer) -> Picture:
     """Plot the scatter of means of quiescent frames against their number, and that of independent frames."""
-    panel, title = SCATTER.panel(scatter_series(answer)), f"{answer.analysis.frames.name}: quiescent frames"
+    panel = scatter_of_means.panel(scatter_of_means.series_of(answer))
     panel = replace(panel, x=replace(panel.x, ticks=([row.frames for row in answer.analysis.scatter],)))
-    return Picture([[panel]], (4.6, 3.2), title)
+    return Picture([[panel]], (4.6, 3.2), f"{answer.analysis.frames.name}: quiescent frames")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Strips, Targets
 from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of, styled_picture
 from mauvecl.schema.columns import First, with_error
@@ -129,41 +130,48 @@ def flares(source: Source, amplitudes: Sequence[float]) -> Panel:
 
 #: Pixels that are averaged for a point of the residuals, and values for one of the photon transfer.
 BIN, GROUPS = 16, 60
-THROUGHPUT = Chart(
+NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
+
+
+@Chart(
     "throughput", "Throughput: fitted and nominal", WAVELENGTH, Axis("electrons per photon (%)"),
     (
         Area("95 % interval", "star", "band", alpha=0.35),
         Line("fitted", "star", width=2, tips=("nm", "fitted (%)")),
         Line("nominal", dash="dashed"),
     ),
-)  # fmt: skip
-TRANSFER = Chart(
-    "transfer", "Photon transfer: variance of frames against their mean", Axis("fitted variance (DN²)", log=True),
-    Axis("measured variance (DN²)", log=True),
-    (Line("fitted"), Dots("measured", "star", size=6, tips=("fitted", "measured"))),
-)  # fmt: skip
-
-
-def throughput_series(answer: CalibrateAnswer) -> dict[str, Any]:
-    """Return the data of `THROUGHPUT`."""
+).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
+def calibrated_throughput(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
+    """Return the fitted throughput with its 95 % band, and the nominal one."""
     table = answer.throughput_table
     nm, wide = table["wavelength"].value, np.exp(1.96 * np.asarray(table["relative_error"]))
     fitted, nominal = (100 * np.asarray(table[name]) for name in ("throughput", "nominal"))
-    return {"band": (nm, fitted / wide, fitted * wide), "fitted": (nm, fitted), "nominal": (nm, nominal)}
+    text = f"{answer.notice} It is {table['ratio'].min():.3g} to {table['ratio'].max():.3g} times the nominal one."
+    band = (nm, fitted / wide, fitted * wide)
+    return chart.ChartData(text, {"band": band, "fitted": (nm, fitted), "nominal": (nm, nominal)})
 
 
 @picture_of("CalibrateAnswer", "throughput")
 def fitted_throughput(answer: CalibrateAnswer) -> Picture:
     """Plot the fitted throughput with its 95 % band next to the nominal one, and their ratio."""
-    series, nominal = throughput_series(answer), np.asarray(answer.throughput_table["nominal"])
-    above = THROUGHPUT.panel(series, f"nominal: {answer.nominal.name}")
-    ratio = THROUGHPUT.panel({name: (nm, *np.divide(y, 100 * nominal)) for name, (nm, *y) in series.items()})
-    below = Panel(WAVELENGTH, Axis("fitted / nominal"), [replace(item, listed=False) for item in ratio.series])
+    series, nominal = calibrated_throughput.series_of(answer), np.asarray(answer.throughput_table["nominal"])
+    above = calibrated_throughput.panel(series, f"nominal: {answer.nominal.name}")
+    series = {name: (nm, *np.divide(y, 100 * nominal)) for name, (nm, *y) in series.items()}
+    ratio = [replace(item, listed=False) for item in calibrated_throughput.panel(series).series]
+    below = Panel(WAVELENGTH, Axis("fitted / nominal"), ratio)
     return Picture([[above], [below]], (5.2, 4.6), f"Throughput {answer.source}", share_x=True)
 
 
-def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
-    """Return name, wavelengths and averaged residuals of each star, without groups of which no pixel was used."""
+@Chart(
+    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {BIN} pixels (sigma)"),
+    (
+        Targets("residual", tips=("residual (sigma)",)),
+        Rule("2 sigma", "threshold", "above", along="y", at=2.0),
+        Rule("2 sigma", "threshold", "below", along="y", listed=False, at=-2.0),
+    ),
+).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
+def residuals_of_stars(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
+    """Return the averaged residuals of each star, without groups of which no pixel was used."""
     fit, rows = answer.throughput, list[tuple[str, Any, Any]]()
     n = fit.wavelength_nm.size // BIN
     nm = fit.wavelength_nm[: n * BIN].reshape(n, BIN).mean(axis=1)
@@ -171,7 +179,8 @@ def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
         count = np.isfinite(residual).sum(axis=1)
         used = count > 0
         rows.append((star.name, nm[used], np.nansum(residual[used], axis=1) / np.sqrt(count[used])))
-    return rows
+    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
+    return chart.ChartData(f"Root mean square, 1 for noise alone: {words}; p = {fit.p_value:.2g}.", {"residual": rows})
 
 
 @picture_of("CalibrateAnswer", "residuals")
@@ -179,33 +188,42 @@ def calibration_residuals(answer: CalibrateAnswer) -> Picture:
     """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
     two = Strips(along="y", alpha=0.2, at=([-2], [2]))
     rows = [[Panel(WAVELENGTH, Axis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
-            for name, nm, row in residual_series(answer)]  # fmt: skip
+            for name, nm, row in residuals_of_stars.series_of(answer)["residual"]]  # fmt: skip
     title, notes = f"Observed less fitted spectra, means of {BIN} pixels", f"p-value {answer.throughput.p_value:.2g}"
     return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, ("grey: 2 sigma", notes), share_x=True, share_y=True)
 
 
-def transfer_series(answer: CalibrateAnswer) -> tuple[dict[str, Any], Any]:
-    """Return the data of `TRANSFER`, and the errors of the measured variances."""
+@Chart(
+    "transfer", "Photon transfer: variance of frames against their mean", Axis("fitted variance (DN²)", log=True),
+    Axis("measured variance (DN²)", log=True),
+    (Line("fitted"), Dots("measured", "star", size=6, tips=("fitted", "measured"))),
+).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
+def variances_of_frames(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
+    """Return the measured over the fitted variance."""
     t = answer.transfer
     # Dark counts have their own variance, which the fit includes.
     groups = np.array_split(np.argsort(t.model), GROUPS)
     model, measured = (np.array([values[group].mean() for group in groups]) for values in (t.model, t.variance))
-    error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])
-    return {"fitted": (model, model), "measured": (model, measured)}, error
+    text = f"Gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise {t.read_noise_dn:.3g} DN."
+    if "gain" in t.assumed:
+        text = "The frames do not determine the gain: it is nominal."
+    return chart.ChartData(text, {"fitted": (model, model), "measured": (model, measured)})
 
 
 @picture_of("CalibrateAnswer", "photon-transfer", when=lambda answer: "gain" not in answer.transfer.assumed)
 def photon_transfer(answer: CalibrateAnswer) -> Picture:
     """Plot the variance of frames against their mean, binned, with the fit and its residuals."""
-    t, (series, error) = answer.transfer, transfer_series(answer)
+    t, series = answer.transfer, variances_of_frames.series_of(answer)
     model, measured = series["measured"]
+    groups = np.array_split(np.argsort(t.model), GROUPS)
+    error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])
     off = Dots("", "star", size=6, at=(model, 100 * (measured / model - 1), 100 * error / model))
-    below = Panel(TRANSFER.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
+    below = Panel(variances_of_frames.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
     title = (
         f"Photon transfer: gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise "
         f"{with_error(t.read_noise_dn, t.read_noise_error)} DN; dark counts in {t.dark_unit}"
     )
-    return Picture([[TRANSFER.panel(series)], [below]], (4.6, 4.6), title, share_x=True)
+    return Picture([[variances_of_frames.panel(series)], [below]], (4.6, 4.6), title, share_x=True)
 
 
 @picture_of("CalibrateAnswer", "dark", when=lambda answer: answer.dark.dof > 0)

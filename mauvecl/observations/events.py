@@ -253,25 +253,6 @@ def _kind(window: Window, fits: Sequence[Fit], summed: float, error: float) -> K
     return "step" if _is_step(window, fits) else "flare"
 
 
-def _directions(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> list[tuple[float, float]]:
-    """Return the log weight of each direction of the bank, and its light relative to that of the event's direction."""
-    if len(survey.bank.directions) == 1:
-        return [(0.0, 1.0)]
-    scores = []
-    for direction in range(len(survey.bank.directions)):
-        window = Window.of(survey, taken, one, direction)
-        noise = np.diag(window.process) + window.noise
-        model = window.model(survey.bank.shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
-        weight = model / noise
-        outside = ~window.inside
-        level = float(np.average(window.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0
-        value = float(weight @ (window.values - level)) / np.sqrt(float(weight @ model))
-        scores.append((value, window.scale))
-    mine = scores[one.direction]
-    return [(0.5 * np.sign(value) * value**2 - 0.5 * mine[0] ** 2, mine[1] / scale * value / mine[0])
-            for value, scale in scores if value > 0]  # fmt: skip
-
-
 def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: DetectedEvent) -> tuple[float, float]:
     """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
 
@@ -454,7 +435,20 @@ def _posterior(window: Window, taken: Bool, fits: Sequence[Fit], poor: bool) -> 
         place = log_time(window.middle[window.inside], fits[int(np.argmax(totals))].flares[0])
         power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
         mixtures = [replace(m, log_weight=m.log_weight + (power - 1) * (m.log_total - totals.max())) for m in mixtures]
-    mixture = joined(mixtures)
-    # Flares of other temperatures have another light for the same sum.
+    mixture, survey, one = joined(mixtures), window.survey, window.one
+    if len(survey.bank.directions) == 1:
+        return mixture
+    # Flares of other temperatures have another light for the same sum: the S/N of each, and the value of its amplitude.
+    scores = []
+    for direction in range(len(survey.bank.directions)):
+        other = Window.of(survey, taken, one, direction)
+        noise = np.diag(other.process) + other.noise
+        model = other.model(survey.bank.shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+        weight, outside = model / noise, ~other.inside
+        level = float(np.average(other.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0
+        scores.append((float(weight @ (other.values - level)) / np.sqrt(float(weight @ model)), other.scale))
+    snr, scale = scores[one.direction]
+    every = [(0.5 * np.sign(value) * value**2 - 0.5 * snr**2, scale / own * value / snr)
+             for value, own in scores if value > 0]  # fmt: skip
     return joined([NormalMixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
-                   for weight, factor in _directions(window.survey, taken, window.one)])  # fmt: skip
+                   for weight, factor in every])  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import scipy
@@ -13,10 +12,8 @@ from numpy.typing import NDArray
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
-
-if TYPE_CHECKING:
-    from mauvecl.observations.search import SeriesSurvey
 
 #: Standard deviation of a normal distribution in units of its median absolute deviation.
 PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
@@ -40,6 +37,10 @@ NO_WEIGHT = 1e4
 MOST_BELOW = 0.03
 #: Smallest variance of the noise of a frame relative to the typical one.
 LEAST_VARIANCE = 0.1
+#: Smallest step from frame to frame as a share of the light; numbers of single precision are rounded by 1e-7.
+LEAST_NOISE = 1e-10
+#: Smallest number of frames without a fault.
+MIN_USABLE = 10
 #: Smallest and largest number of simulated light curves from which the standard error of the level is estimated, to
 #: 1 / sqrt(2 times as many), and number of values in all of them, which bounds the time.
 LEVEL_DRAWS, LEVEL_VALUES = (8, 32), 2**22
@@ -59,20 +60,6 @@ class QuiescentLevel:
     reasons: NDArray[np.int64]  # shape (n_frame,); why frames are not searched; see `frames.Reason`
     process: Process  # in standard deviations of the noise of a typical frame
     changes: tuple[tuple[int, float], ...] = ()  # first frames after steps of the level, and its relative changes
-
-    @classmethod
-    def of(
-        cls, frames: Frames, survey: SeriesSurvey, reasons: NDArray[np.int64], outside: Bool, seed: int, steps: Steps
-    ) -> Self:
-        """Return the level of all frames from those that are searched and `outside` of events."""
-        used, process = reasons == 0, survey.flux_process
-        quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
-        error = level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
-        level, sd, noise = (
-            np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
-            for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
-        )
-        return cls(level, sd, noise, excess, used & outside, reasons, process)
 
     def times(self, relative: Float) -> QuiescentLevel:
         """Return the level of light that was divided by one which changes in steps, shape (n_frame,)."""
@@ -157,6 +144,30 @@ def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tupl
         slope = max(float(apart @ (squared[quiet] - squared[quiet].mean())) / spread, 0.0)
     typical = float(np.median(squared[quiet]))
     return np.maximum(squared - slope * (flux - level), LEAST_VARIANCE * typical), slope
+
+
+def noise_of_frames(
+    frames: Frames, flux: Float, error: Float | None, level: Float, quiet: Bool, counts: float | None
+) -> tuple[Float, float]:
+    """Return the variance of the noise of each frame at its level, and its rise with the flux."""
+    if counts is not None:
+        return np.maximum(level, 1e-3 * float(np.median(level[quiet])) + 1e-300) / counts, 1.0 / counts
+    if error is not None:
+        return quiet_variance(flux, error, level, quiet)
+    spread = noise_of_steps(frames.numbers[quiet], flux[quiet])
+    return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
+
+
+def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
+    """Raise InputError if too few frames are without a fault, or if most of them have the same flux."""
+    usable = reasons == 0
+    if (n := usable.sum()) < MIN_USABLE:
+        raise InputError(f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {n}", key="frames")
+    flux = frames.white_light[0][usable]
+    if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
+        raise InputError(
+            f"{frames.name} must be a light curve with noise, but the flux of most frames is the same", key="flux"
+        )
 
 
 class LevelGiven:

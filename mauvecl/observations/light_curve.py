@@ -24,10 +24,12 @@ from mauvecl.observations.level import (
     MOST_BELOW,
     PER_MAD,
     QuiescentLevel,
+    check_usable,
     counts_per_unit,
     guess_flares,
+    level_error,
+    noise_of_frames,
     noise_of_steps,
-    quiet_variance,
     relative_level,
     single_frames,
 )
@@ -382,12 +384,8 @@ def _bright(survey: SeriesSurvey) -> Bool:
     return bright if bright.mean() < MOST_BRIGHT else np.zeros_like(bright)
 
 
-#: Smallest step from frame to frame as a share of the light; numbers of single precision are rounded by 1e-7.
-LEAST_NOISE = 1e-10
 #: Number of frames whose median is the level around a single bright frame.
 SPIKE_FRAMES = 9
-#: Smallest number of frames without a fault.
-MIN_USABLE = 10
 #: Largest number of times that single frames are left out and the rest is fitted again.
 ROUNDS = 3
 
@@ -414,7 +412,7 @@ def survey_light_curve(
             guessed[used] = guess_flares(frames.numbers[used], flux[used], least)
             level = np.full(flux.size, _mean(frames.name, flux[used & ~guessed], least))
         quiet = used & ~guessed
-        variance, photon = _noise(frames, flux, error, level, quiet, counts)
+        variance, photon = noise_of_frames(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
         survey, taken = fit_quiet_light(new, guessed[used], survey, fits)
@@ -434,7 +432,7 @@ def survey_light_curve(
     below = np.isfinite(flux) & (reasons != 0) & (flux - level < -FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     survey = survey.frames((reasons == 0)[np.searchsorted(frames.time_s, survey.time_s)])
-    light = QuiescentLevel.of(frames, survey, reasons, ~guessed, seed, steps.part(0.9, 1.0))
+    light = quiescent_light(frames, survey, reasons, ~guessed, seed, steps.part(0.9, 1.0))
     return survey, light.times(steps_of_level), frames
 
 
@@ -465,18 +463,6 @@ def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], 
     return frames, counts, reasons, level
 
 
-def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
-    """Raise InputError if too few frames are without a fault, or if most of them have the same flux."""
-    usable = reasons == 0
-    if (n := usable.sum()) < MIN_USABLE:
-        raise InputError(f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {n}", key="frames")
-    flux = frames.white_light[0][usable]
-    if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
-        raise InputError(
-            f"{frames.name} must be a light curve with noise, but the flux of most frames is the same", key="flux"
-        )
-
-
 def _mean(name: str, flux: Float, least: float) -> float:
     """Return the mean without outliers, which must not be zero; a median of whole numbers would be one of them."""
     middle = float(np.median(flux))
@@ -485,18 +471,6 @@ def _mean(name: str, flux: Float, least: float) -> float:
     if (mean := float(flux[near].mean())) == 0.0:
         raise InputError(f"{name}: the level of the star's light must not be zero", key="flux")
     return mean
-
-
-def _noise(
-    frames: Frames, flux: Float, error: Float | None, level: Float, quiet: Bool, counts: float | None
-) -> tuple[Float, float]:
-    """Return the variance of the noise of each frame at its level, and its rise with the flux."""
-    if counts is not None:
-        return np.maximum(level, 1e-3 * float(np.median(level[quiet])) + 1e-300) / counts, 1.0 / counts
-    if error is not None:
-        return quiet_variance(flux, error, level, quiet)
-    spread = noise_of_steps(frames.numbers[quiet], flux[quiet])
-    return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
 
 
 def _single(
@@ -511,3 +485,17 @@ def _single(
     if counts is None:
         flagged[single_frames(frames.numbers, sigmas, used)] |= Reason.SPIKE
     return flagged
+
+
+def quiescent_light(
+    frames: Frames, survey: SeriesSurvey, reasons: NDArray[np.int64], outside: Bool, seed: int, steps: Steps
+) -> QuiescentLevel:
+    """Return level, its error, and noise of all frames, from those that are searched and `outside` of events."""
+    used, process = reasons == 0, survey.flux_process
+    quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
+    error = level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
+    level, sd, noise = (
+        np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
+        for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
+    )
+    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process)

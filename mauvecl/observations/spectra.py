@@ -30,8 +30,8 @@ from mauvecl.observations.frame_model import (
     light_changes,
 )
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
-from mauvecl.observations.light_curve import check_usable, fit_quiet_light
+from mauvecl.observations.level import QuiescentLevel, check_usable, guess_flares, single_frames
+from mauvecl.observations.light_curve import fit_quiet_light, quiescent_light
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.errors import InputError
@@ -167,7 +167,7 @@ def survey_spectra(
         used = reasons == 0
     survey = survey.frames(reasons[np.searchsorted(frames.time_s, survey.time_s)] == 0)
     series = replace(series, excess=series.excess[used])
-    return survey, series, QuiescentLevel.of(frames, survey, reasons, ~events, seed, steps.part(0.9, 1.0))
+    return survey, series, quiescent_light(frames, survey, reasons, ~events, seed, steps.part(0.9, 1.0))
 
 
 def _weighted_sums(

@@ -11,9 +11,8 @@ from bokeh.palettes import interp_palette
 
 from mauvecl.answers.plan import COLUMNS
 from mauvecl.charts import chart, light_curves, spectra
-from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, ChartData, Custom, Own, Rule, Targets
+from mauvecl.charts.chart import Axis, Chart, ChartData, Custom, Own, Targets
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.columns import with_error
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
@@ -23,8 +22,6 @@ from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, unpack
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
-    from mauvecl.answers.analyse import AnalyseAnswer
-    from mauvecl.answers.calibrate import CalibrateAnswer
     from mauvecl.answers.change import ChangeAnswer
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.observations.analysis import Analysis
@@ -104,20 +101,6 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     return ChartData(text, series, {"deviation": {"low": -reach, "high": reach}})
 
 
-@light_curves.SCATTER.data("analyse", "Analyse checks the noise.")
-def scatter(closed: ClosedForms, answer: AnalyseAnswer) -> ChartData:
-    """Return the scatter of means of quiescent frames against that of independent ones."""
-    rows, series = answer.analysis.scatter, light_curves.scatter_series(answer)
-    red = next((row for row in rows if row.red), None) if series else None
-    text = "Analyse checks the noise."
-    if rows:
-        text = "Quiescent frames are independent." if series else "Too few consecutive quiescent frames for means."
-    if red is not None:
-        of = "Single frames" if red.frames == 1 else f"Means of {red.frames} frames"
-        text = f"{of} scatter {red.measured / red.white:.2f} times as much as independent frames."
-    return ChartData(text, series)
-
-
 def read_frames(question: FieldValues) -> dict[str, Any]:
     """Read the frames."""
     frames = read_frames_of(
@@ -138,50 +121,13 @@ ANALYSE = Tab(
     about="Flares in your own light curve or spectra: the noise is checked first, and every event has its false-alarm "
     "rate in the noise as measured. The star's fields are for spectra of Mauve.",
     chance=False,
-    pictures=(light_curve, dynamic_spectrum, scatter),
+    pictures=(light_curve, dynamic_spectrum, light_curves.scatter_of_means),
     files=dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse"),
     documents={"analyse.html": "analyse"},
     needs="frames",
     given=read_frames,
     words=name_of("frames", "no file of frames yet"),
 )
-
-
-NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
-
-
-@spectra.THROUGHPUT.data("calibrate", NO_OBSERVATIONS)
-def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
-    """Return the fitted throughput with its 95 % band, and the nominal one."""
-    ratio = answer.throughput_table["ratio"]
-    text = f"{answer.notice} It is {ratio.min():.3g} to {ratio.max():.3g} times the nominal one."
-    return ChartData(text, spectra.throughput_series(answer))
-
-
-@Chart(
-    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {spectra.BIN} pixels (sigma)"),
-    (
-        Targets("residual", tips=("residual (sigma)",)),
-        Rule("2 sigma", "threshold", "above", along="y", at=2.0),
-        Rule("2 sigma", "threshold", "below", along="y", listed=False, at=-2.0),
-    ),
-).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
-def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
-    """Return the residuals of each star."""
-    rows = spectra.residual_series(answer)
-    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
-    text = f"Root mean square, 1 for noise alone: {words}; p = {answer.throughput.p_value:.2g}."
-    return ChartData(text, {"residual": rows})
-
-
-@spectra.TRANSFER.data("calibrate", NO_OBSERVATIONS)
-def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
-    """Return the measured over the fitted variance."""
-    t = answer.transfer
-    text = f"Gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise {t.read_noise_dn:.3g} DN."
-    if "gain" in t.assumed:
-        text = "The frames do not determine the gain: it is nominal."
-    return ChartData(text, spectra.transfer_series(answer)[0])
 
 
 def read_observations(question: FieldValues) -> dict[str, Any]:
@@ -208,7 +154,7 @@ CALIBRATE = Tab(
     about="The instrument from frames of standard stars and of no light: throughput with its errors, dark current, "
     "gain and line width, next to the nominal values.",
     chance=False,
-    pictures=(throughput, residuals, photon_transfer),
+    pictures=(spectra.calibrated_throughput, spectra.residuals_of_stars, spectra.variances_of_frames),
     files=dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate"),
     documents={"instrument.zip": "calibrate"},
     needs="observations",
