@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
@@ -253,15 +253,16 @@ MOST = 3
 AROUND_NM = 15.0
 
 
-def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
-    """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
+def along_magnitude(answer: ChangeAnswer, scales: Mapping[str, float]) -> list[tuple[str, Any, Any]]:
+    """Return name, magnitudes and smallest changes of the first star, times the factor of their unit, where known."""
     from mauvecl.answers.change import MAGNITUDES
 
     lines = list[tuple[str, Any, Any]]()
-    for name in names:
-        own = [row for row in answer.along if row.change.name == name]
-        x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: MAGNITUDES.size]]).T
-        lines.append((shown_name(name), x[np.isfinite(y)], scale * y[np.isfinite(y)]))
+    for name, unit in dict.fromkeys((row.change.name, row.change.unit) for row in answer.along):
+        if unit in scales:
+            own = [row for row in answer.along if row.change.name == name][: MAGNITUDES.size]
+            x, y = np.array([(row.magnitude, row.smallest.one) for row in own]).T
+            lines.append((shown_name(name), x[np.isfinite(y)], scales[unit] * y[np.isfinite(y)]))
     return lines
 
 
@@ -276,8 +277,7 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
     (title,), star, row = titles, answer.study.star[0], []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
-        names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
-        lines = [line for line in along_magnitude(answer, names, 1 if unit else 100) if line[1].size]
+        lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
         here = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
         values, limits = [value for _, _, column in lines for value in column], None

@@ -20,13 +20,7 @@ from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import UNREPORTED, Steps
-from mauvecl.observations.search import (
-    NO_COLOUR_K,
-    SeriesSurvey,
-    SimulatedRate,
-    innovations,
-    simulated_rates,
-)
+from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey, SimulatedRate, innovations, simulated_rates
 from mauvecl.observations.spectra import (
     CAUSES,
     EventSpectrum,

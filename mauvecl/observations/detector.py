@@ -200,10 +200,7 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     `dark_error_dn`, moves the read noise.
     """
     variance, light, dark, dof = measured
-    fits = {
-        "DN": _fit(light, dark, variance, dof),
-        "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof),
-    }
+    fits = {"DN": _fit(light, dark, variance, dof), "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof)}
     better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
     assumed: tuple[str, ...] = ("unit of the dark counts",)
     if abs(better) > TELLS:

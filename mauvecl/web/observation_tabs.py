@@ -168,17 +168,15 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
 
     def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
         here = [row for row in answer.changes if row.change.unit in units]
-        lines, words, own = [], list[str](), list[float]()
-        for row in here:
-            change, scale = row.change.name, units[row.change.unit]
-            lines += spectra.along_magnitude(answer, [change], scale)
-            hidden = np.isinf(row.smallest.one)
-            words.append(f"{spectra.shown_name(change)} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
-            own += [] if hidden else [scale * row.smallest.one]
+        sizes = [units[row.change.unit] * row.smallest.one for row in here]
+        words = [f"{spectra.shown_name(row.change.name)} {'hidden' if np.isinf(size) else f'{size:.3g}'}"
+                 for row, size in zip(here, sizes, strict=True)]  # fmt: skip
+        own = [size for size in sizes if not np.isinf(size)]
         text = (
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
             f"{'; '.join(words) or 'none of this kind'}."
         )
+        lines = spectra.along_magnitude(answer, units)
         return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
 
     axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
