@@ -22,7 +22,7 @@ from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason, barycentric
-from mauvecl.observations.spectra import EventSpectrum
+from mauvecl.observations.spectra import EventSpectrum, event_colour
 from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
@@ -178,8 +178,15 @@ class EventRow:
 
     @cached_property
     def colour(self) -> tuple[float, float, float]:
-        """Colour of the event; see `Analysis.colour`."""
-        return self.analysis.colour(self.event)
+        """Blue over red rise with its error, and the p-value of no colour; NaN without spectra with errors."""
+        analysis, frames = self.analysis, self.analysis.frames
+        if frames.flux.ndim == 1 or frames.error is None:
+            return (np.nan,) * 3
+        used = np.flatnonzero(analysis.level.used)
+        inside, quiet = np.zeros((2, frames.n_frames), np.bool_)
+        inside[used[self.event.first : self.event.last + 1]] = True
+        quiet[used] = analysis.level.quiet[used] & ~analysis.inside
+        return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
     def note(self) -> str:

@@ -25,7 +25,6 @@ from mauvecl.observations.spectra import (
     CAUSES,
     EventSpectrum,
     SpectralSeries,
-    event_colour,
     event_spectrum,
     measure_flare,
     survey_spectra,
@@ -184,7 +183,7 @@ class Analysis:
         return series is not None and bool(series.changes) and bool(np.isfinite(series.jitters["light"]))
 
     @cached_property
-    def _inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> NDArray[np.bool_]:
         """Searched frames in events."""
         inside = np.zeros(self.survey.stare.n_frames, np.bool_)
         for one in self.events:
@@ -194,7 +193,7 @@ class Analysis:
     @property
     def in_events(self) -> float:
         """Share of the searched frames in events."""
-        return float(self._inside.mean())
+        return float(self.inside.mean())
 
     @property
     def crowded(self) -> bool:
@@ -206,17 +205,6 @@ class Analysis:
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: by the process, and with measured residuals."""
         return self.modelled.rate(event.value), self.measured.rate(event.value)
-
-    def colour(self, event: ObservedEvent) -> tuple[float, float, float]:
-        """Return blue over red rise with its error, and the p-value of no colour; NaN without spectra with errors."""
-        frames = self.frames
-        if frames.flux.ndim == 1 or frames.error is None:
-            return (np.nan,) * 3
-        used = np.flatnonzero(self.level.used)
-        inside, quiet = np.zeros((2, frames.n_frames), np.bool_)
-        inside[used[event.first : event.last + 1]] = True
-        quiet[used] = self.level.quiet[used] & ~self._inside
-        return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
     def dark_misleads(self) -> bool:
