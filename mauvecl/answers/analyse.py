@@ -22,7 +22,7 @@ from mauvecl.observations.events import GAP_FRAMES, ObservedEvent
 from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason, barycentric
-from mauvecl.observations.spectra import EventSpectrum
+from mauvecl.observations.spectra import EventSpectrum, event_colour
 from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
 from mauvecl.schema.errors import InputError
@@ -86,22 +86,12 @@ ANY_STAR = Star(library="G2V", magnitude=12.0)
 
 @dataclass(frozen=True, eq=False)
 class EventRow:
-    """An event, by its number, with the analysis that it belongs to."""
+    """An event with the analysis that it belongs to."""
 
     analysis: Analysis
-    number: int
     event: ObservedEvent
-
-    @property
-    def spectrum(self) -> EventSpectrum | None:
-        """Its spectrum, in spectra that are searched with weights for flares."""
-        return None if self.analysis.spectra is None else self.analysis.found[self.number]
-
-    @property
-    def measured(self) -> Measurement | str:
-        """The flare fitted to its spectrum, or the reason why none is."""
-        analysis = self.analysis
-        return "no spectra of the instrument are given" if analysis.spectra is None else analysis.fitted[self.number]
+    spectrum: EventSpectrum | None  # in spectra that are searched with weights for flares
+    measured: Measurement | str  # the flare fitted to its spectrum, or the reason why none is
 
     @property
     def unmeasured(self) -> str:
@@ -188,8 +178,15 @@ class EventRow:
 
     @cached_property
     def colour(self) -> tuple[float, float, float]:
-        """Colour of the event; see `Analysis.colour`."""
-        return self.analysis.colour(self.event)
+        """Blue over red rise with its error, and the p-value of no colour; NaN without spectra with errors."""
+        analysis, frames = self.analysis, self.analysis.frames
+        if frames.flux.ndim == 1 or frames.error is None:
+            return (np.nan,) * 3
+        used = np.flatnonzero(analysis.level.used)
+        inside, quiet = np.zeros((2, frames.n_frames), np.bool_)
+        inside[used[self.event.first : self.event.last + 1]] = True
+        quiet[used] = analysis.level.quiet[used] & ~analysis.inside
+        return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
     def note(self) -> str:
@@ -454,7 +451,9 @@ class AnalyseAnswer(Answer):
     @property
     def rows(self) -> list[EventRow]:
         """Events in order of time."""
-        return [EventRow(self.analysis, number, event) for number, event in enumerate(self.analysis.events)]
+        analysis = self.analysis
+        each = zip(analysis.events, analysis.found, analysis.fitted, strict=True)
+        return [EventRow(analysis, *one) for one in each]
 
     @property
     def json_tables(self) -> dict[str, Table]:

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
     from mauvecl.study.study import Study
 
-#: Change of temperature, deg C, within which consecutive dark frames are compared for their variance.
-SAME_TEMPERATURE_C = 0.05
 #: Knots of the written throughput factor, nm apart.
 KNOT_NM = 2.0
 #: Bands of equal width whose light the first modes of the throughput's errors determine.
@@ -172,12 +170,10 @@ class CalibrateAnswer(Answer):
             Fitted("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN"),
         ]
         rows = [replace(row, error=np.nan) if row.name in (*d.assumed, *t.assumed) else row for row in rows]
-        for name, fit, usual in (
-            ("wavelength shift", f.shift_nm, 0.0), ("wavelength stretch", f.stretch_nm, 0.0),
-            ("line width", f.fwhm_nm, n.gaussian_fwhm_nm), ("line width, change to the red", f.fwhm_change_nm, 0.0),
-        ):  # fmt: skip
-            rows.append(Fitted(name, *((fit.value, fit.error) if fit else (usual, np.nan)), usual, "nm"))
-        return rows
+        names = ("wavelength shift", "wavelength stretch", "line width", "line width, change to the red")
+        usual = (0.0, 0.0, n.gaussian_fwhm_nm, 0.0)
+        shapes = zip(names, f.shape_nm.tolist(), f.shape_error_nm.tolist(), usual, strict=True)
+        return [*rows, *(Fitted(*each, "nm") for each in shapes)]
 
     @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:
@@ -211,8 +207,7 @@ class CalibrateAnswer(Answer):
                 "The dark current of single pixels rises differently with temperature: the instrument file has the "
                 f"common slope (p = {self.dark.slopes_p_value:.2g})."
             )
-        change = self.throughput.fwhm_change_nm
-        if change is not None and abs(change.value) > 3 * change.error:
+        if abs(self.throughput.shape_nm[3]) > 3 * self.throughput.shape_error_nm[3]:
             lines.append("The line width changes along the spectrum: the instrument file has its mean.")
         saturated = [lit.name for lit in self.stars if not lit.usable(self.nominal).all()]
         if saturated:
@@ -284,19 +279,21 @@ class CalibrateAnswer(Answer):
             volts = n.adc_range_v / 2**n.adc_bits
             values["conversion_uv_per_electron"] = float(t.noise.gain * volts * 1e6)
             values |= {"read_noise_dn": t.read_noise_dn, "dark_unit": t.dark_unit}
-        if f.shift_nm is not None and f.stretch_nm is not None:
+        shift, stretch, fwhm = f.shape_nm[:3].tolist()
+        fitted = np.isfinite(f.shape_error_nm)
+        if fitted[0]:
             # A feature is found at a pixel whose nominal wavelength is too small by the shift.
             half = np.ptp(f.wavelength_nm) / 2
-            values["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + f.stretch_nm.value / half)
+            values["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + stretch / half)
             first = n.pixel_zero_nm - f.wavelength_nm.mean()
-            values["pixel_zero_nm"] = n.pixel_zero_nm + f.shift_nm.value + f.stretch_nm.value * first / half
+            values["pixel_zero_nm"] = n.pixel_zero_nm + shift + stretch * first / half
             # The pixels that were observed stay those that are read.
             step, read = values["dispersion_nm_per_pixel"], n.read_pixels
             lowest, highest = (values["pixel_zero_nm"] + step * end for end in (read.start - 0.5, read.stop - 0.5))
             values["output_min_nm"] = max(n.output_min_nm, float(lowest))
             values["output_max_nm"] = min(n.output_max_nm, float(highest))
-        if f.fwhm_nm is not None:
-            values["gaussian_fwhm_nm"] = f.fwhm_nm.value
+        if fitted[2]:
+            values["gaussian_fwhm_nm"] = fwhm
         return values
 
     @cached_property
@@ -433,14 +430,14 @@ def calibrate(
     nominal, observations = _observations(study, frames, stars)
     lit = [observation for observation in observations if observation.star is not None]
     without = [observation for observation in observations if observation.star is None]
-    dark = detector.assumed_dark(nominal, nominal.wavelength_nm.size)
-    if without:
-        dark = detector.fit_dark(without, nominal, detector.NoiseModel.nominal(nominal))
-    transfer = detector.fit_photon_transfer(_variances(observations, dark, nominal), nominal)
-    if without:
-        dark = detector.fit_dark(without, nominal, transfer.noise)
+    noise = detector.NoiseModel.nominal(nominal)
+    # The dark current is fitted again with the noise as fitted.
+    for _ in range(2 if without else 1):
+        dark = detector.fit_dark(without, nominal, noise)
         error = float(np.sqrt(dark.shared[0, 0]))
-        transfer = detector.fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
+        variances = detector.measured_variances(observations, dark, nominal)
+        transfer = detector.fit_photon_transfer(variances, nominal, error)
+        noise = transfer.noise
     model = ThroughputModel(
         lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
         light_error=asked.light_error,
@@ -473,21 +470,3 @@ def _observations(
             raise InputError.of("observations", observation.name, "frames that no other observation has")
         observations.append(observation)
     return nominal, tuple(observations)
-
-
-def _variances(
-    observations: tuple[detector.CalibrationFrames, ...], dark: detector.DarkFit, nominal: Instrument
-) -> list[NDArray[np.float64]]:
-    """Measure the variances of all observations, of dark frames apart for each temperature."""
-    variances = []
-    for observation in observations:
-        usable = observation.usable(nominal)
-        breaks = np.flatnonzero(np.abs(np.diff(observation.temperature_c)) > SAME_TEMPERATURE_C) + 1
-        for part in np.split(np.arange(observation.n_frames), breaks if observation.star is None else []):
-            if part.size < 3:
-                continue
-            same = replace(observation, raw_dn=observation.raw_dn[part], temperature_c=observation.temperature_c[part])
-            mean = dark.mean_dn(same)
-            light = np.zeros(mean.size) if observation.star is None else same.raw_dn.mean(axis=0) - mean
-            variances.append(detector.measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
-    return variances

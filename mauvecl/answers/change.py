@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -286,20 +287,30 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
 
 
 def _indices(case: Case) -> list[IndexRow]:
-    quiet, unknown, rows = case.quiet, case.unknowns(), []
-    first, last = quiet.wavelength_nm[[0, -1]]
+    """Return the line indices of a case's star whose bands and continua the instrument covers."""
+    quiet, instrument, unknown, rows = case.quiet, case.instrument, case.unknowns(), []
+    nm, flux_per_dn = quiet.wavelength_nm, visits.flux_per_dn(quiet, instrument)
     for index in visits.INDICES.values():
-        if not first <= index.continuum_nm[0][0] < index.continuum_nm[-1][1] <= last:
+        low, high = index.continuum_nm[0][0], index.continuum_nm[-1][1]
+        if not nm[0] <= low < high <= nm[-1]:
             continue
-        order = case.study.observation.order
-        weights, value, width, captured = visits.index_of(index, quiet, case.instrument, order)
+        # The index is linear in the pixels near it.
+        near = (nm > low - 1.0) & (nm < high + 1.0)
+        find = partial(visits.line_index, nm[near], band_nm=index.band_nm, continuum_nm=index.continuum_nm)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Pixels of the band alone have no continuum, and no equivalent width.
+            part = find(np.eye(int(near.sum())))
+        weights = np.zeros(nm.size)
+        weights[near] = part.flux * flux_per_dn[near]
+        flux = flux_per_dn * quiet.signal_dn
+        mean, lost = find(flux[near]), visits.pixels_of(weights, quiet)
+        order, band = case.study.observation.order, case.study.change.band
+        line = visits.Change.named(index.name, case.source, quiet, instrument, order, None, band)
         error, known_error = (visits.error_of_index(weights, quiet, nuisances) for nuisances in (unknown, None))
-        lost = visits.pixels_of(weights, quiet)
-        if lost[0]:
-            value = width = np.nan
-        flux = visits.flux_per_dn(quiet, case.instrument) * quiet.signal_dn
         rows.append(IndexRow(
-            case.label, case.at, index, weights, value=value, equivalent_width_nm=width, captured=captured, error=error,
-            error_known=known_error, wavelength_nm=quiet.wavelength_nm, flux=flux, saturated=lost,
+            case.label, case.at, index, weights, value=np.nan if lost[0] else float(mean.flux),
+            equivalent_width_nm=np.nan if lost[0] else float(mean.equivalent_width_nm),
+            captured=float(weights @ line.counts_dn), error=error, error_known=known_error, wavelength_nm=nm, flux=flux,
+            saturated=lost,
         ))  # fmt: skip
     return rows

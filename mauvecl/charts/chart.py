@@ -206,6 +206,11 @@ class Chart:
         """
         return lambda fill: replace(self, fill=fill, of=of, before=before)
 
+    def series_of(self, answer: Any) -> dict[str, Any]:
+        """Return the data of the series for the answer that the chart is of."""
+        assert self.fill is not None
+        return dict(self.fill(None, answer).series)
+
     def drawn(self, closed: Any, answers: Mapping[str, Any]) -> dict[str, Any]:
         """Return the text, the columns of the page's data sources, properties of models, and entries of the legend."""
         data = ChartData(self.before)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from mauvecl.charts import chart
 from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
@@ -22,8 +23,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.inject import InjectAnswer
     from mauvecl.answers.stare import StareAnswer, StarStare
     from mauvecl.flares.stare import Stare
-    from mauvecl.observations.analysis import Analysis
-    from mauvecl.observations.events import ObservedEvent
+    from mauvecl.observations.frames import Frames
 
 #: Labels of the size axes.
 SIZES = {
@@ -188,19 +188,14 @@ def spectra_panel(
     scale, unit = time_unit(stare.duration_s)
     # The stare is shown on a regular grid with empty gaps.
     numbers = stare.numbers - stare.numbers[0]
-    step = -(-(int(numbers[-1]) + 1) // MOST_ROWS)
-    rows = numbers // step
-    n_rows = int(rows[-1]) + 1
-
-    def summed(values: NDArray[Any]) -> Float:
-        return np.array([np.bincount(rows, column, minlength=n_rows) for column in values.T]).T
-
+    excess, _, step = column_sums(spectra - np.median(spectra, axis=0), numbers, MOST_ROWS)
+    variance = column_sums(sd.astype(np.float64) ** 2, numbers, MOST_ROWS)[0]
     # Columns without frames are 0 / 0.
     with np.errstate(invalid="ignore", divide="ignore"):
-        image = summed(spectra - np.median(spectra, axis=0)) / np.sqrt(summed(sd.astype(np.float64) ** 2))
+        image = excess / np.sqrt(variance)
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
     half = (wavelength_nm[1] - wavelength_nm[0]) / 2 if wavelength_nm.size > 1 else 5.0
-    time = np.arange(n_rows + 1) * step * stare.frame_s / scale
+    time = np.arange(len(image) + 1) * step * stare.frame_s / scale
     nm = np.linspace(wavelength_nm[0] - half, wavelength_nm[-1] + half, wavelength_nm.size + 1)
     label = "standard deviations from the median"
     mesh = Mesh(label, low=-reach, high=reach, palette="RdBu_r", at=(time, nm, image.T))
@@ -215,6 +210,19 @@ def spectra_panel(
     return panel, step * stare.frame_s
 
 
+def column_sums(values: Float, numbers: NDArray[np.int64], most: int) -> tuple[Float, Float, int]:
+    """Return sums of the finite values of rows by their numbers, their counts, and the numbers in each of `most` sums.
+
+    Sums and counts have the shape (n_sum, n_column).
+    """
+    step = -(-(int(numbers[-1]) + 1) // most)
+    sums, counts = np.zeros((2, int(numbers[-1]) // step + 1, values.shape[1]))
+    finite = np.isfinite(values)
+    np.add.at(sums, numbers // step, np.where(finite, values, 0.0))
+    np.add.at(counts, numbers // step, finite)
+    return sums, counts, step
+
+
 def time_unit(duration_s: float) -> tuple[float, str]:
     """Return the length of the unit in which a duration is shown, and its name."""
     return next((length_s, name) for longest_s, length_s, name in TIME_UNITS if duration_s <= longest_s)
@@ -225,17 +233,60 @@ def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
     return np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) > 1) + 1)
 
 
-#: Names of events by their colours.
-EVENTS = {"star": "event", "drawn": "candidate", "flare": "look-alike"}
-INKS = {"star": "blue", "drawn": "grey", "flare": "red"}
+#: Verdicts on events, with their colours, and these in words.
+VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
+WORDS = {"star": "blue", "drawn": "grey", "own": "red", "dark": "pink"}
 #: Flux in standard deviations above which the light curve has a second panel near the level.
 BRIGHT = 30.0
+LIGHT_CURVE = Chart(
+    "frames", "Light curve", Axis("time from the first frame (min)"), Axis("flux"),
+    (
+        *(Strips(verdict, colour, f"{verdict} events") for verdict, colour in VERDICTS.items()),
+        Area("95 % of the level", "sky", "range", alpha=0.3),
+        Line("quiescent level", "sky", "level"),
+        # A bad frame far away does not compress the others.
+        Dots("frames", "text", "searched", size=3, tips=("minute", "flux"), alone=True),
+        Dots("not searched", "own", "left out", size=6, marker="x"),
+    ),
+    logs=("y",),
+)  # fmt: skip
 
 
-def _since(analysis: Analysis, time_s: Any) -> tuple[Any, str]:
-    """Return times from the first frame in the unit of the analysis's pictures, and this unit."""
-    length_s, name = time_unit(float(np.ptp(analysis.frames.time_s)))
-    return (time_s - analysis.frames.time_s[0]) / length_s, name
+def thinned(values: Float, most: int | None) -> NDArray[np.int64]:
+    """Return the indices of at most `most` values, including the smallest and largest of each part."""
+    if most is None or values.size <= most:
+        return np.arange(values.size)
+    parts = np.array_split(np.arange(values.size), most // 2)
+    ends = [(part[np.argmin(values[part])], part[np.argmax(values[part])]) for part in parts]
+    return np.unique(np.array(ends))
+
+
+def light_curve_series(
+    frames: Frames, answer: AnalyseAnswer | None = None, unit_s: float = 60.0, most: int | None = None, *,
+    in_noise: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the data of `LIGHT_CURVE`, at most so many points of each series, without or with an analysis.
+
+    The flux may be that above the level in units of the noise.
+    """
+    time, series = (frames.time_s - frames.time_s[0]) / unit_s, dict[str, Any]()
+    flux, used = frames.white_light[0], frames.faults == 0
+    if answer is not None:
+        level, half_s = answer.analysis.level, frames.cadence_s / 2
+        flux, used, middle, off = answer.analysis.flux, level.used, level.level, 2 * level.level_error
+        if in_noise:
+            flux, middle, off = (flux - middle) / level.error, 0 * middle, off / level.error
+        for verdict in VERDICTS:
+            ends = [(row.event.first, row.event.last) for row in answer.rows if row.verdict == verdict]
+            ends_s = answer.analysis.survey.time_s[np.array(ends, int).reshape(-1, 2)] + [-half_s, half_s]
+            series[f"{verdict} events"] = (ends_s - frames.time_s[0]).T / unit_s
+        at = thinned(middle, most)
+        series |= {"range": (time[at], (middle - off)[at], (middle + off)[at]), "level": (time[at], middle[at])}
+    for name, which in (("searched", used), ("left out", ~used & np.isfinite(flux))):
+        at = np.flatnonzero(which)
+        at = at[thinned(flux[at], most)]
+        series[name] = time[at], flux[at]
+    return series
 
 
 @picture_of("AnalyseAnswer", "light-curve")
@@ -245,46 +296,24 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     If there are bright events, a second panel shows the flux less the level.
     """
     analysis, used = answer.analysis, answer.analysis.level.used
-    time, unit = _since(analysis, analysis.frames.time_s)
-    level, error, off = analysis.level.level, analysis.level.error, 2 * analysis.level.level_error
-    left_out, strips = ~used & np.isfinite(analysis.flux), list[Series]()
-    for colour, name in EVENTS.items():
-        events = [event for event in analysis.events if _colour(analysis, event) == colour]
-        if events:
-            frames = np.transpose([(event.first, event.last) for event in events])
-            strips.append(Strips(name, colour, alpha=0.2, at=_since(analysis, analysis.survey.time_s[frames])[0]))
-
-    def series(flux: Any, middle: Any, reach: Any) -> list[Series]:
-        parts: list[Series] = [
-            *strips,
-            Dots("frames", "text", size=2.5, alpha=0.7, at=(time[used], flux[used])),
-            Area("95 % of the level", "sky", alpha=0.3, at=(time, middle - reach, middle + reach)),
-            Line("level without flares", "sky", width=1.6, at=(time, middle)),
-        ]
-        if left_out.any():
-            parts.append(Dots("not searched", COLOURS[3], size=8, marker="x", at=(time[left_out], flux[left_out])))
-        return parts
-
-    x = Axis(f"time ({unit}) from {analysis.frames.date(float(analysis.frames.time_s[0]))[:19]}")
-    label = f"flux ({analysis.frames.unit})" if analysis.frames.unit else "flux"
-    around = float(np.min((analysis.flux - error)[used])), float(np.max((analysis.flux + error)[used]))
+    frames, flux, error = analysis.frames, analysis.flux, analysis.level.error
+    unit_s, unit = time_unit(float(np.ptp(frames.time_s)))
+    x = Axis(f"time ({unit}) from {frames.date(float(frames.time_s[0]))[:19]}")
+    label = f"flux ({frames.unit})" if frames.unit else "flux"
+    around = float(np.min((flux - error)[used])), float(np.max((flux + error)[used]))
     # Frames that are left out may be far off.
     reach = around[1] - around[0]
-    beside = [flux for flux in analysis.flux[left_out] if around[0] - reach < flux < around[1] + reach]
-    around = min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach
-    rows, excess = [[Panel(x, Axis(label, limits=around), series(analysis.flux, level, off))]], (analysis.flux - level)
-    if (excess / error)[used].max() > BRIGHT:
-        y = Axis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2))
-        rows.append([Panel(x, y, series(excess / error, 0 * level, off / error))])
-    title = f"{analysis.frames.name}: observed light curve; threshold of events {analysis.threshold:.2f}"
+    beside = [one for one in flux[~used & np.isfinite(flux)] if around[0] - reach < one < around[1] + reach]
+    shown = [(Axis(label, limits=(min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach)), False)]
+    if ((flux - analysis.level.level) / error)[used].max() > BRIGHT:
+        shown.append((Axis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2)), True))
+    rows = []
+    for y, in_noise in shown:
+        series = light_curve_series(frames, answer, unit_s, in_noise=in_noise)
+        panel = LIGHT_CURVE.panel({name: at for name, at in series.items() if len(at[0])})
+        rows.append([replace(panel, x=x, y=y)])
+    title = f"{frames.name}: observed light curve; threshold of events {analysis.threshold:.2f}"
     return Picture(rows, (7.2, 1.4 + 1.8 * len(rows)), title, below=True, share_x=True)
-
-
-def _colour(analysis: Analysis, event: ObservedEvent) -> str:
-    """Return the colour of an event."""
-    if event.kind != "flare":
-        return "flare"
-    return "star" if event.value >= analysis.threshold else "drawn"
 
 
 @picture_of("AnalyseAnswer", "dynamic-spectrum", when=lambda answer: answer.analysis.spectra is not None)
@@ -294,14 +323,13 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     assert spectra is not None
     stare, noise = analysis.survey.stare, spectra.noise
     sd = np.broadcast_to(noise.used, spectra.excess.shape)
-    marks = []
-    for event in analysis.events:
+    marks, verdicts = [], [row.verdict for row in answer.rows]
+    for event, verdict in zip(analysis.events, verdicts, strict=True):
         first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
         ends = np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0]
-        marks.append((ends, _colour(analysis, event)))
+        marks.append((ends, VERDICTS[verdict]))
     panel, _ = spectra_panel(stare, spectra.excess, sd, noise.wavelength_nm, marks)
-    shown = {_colour(analysis, event) for event in analysis.events}
-    marked = ", ".join(f"{EVENTS[colour]}s ({INKS[colour]})" for colour in EVENTS if colour in shown)
+    marked = ", ".join(f"{name} ({WORDS[colour]})" for name, colour in VERDICTS.items() if name in verdicts)
     return Picture([[panel]], (7.2, 3.6), analysis.frames.name, (f"marked above: {marked}" if marked else "",))
 
 
@@ -325,7 +353,8 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
     analysis = answer.analysis
     residual, likeness = analysis.residual[:, 0], analysis.likeness
-    time, unit = _since(analysis, analysis.survey.time_s[analysis.quiet])
+    unit_s, unit = time_unit(float(np.ptp(analysis.frames.time_s)))
+    time = (analysis.survey.time_s[analysis.quiet] - analysis.frames.time_s[0]) / unit_s
     size = 1.7 if time.size > 1000 else 4
 
     lags = np.arange(1, likeness.correlations.size + 1)
@@ -349,7 +378,7 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     return Picture([row], (9.6, 2.9), title, ("grey: 95 % of independent, normal noise",), widths=(2, 1, 1))
 
 
-SCATTER = Chart(
+@Chart(
     "scatter", "Noise of quiescent frames", Axis("frames in a mean", log=True),
     Axis("scatter (noise of one frame)", log=True),
     (
@@ -357,21 +386,23 @@ SCATTER = Chart(
         Line("independent frames", name="white"),
         Dots("measured", "star", size=8, tips=("frames", "scatter")),
     ),
-)  # fmt: skip
-
-
-def scatter_series(answer: AnalyseAnswer) -> dict[str, Any]:
-    """Return the data of `SCATTER`, or nothing if there are too few quiescent frames."""
+).data("analyse", "Analyse checks the noise.")  # fmt: skip
+def scatter_of_means(closed: Any, answer: AnalyseAnswer) -> chart.ChartData:
+    """Return the scatter of means of quiescent frames against that of independent ones."""
     rows = answer.analysis.scatter
     if len(rows) < 2:
-        return {}
+        return chart.ChartData("Too few consecutive quiescent frames for means.")
+    text = "Quiescent frames are independent."
+    if red := next((row for row in rows if row.red), None):
+        of = "Single frames" if red.frames == 1 else f"Means of {red.frames} frames"
+        text = f"{of} scatter {red.measured / red.white:.2f} times as much as independent frames."
     x, low, high, white, measured = np.array([(r.frames, r.low, r.high, r.white, r.measured) for r in rows]).T
-    return {"range": (x, low, high), "white": (x, white), "measured": (x, measured)}
+    return chart.ChartData(text, {"range": (x, low, high), "white": (x, white), "measured": (x, measured)})
 
 
 @picture_of("AnalyseAnswer", "noise", when=lambda answer: len(answer.analysis.scatter) > 1)
 def observed_noise(answer: AnalyseAnswer) -> Picture:
     """Plot the scatter of means of quiescent frames against their number, and that of independent frames."""
-    panel, title = SCATTER.panel(scatter_series(answer)), f"{answer.analysis.frames.name}: quiescent frames"
+    panel = scatter_of_means.panel(scatter_of_means.series_of(answer))
     panel = replace(panel, x=replace(panel.x, ticks=([row.frames for row in answer.analysis.scatter],)))
-    return Picture([[panel]], (4.6, 3.2), title)
+    return Picture([[panel]], (4.6, 3.2), f"{answer.analysis.frames.name}: quiescent frames")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Strips, Targets
 from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of, styled_picture
 from mauvecl.schema.columns import First, with_error
@@ -129,44 +130,57 @@ def flares(source: Source, amplitudes: Sequence[float]) -> Panel:
 
 #: Pixels that are averaged for a point of the residuals, and values for one of the photon transfer.
 BIN, GROUPS = 16, 60
-THROUGHPUT = Chart(
+NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
+
+
+@Chart(
     "throughput", "Throughput: fitted and nominal", WAVELENGTH, Axis("electrons per photon (%)"),
     (
         Area("95 % interval", "star", "band", alpha=0.35),
         Line("fitted", "star", width=2, tips=("nm", "fitted (%)")),
         Line("nominal", dash="dashed"),
     ),
-)  # fmt: skip
-TRANSFER = Chart(
-    "transfer", "Photon transfer: variance of frames against their mean", Axis("fitted variance (DN²)", log=True),
-    Axis("measured variance (DN²)", log=True),
-    (Line("fitted"), Dots("measured", "star", size=6, tips=("fitted", "measured"))),
-)  # fmt: skip
-
-
-def throughput_series(answer: CalibrateAnswer) -> dict[str, Any]:
-    """Return the data of `THROUGHPUT`."""
+).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
+def calibrated_throughput(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
+    """Return the fitted throughput with its 95 % band, and the nominal one."""
     table = answer.throughput_table
     nm, wide = table["wavelength"].value, np.exp(1.96 * np.asarray(table["relative_error"]))
     fitted, nominal = (100 * np.asarray(table[name]) for name in ("throughput", "nominal"))
-    return {"band": (nm, fitted / wide, fitted * wide), "fitted": (nm, fitted), "nominal": (nm, nominal)}
+    text = f"{answer.notice} It is {table['ratio'].min():.3g} to {table['ratio'].max():.3g} times the nominal one."
+    band = (nm, fitted / wide, fitted * wide)
+    return chart.ChartData(text, {"band": band, "fitted": (nm, fitted), "nominal": (nm, nominal)})
 
 
 @picture_of("CalibrateAnswer", "throughput")
 def fitted_throughput(answer: CalibrateAnswer) -> Picture:
     """Plot the fitted throughput with its 95 % band next to the nominal one, and their ratio."""
-    series, nominal = throughput_series(answer), np.asarray(answer.throughput_table["nominal"])
-    above = THROUGHPUT.panel(series, f"nominal: {answer.nominal.name}")
-    ratio = THROUGHPUT.panel({name: (nm, *np.divide(y, 100 * nominal)) for name, (nm, *y) in series.items()})
-    below = Panel(WAVELENGTH, Axis("fitted / nominal"), [replace(item, listed=False) for item in ratio.series])
+    series, nominal = calibrated_throughput.series_of(answer), np.asarray(answer.throughput_table["nominal"])
+    above = calibrated_throughput.panel(series, f"nominal: {answer.nominal.name}")
+    series = {name: (nm, *np.divide(y, 100 * nominal)) for name, (nm, *y) in series.items()}
+    ratio = [replace(item, listed=False) for item in calibrated_throughput.panel(series).series]
+    below = Panel(WAVELENGTH, Axis("fitted / nominal"), ratio)
     return Picture([[above], [below]], (5.2, 4.6), f"Throughput {answer.source}", share_x=True)
 
 
-def residual_series(answer: CalibrateAnswer) -> list[tuple[str, Any, Any]]:
-    """Return name, wavelengths and averaged residuals of each star, without pixels that were not used."""
-    nm, each = answer.throughput.binned_residuals(BIN)
-    stars = zip(answer.stars, each, strict=True)
-    return [(star.name, nm[finite], row[finite]) for star, row in stars for finite in [np.isfinite(row)]]
+@Chart(
+    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {BIN} pixels (sigma)"),
+    (
+        Targets("residual", tips=("residual (sigma)",)),
+        Rule("2 sigma", "threshold", "above", along="y", at=2.0),
+        Rule("2 sigma", "threshold", "below", along="y", listed=False, at=-2.0),
+    ),
+).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
+def residuals_of_stars(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
+    """Return the averaged residuals of each star, without groups of which no pixel was used."""
+    fit, rows = answer.throughput, list[tuple[str, Any, Any]]()
+    n = fit.wavelength_nm.size // BIN
+    nm = fit.wavelength_nm[: n * BIN].reshape(n, BIN).mean(axis=1)
+    for star, residual in zip(answer.stars, fit.residual[:, : n * BIN].reshape(-1, n, BIN), strict=True):
+        count = np.isfinite(residual).sum(axis=1)
+        used = count > 0
+        rows.append((star.name, nm[used], np.nansum(residual[used], axis=1) / np.sqrt(count[used])))
+    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
+    return chart.ChartData(f"Root mean square, 1 for noise alone: {words}; p = {fit.p_value:.2g}.", {"residual": rows})
 
 
 @picture_of("CalibrateAnswer", "residuals")
@@ -174,33 +188,42 @@ def calibration_residuals(answer: CalibrateAnswer) -> Picture:
     """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
     two = Strips(along="y", alpha=0.2, at=([-2], [2]))
     rows = [[Panel(WAVELENGTH, Axis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
-            for name, nm, row in residual_series(answer)]  # fmt: skip
+            for name, nm, row in residuals_of_stars.series_of(answer)["residual"]]  # fmt: skip
     title, notes = f"Observed less fitted spectra, means of {BIN} pixels", f"p-value {answer.throughput.p_value:.2g}"
     return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, ("grey: 2 sigma", notes), share_x=True, share_y=True)
 
 
-def transfer_series(answer: CalibrateAnswer) -> tuple[dict[str, Any], Any]:
-    """Return the data of `TRANSFER`, and the errors of the measured variances."""
+@Chart(
+    "transfer", "Photon transfer: variance of frames against their mean", Axis("fitted variance (DN²)", log=True),
+    Axis("measured variance (DN²)", log=True),
+    (Line("fitted"), Dots("measured", "star", size=6, tips=("fitted", "measured"))),
+).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
+def variances_of_frames(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
+    """Return the measured over the fitted variance."""
     t = answer.transfer
     # Dark counts have their own variance, which the fit includes.
     groups = np.array_split(np.argsort(t.model), GROUPS)
     model, measured = (np.array([values[group].mean() for group in groups]) for values in (t.model, t.variance))
-    error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])
-    return {"fitted": (model, model), "measured": (model, measured)}, error
+    text = f"Gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise {t.read_noise_dn:.3g} DN."
+    if "gain" in t.assumed:
+        text = "The frames do not determine the gain: it is nominal."
+    return chart.ChartData(text, {"fitted": (model, model), "measured": (model, measured)})
 
 
 @picture_of("CalibrateAnswer", "photon-transfer", when=lambda answer: "gain" not in answer.transfer.assumed)
 def photon_transfer(answer: CalibrateAnswer) -> Picture:
     """Plot the variance of frames against their mean, binned, with the fit and its residuals."""
-    t, (series, error) = answer.transfer, transfer_series(answer)
+    t, series = answer.transfer, variances_of_frames.series_of(answer)
     model, measured = series["measured"]
+    groups = np.array_split(np.argsort(t.model), GROUPS)
+    error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])
     off = Dots("", "star", size=6, at=(model, 100 * (measured / model - 1), 100 * error / model))
-    below = Panel(TRANSFER.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
+    below = Panel(variances_of_frames.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
     title = (
         f"Photon transfer: gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise "
         f"{with_error(t.read_noise_dn, t.read_noise_error)} DN; dark counts in {t.dark_unit}"
     )
-    return Picture([[TRANSFER.panel(series)], [below]], (4.6, 4.6), title, share_x=True)
+    return Picture([[variances_of_frames.panel(series)], [below]], (4.6, 4.6), title, share_x=True)
 
 
 @picture_of("CalibrateAnswer", "dark", when=lambda answer: answer.dark.dof > 0)
@@ -230,15 +253,16 @@ MOST = 3
 AROUND_NM = 15.0
 
 
-def along_magnitude(answer: ChangeAnswer, names: Sequence[str], scale: float) -> list[tuple[str, Any, Any]]:
-    """Return name, magnitudes and smallest changes of the first star, times a factor, where they are known."""
+def along_magnitude(answer: ChangeAnswer, scales: Mapping[str, float]) -> list[tuple[str, Any, Any]]:
+    """Return name, magnitudes and smallest changes of the first star, times the factor of their unit, where known."""
     from mauvecl.answers.change import MAGNITUDES
 
     lines = list[tuple[str, Any, Any]]()
-    for name in names:
-        own = [row for row in answer.along if row.change.name == name]
-        x, y = np.array([(row.magnitude, row.smallest.one) for row in own[: MAGNITUDES.size]]).T
-        lines.append((shown_name(name), x[np.isfinite(y)], scale * y[np.isfinite(y)]))
+    for name, unit in dict.fromkeys((row.change.name, row.change.unit) for row in answer.along):
+        if unit in scales:
+            own = [row for row in answer.along if row.change.name == name][: MAGNITUDES.size]
+            x, y = np.array([(row.magnitude, row.smallest.one) for row in own]).T
+            lines.append((shown_name(name), x[np.isfinite(y)], scales[unit] * y[np.isfinite(y)]))
     return lines
 
 
@@ -253,8 +277,7 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
     (title,), star, row = titles, answer.study.star[0], []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
-        names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
-        lines = [line for line in along_magnitude(answer, names, 1 if unit else 100) if line[1].size]
+        lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
         here = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
         values, limits = [value for _, _, column in lines for value in column], None

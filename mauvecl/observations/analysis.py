@@ -14,25 +14,17 @@ from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK
 from mauvecl.flares.shapes import shape_of
 from mauvecl.host.arrays import Float
-from mauvecl.observations.detection import LONG_S, detect_events, most_events
-from mauvecl.observations.events import ObservedEvent, measure_events
+from mauvecl.observations.events import LONG_S, Kind, ObservedEvent, detect_events, measure_events, most_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import UNREPORTED, Steps
-from mauvecl.observations.search import (
-    NO_COLOUR_K,
-    SeriesSurvey,
-    SimulatedRate,
-    innovations,
-    simulated_rates,
-)
+from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey, SimulatedRate, innovations, simulated_rates
 from mauvecl.observations.spectra import (
     CAUSES,
     EventSpectrum,
     SpectralSeries,
-    event_colour,
     event_spectrum,
     measure_flare,
     survey_spectra,
@@ -161,7 +153,6 @@ class Analysis:
 
     frames: Frames
     flux: Float  # shape (n_frame,); the light curve that was searched; for spectra, the sum over wavelength
-    error: Float | None
     level: QuiescentLevel
     survey: SeriesSurvey
     wanted: float  # wanted false alarms per star-day
@@ -176,13 +167,11 @@ class Analysis:
     residual: Float  # shape (n_quiet, n_sum); of quiescent frames given those before them, in standard deviations
     quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals
     likeness: Likeness  # of the residuals and independent noise
-    # Of spectra that are searched with weights for flares, spectra of the events, in their order, and flares fitted to
-    # these, or the reason why none is.
-    spectra: SpectralSeries | None
-    found: list[EventSpectrum]
-    fitted: list[Measurement | str]
+    spectra: SpectralSeries | None  # if they are searched with weights for flares
+    found: list[EventSpectrum | None]  # of these, those of the events, in their order
+    fitted: list[Measurement | str]  # flares fitted to these, or the reasons why none are
 
-    @cached_property
+    @property
     def days(self) -> float:
         """Star-days of the searched frames."""
         return self.survey.stare.observed_s / DAY_S
@@ -194,7 +183,7 @@ class Analysis:
         return series is not None and bool(series.changes) and bool(np.isfinite(series.jitters["light"]))
 
     @cached_property
-    def _inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> NDArray[np.bool_]:
         """Searched frames in events."""
         inside = np.zeros(self.survey.stare.n_frames, np.bool_)
         for one in self.events:
@@ -204,7 +193,7 @@ class Analysis:
     @property
     def in_events(self) -> float:
         """Share of the searched frames in events."""
-        return float(self._inside.mean())
+        return float(self.inside.mean())
 
     @property
     def crowded(self) -> bool:
@@ -216,17 +205,6 @@ class Analysis:
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: by the process, and with measured residuals."""
         return self.modelled.rate(event.value), self.measured.rate(event.value)
-
-    def colour(self, event: ObservedEvent) -> tuple[float, float, float]:
-        """Return blue over red rise with its error, and the p-value of no colour; NaN without spectra with errors."""
-        frames = self.frames
-        if frames.flux.ndim == 1 or frames.error is None:
-            return (np.nan,) * 3
-        used = np.flatnonzero(self.level.used)
-        inside, quiet = np.zeros((2, frames.n_frames), np.bool_)
-        inside[used[event.first : event.last + 1]] = True
-        quiet[used] = self.level.quiet[used] & ~self._inside
-        return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
     def dark_misleads(self) -> bool:
@@ -361,18 +339,21 @@ def analyse_frames(
         frames = series.cleaned.frames
     rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], wanted, seed, rate_steps)
     detected, taken = detect_events(survey, candidates, search_steps)
-    seen = [] if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
-    events = measure_events(survey, taken, detected, [one.cause for one in seen], event_steps)
-    fitted: list[Measurement | str] = [] if series is None else [
-        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
-        for event, one in zip(events, detected, strict=True)
-    ]  # fmt: skip
+    seen = [None if series is None else event_spectrum(survey, series, taken, one) for one in detected]
+    causes: list[Kind] = ["flare" if one is None else one.cause for one in seen]
+    events, fitted = measure_events(survey, taken, detected, causes, event_steps), list[Measurement | str]()
+    for event, one in zip(events, detected, strict=True):
+        if series is None:
+            fitted.append("no spectra of the instrument are given")
+        else:
+            reason = "" if event.kind == "flare" else f"its kind is {event.kind}"
+            fitted.append(reason or measure_flare(survey, series, taken, one))
     quiet = ~taken
     residual = innovations(survey, quiet)
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
     numbers = survey.stare.numbers[quiet]
     return Analysis(
-        frames, *frames.white_light, level, survey, wanted, *rates,
+        frames, frames.white_light[0], level, survey, wanted, *rates,
         threshold=threshold, candidates=candidates, dip=dip, events=events,
         completeness=inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
         scatter=binned_scatter(numbers, residual @ middle), residual=residual, quiet=quiet,

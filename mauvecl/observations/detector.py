@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
@@ -78,6 +78,20 @@ class CalibrationFrames:
         return np.asarray(self.raw_dn.max(axis=0) < MOST_OF_SATURATION * ceiling)
 
 
+class GoodnessOfFit:
+    """Chi-squared of a fit."""
+
+    chi2: float
+    dof: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
+
+
+#: Change of temperature, deg C, within which consecutive dark frames are compared for their variance.
+SAME_TEMPERATURE_C = 0.05
 #: Variance of rounding to whole DN.
 ROUNDING = 1.0 / 12.0
 #: Iterations of the weights, which follow the fitted variances.
@@ -112,7 +126,7 @@ class NoiseModel:
 
 
 @dataclass(frozen=True, eq=False)
-class PhotonTransfer:
+class PhotonTransfer(GoodnessOfFit):
     """Fit of measured variances."""
 
     noise: NoiseModel
@@ -141,11 +155,6 @@ class PhotonTransfer:
         """Standard error of the gain over its value."""
         return self.gain_error / self.noise.gain
 
-    @property
-    def p_value(self) -> float:
-        """Probability of a chi-squared at least as large."""
-        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
-
 
 def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
     """Return the variance of each pixel from differences of frames, shape (n_step, n_pixel), without drifts.
@@ -159,34 +168,39 @@ def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
     return np.asarray(np.mean(white**2, axis=0) / (1.0 - np.sum(basis**2, axis=0)) * scale**2 / 2)
 
 
-def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: NDArray[np.bool_]) -> Float:
+def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit, nominal: Instrument) -> Float:
     """Measure the variance of frames from differences of consecutive ones, where light and dark may jitter.
 
-    Returned are variance, light and dark of each usable pixel, and the degrees of freedom of the variance, shape
-    (4, n_pixel).
+    Returned are variance, light and dark of each usable pixel of each observation, of dark frames at each temperature,
+    and the degrees of freedom of the variance, shape (4, n_value).
     """
-    # A pixel that never changes is dead.
-    usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
-    steps = np.diff(raw_dn[:, usable], axis=0)
-    light, dark = light_dn[usable], dark_dn[usable]
-    variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, dark]))
-    n = len(steps)
-    # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann 1941).
-    dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
-    return np.array([variance, light, dark, dof])
+    measured = []
+    for one in observations:
+        breaks = np.flatnonzero(np.abs(np.diff(one.temperature_c)) > SAME_TEMPERATURE_C) + 1
+        for part in np.split(np.arange(one.n_frames), breaks if one.star is None else []):
+            if part.size < 3:
+                continue
+            same = replace(one, raw_dn=one.raw_dn[part], temperature_c=one.temperature_c[part])
+            # A pixel that never changes is dead.
+            usable = one.usable(nominal) & np.any(same.raw_dn != same.raw_dn[0], axis=0)
+            mean, steps = dark.mean_dn(same)[usable], np.diff(same.raw_dn[:, usable], axis=0)
+            light = np.zeros(mean.size) if one.star is None else same.raw_dn[:, usable].mean(axis=0) - mean
+            counts, n = mean - dark.bias_dn[usable], len(steps)
+            variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, counts]))
+            # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann
+            # 1941).
+            measured.append([variance, light, counts, np.full(light.size, 2 * n**2 / (3 * n - 1))])
+    return np.concatenate(measured, axis=1)
 
 
-def fit_photon_transfer(measured: Sequence[Float], nominal: Instrument, dark_error_dn: float = 0.0) -> PhotonTransfer:
-    """Fit gain, read noise and the unit of dark counts to variances of `measured_variance` by weighted least squares.
+def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: float = 0.0) -> PhotonTransfer:
+    """Fit gain, read noise and the unit of dark counts to `measured_variances` by weighted least squares.
 
     The nominal values are kept where the data determine none. The standard error of the dark of a mean frame,
     `dark_error_dn`, moves the read noise.
     """
-    variance, light, dark, dof = np.concatenate(measured, axis=1)
-    fits = {
-        "DN": _fit(light, dark, variance, dof),
-        "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof),
-    }
+    variance, light, dark, dof = measured
+    fits = {"DN": _fit(light, dark, variance, dof), "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof)}
     better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
     assumed: tuple[str, ...] = ("unit of the dark counts",)
     if abs(better) > TELLS:
@@ -231,13 +245,12 @@ EXPOSURE_RATIO = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class DarkFit:
+class DarkFit(GoodnessOfFit):
     """Dark current as level_p exp(slope (T - reference)), and bias."""
 
     reference_c: float  # temperature at which the levels hold
     level_dn_per_s: Float  # shape (n_pixel,)
     bias_dn: Float  # shape (n_pixel,)
-    bias_error: Float  # 0 if the bias is assumed
     covariance: Float  # shape (n_pixel, 2, 2); of bias and level of each pixel, independent between pixels
     shared: Float  # shape (3, 3); covariance of bias, level and slope of the mean pixel, which all pixels share
     slope_per_c: float  # common to all pixels
@@ -249,9 +262,10 @@ class DarkFit:
     slopes_p_value: float = np.nan  # of pixel slopes at least as different if all are equal
 
     @property
-    def p_value(self) -> float:
-        """Probability of a chi-squared at least as large."""
-        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
+    def bias_error(self) -> Float:
+        """Standard errors of the biases, shape (n_pixel,): of each, or of all together; 0 if they are assumed."""
+        own = self.covariance[:, 0, 0]
+        return np.asarray(np.sqrt(np.where(own > 0, own, self.shared[0, 0])))
 
     @property
     def level_error(self) -> Float:
@@ -277,30 +291,19 @@ class DarkFit:
         return self.bias_dn + self.level_dn_per_s * self.terms(frames)[0]
 
 
-def assumed_dark(nominal: Instrument, n_pixel: int) -> DarkFit:
-    """Return the dark current and bias of an instrument, where there are no frames without light."""
-    zero, nothing = np.zeros(n_pixel), np.full(n_pixel, np.nan)
-    level = nominal.per_pixel("dark", nominal.dark_dn_per_s)
-    return DarkFit(
-        reference_c=nominal.temperature_c,
-        level_dn_per_s=level,
-        bias_dn=nominal.per_pixel("bias_dn", nominal.bias_dn),
-        bias_error=zero,
-        covariance=np.zeros((n_pixel, 2, 2)),
-        shared=np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0]),
-        slope_per_c=nominal.dark_slope_per_c,
-        pixel_slope_per_c=nothing,
-        pixel_slope_error=nothing,
-        assumed=("dark current", "dark slope", "bias"),
-    )
-
-
 def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: NoiseModel) -> DarkFit:
     """Fit bias, dark level of each pixel and a common slope to frames without light, by weighted least squares.
 
     The slope is assumed for temperatures within `SLOPE_RANGE_C`. Each pixel's bias is fitted if exposure times differ
     by `EXPOSURE_RATIO`, and one for all pixels if temperatures span `BIAS_RANGE_C`; otherwise it is the instrument's.
+    Without frames all are the instrument's.
     """
+    bias, level = (nominal.per_pixel(*of) for of in (("bias_dn", nominal.bias_dn), ("dark", nominal.dark_dn_per_s)))
+    covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)
+    if not dark:
+        shared = np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0])
+        return DarkFit(nominal.temperature_c, level, bias, covariance, shared, nominal.dark_slope_per_c, change, error,
+                       ("dark current", "dark slope", "bias"))  # fmt: skip
     raw = np.concatenate([one.raw_dn for one in dark])
     temperature = np.concatenate([one.temperature_c for one in dark])
     exposure = np.concatenate([np.full(one.n_frames, one.exposure_s) for one in dark])
@@ -314,7 +317,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     free = np.array([fits_bias, True, fits_slope])
     common, shared, typical = _mean_dark(raw, exposure, offset, free, nominal, noise)
     slope = float(common[2])
-    bias = np.full(n_pixel, common[0]) if shares_bias else nominal.per_pixel("bias_dn", nominal.bias_dn)
+    bias = np.full(n_pixel, common[0]) if shares_bias else bias
 
     # With the slope known, each pixel is linear in its level and bias.
     seconds = exposure * np.exp(slope * offset)
@@ -322,9 +325,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     values, used = (raw, [0, 1]) if by_pixel else (raw - bias, [1])
     found, errors = _fit_pixels(columns[:, used], 1.0 / typical, values, noise)
     level, bias = found[-1], found[0] if by_pixel else bias
-    covariance = np.zeros((n_pixel, 2, 2))
     covariance[:, -len(used) :, -len(used) :] = errors
-    change, error = np.full((2, n_pixel), np.nan)
     if fits_slope:
         found, errors = _fit_pixels(columns[:, [*used, 2]], 1.0 / typical, values, noise, (seconds, level))
         change, error = found[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
@@ -333,7 +334,6 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         reference_c=reference,
         level_dn_per_s=level,
         bias_dn=bias,
-        bias_error=np.sqrt(covariance[:, 0, 0]) if by_pixel else np.full(n_pixel, np.sqrt(shared[0, 0])),
         covariance=covariance,
         shared=shared,
         slope_per_c=slope,
@@ -356,21 +356,15 @@ def _mean_dark(
     series, bias = raw.mean(axis=1), nominal.per_pixel("bias_dn", nominal.bias_dn).mean()
     start = np.array([bias, (series - bias).mean() / exposure.mean(), nominal.dark_slope_per_c])
     typical = noise.variance(0.0, start[1] * exposure * np.exp(start[2] * offset))
-    variance = typical / raw.shape[1]
-
-    def whole(values: Float) -> Float:
-        every = start.copy()
-        every[free] = values
-        return every
 
     def left(values: Float) -> Float:
-        bias, level, slope = whole(values)
-        return np.asarray((series - bias - level * exposure * np.exp(slope * offset)) / np.sqrt(variance))
+        bias, level, slope = np.where(free, values, start)
+        return np.asarray((series - bias - level * exposure * np.exp(slope * offset)) / np.sqrt(typical / raw.shape[1]))
 
-    found = scipy.optimize.least_squares(left, start[free], x_scale=np.maximum(np.abs(start[free]), 1e-3), xtol=1e-14)
-    covariance, jacobian = np.zeros((3, 3)), np.asarray(found.jac)
+    found = scipy.optimize.least_squares(left, start, x_scale=np.maximum(np.abs(start), 1e-3), xtol=1e-14)
+    covariance, jacobian = np.zeros((3, 3)), np.asarray(found.jac)[:, free]
     covariance[np.ix_(free, free)] = np.linalg.inv(jacobian.T @ jacobian)
-    return whole(found.x), covariance, typical
+    return np.where(free, found.x, start), covariance, typical
 
 
 def _fit_pixels(

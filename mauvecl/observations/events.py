@@ -1,4 +1,7 @@
-"""Events: flares, or other changes, with their times, causes and energies."""
+"""Events of observed light curves: flares, or other changes, their detection and their times, causes and energies.
+
+The largest statistics above a threshold become events; their frames are taken away, and the rest is searched again.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,190 @@ from mauvecl.host.arrays import Bool, Float, map_in_threads
 from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
 from mauvecl.observations.process import UNREPORTED, Steps
-from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
+from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, ProcessSearch, SeriesSurvey
+from mauvecl.schema.fields import DAY_S
+from mauvecl.search.templates import REACH
+
+#: Largest number of searches.
+MAX_PASSES = 40
+#: Number of events after which no further ones are searched, and the same for each frame of a long light curve.
+MOST_EVENTS, MOST_PER_FRAME = 500, 1 / 500
+#: Smallest number of quiescent frames to which a process is fitted; with fewer, the longest events are shortened.
+MIN_QUIET = 20
+#: Share of a template's response to other events, of inexact shapes, that a further event must exceed.
+UNCERTAIN = 0.5
+#: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event: the smallest for which
+#: more than a few events leave most frames to the star (number and share assumed).
+FAINT, FEW, MOST_TAKEN = (0.05, 0.2, 0.8), 2, 0.3
+#: Length of a light curve above which events are an exception from the light of the star (assumed).
+LONG_S = 2 * DAY_S
+#: Longest tail and beginning of a template that belong to an event, in half-widths.
+LONGEST_TAIL, BEGINNING = 60.0, 1.2
+#: Statistic of an event, relative to that of an event next to it, below which it is that one's beginning or tail.
+BELONGING = 0.1
+#: Half-widths, and shortest time scales of the process, in which smaller events wait for the next search.
+NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
+#: Mean of the last frames of an event, in standard deviations of a frame, and their number, with which it goes on.
+STILL_BRIGHT, END_FRAMES = 1.0, 4
+
+
+def detect_events(
+    survey: SeriesSurvey, threshold: float, steps: Steps = UNREPORTED
+) -> tuple[list[DetectedEvent], Bool]:
+    """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
+    # Where the star is constant, or seen for a short time, events may take any number of frames.
+    varies_for_days = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
+    for faint in FAINT if varies_for_days else FAINT[:1]:
+        events, taken = _detect_to(survey, threshold, faint, steps)
+        if len(events) <= FEW or taken.mean() <= MOST_TAKEN:
+            break
+    return events, taken
+
+
+def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Steps) -> tuple[list[DetectedEvent], Bool]:
+    """Detect events whose tails end at a flux in standard deviations of a frame, as `detect_events`."""
+    n = survey.stare.n_frames
+    taken, found = np.zeros(n, np.bool_), list[DetectedEvent]()
+    light = np.zeros_like(survey.sums)
+    noise = float(np.sqrt(np.median(survey.variance))) * min(process.excess for process in survey.processes)
+    search = survey.search
+    for _ in range(MAX_PASSES):
+        left = ~taken
+        if left.sum() < MIN_QUIET or len(_merged(found)) >= most_events(n):
+            break
+        part = survey.frames(left)
+        if taken.any():
+            search = ProcessSearch(part.bank, part.stare, part.processes, part.variance, search)
+        new = _search_once(part, search, light[left], threshold)
+        steps.step()
+        if not new:
+            break
+        for one in new:
+            unit = survey.bank.directions[one.direction]
+            rows, flux = light_of_flare(survey, one.peak_s, one.half_width_s, one.amplitude)
+            light[rows] += flux[:, None] * unit
+        mine = []
+        for one in new:
+            first, last = _extent(survey, taken, faint * noise, one)
+            # Some frames are left for the level, the faintest of the event.
+            short = MIN_QUIET - int(np.count_nonzero(~taken)) + last - first + 1
+            last = max(last - max(short, 0), first)
+            mine.append((first, last))
+            taken[first : last + 1] = True
+        mine = _extended(survey, taken, mine, new, crowded=faint > FAINT[0])
+        for (first, last), one in zip(mine, new, strict=True):
+            taken[first : last + 1] = True
+            found.append(replace(one, first=first, last=last))
+    return _merged(found), taken
+
+
+def most_events(n_frames: int) -> int:
+    """Return the number of events at which a search of some frames ends, although there may be more."""
+    return max(MOST_EVENTS, int(MOST_PER_FRAME * n_frames))
+
+
+def _merged(found: list[DetectedEvent]) -> list[DetectedEvent]:
+    """Return the events in order of time, without those that overlap a larger one or are its beginning or tail."""
+    kept: list[DetectedEvent] = []
+    for one in sorted(found, key=lambda each: each.first):
+        if kept:
+            smaller, larger = sorted((one, kept[-1]), key=lambda each: each.value)
+            touching = one.first == kept[-1].last + 1 and smaller.value < BELONGING * larger.value
+            if one.first <= kept[-1].last or touching:
+                other = kept.pop()
+                one = replace(larger, first=min(one.first, other.first), last=max(one.last, other.last))
+        kept.append(one)
+    return kept
+
+
+def light_of_flare(survey: SeriesSurvey, peak_s: float, half_width_s: float, amplitude: float) -> tuple[slice, Float]:
+    """Return the frames in which a flare is not negligible, and its mean in each, in the unit of the amplitude."""
+    start, frame_s = survey.stare.start_s, survey.stare.frame_s
+    # From the frame on in which it begins.
+    ends = [peak_s - REACH[0] * half_width_s - frame_s, peak_s + REACH[1] * half_width_s]
+    rows = slice(*np.searchsorted(start, ends))
+    edges = np.column_stack([start[rows], start[rows] + frame_s])
+    return rows, amplitude * survey.bank.shape.mean_over(edges, peak_s, half_width_s)
+
+
+def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, threshold: float) -> list[DetectedEvent]:
+    """Return the largest events among the frames that are left, at most one near another."""
+    both = np.stack([part.sums, UNCERTAIN * light]) if light.any() else part.sums[None]
+    # Local maxima above the threshold, of which there are many where the process does not describe the light.
+    parts = []
+    for row, rho in search.values(both, threshold):
+        excess = rho[0] - np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0)) if len(rho) > 1 else rho[0]
+        direction = excess.argmax(axis=0)
+        best = excess[direction, np.arange(excess.shape[1])]
+        # Local maxima only: neighbours belong to the same event.
+        top = (best >= np.append(best[1:], -np.inf)) & (best >= np.insert(best[:-1], 0, -np.inf))
+        onset = np.flatnonzero(top & (best >= threshold))
+        along, half_width = direction[onset], np.full(onset.size, row.template.half_width_s)
+        value = rho[0, along, onset]
+        amplitude = value / row.per_amplitude[along, onset]
+        parts.append(np.array([best[onset], value, half_width, search.peaks_s(row)[onset], along, amplitude]))
+    bests, *others = np.concatenate(parts, axis=1)
+    order = np.argsort(bests)[::-1][: 4 * most_events(part.stare.n_frames)]
+    scales = min(one.shortest_s for one in part.processes)
+    scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
+    accepted: list[DetectedEvent] = []
+    peaks, reaches = np.empty((2, order.size))
+    for n, (value, half_width, peak, along, amplitude) in enumerate(np.array(others)[:, order].T.tolist()):
+        peaks[n], reaches[n] = peak, max(NEAR_WIDTHS * half_width, scale)
+        if (np.abs(peak - peaks[:n]) > np.maximum(reaches[n], reaches[:n])).all():
+            accepted.append(DetectedEvent(value, half_width, peak, int(along), amplitude, 0, 0))
+    return accepted
+
+
+def _extent(survey: SeriesSurvey, taken: Bool, faint: float, one: DetectedEvent) -> tuple[int, int]:
+    """Return the first and last frame in which the template of an event is brighter than a flux."""
+    tau = np.linspace(0.0, LONGEST_TAIL, 1200)
+    bright = tau[one.amplitude * survey.bank.shape.at(tau) > faint]
+    tail = max(1.0, float(bright[-1]) if bright.size else 0.0)
+    frame_s = survey.stare.frame_s
+    start = one.peak_s - BEGINNING * one.half_width_s - frame_s / 2
+    stop = one.peak_s + tail * one.half_width_s + frame_s / 2
+    # As the middles of frames, at which they are looked up, but for half a frame.
+    first, last, peak = np.searchsorted(survey.stare.start_s, np.array([start, stop, one.peak_s]) - frame_s / 2)
+    peak = min(int(peak), survey.stare.n_frames - 1)
+    first, last = min(int(first), peak), max(int(last) - 1, peak)
+    # Other events end it.
+    before, after = np.flatnonzero(taken[first:peak]), np.flatnonzero(taken[peak : last + 1])
+    if before.size:
+        first = first + int(before[-1]) + 1
+    if after.size and after[0] > 0:
+        last = peak + int(after[0]) - 1
+    return first, max(first, last)
+
+
+def _extended(
+    survey: SeriesSurvey, taken: Bool, extents: list[tuple[int, int]], found: list[DetectedEvent], *, crowded: bool
+) -> list[tuple[int, int]]:
+    """Extend events to frames that are brighter than the level; in crowded light curves, cut off those that are not."""
+    quiet = ~taken
+    if quiet.sum() < MIN_QUIET:
+        return extents
+    steps = np.diff(survey.stare.numbers)
+    sigmas = {direction: survey.along(direction, quiet) for direction in {one.direction for one in found}}
+    longer = []
+    for (first, last), one in zip(extents, found, strict=True):
+        sigma, length = sigmas[one.direction], last - first + 1
+        if crowded:
+            peak = first + int(sigma[first : last + 1].argmax())
+            while last > peak + 1 and sigma[max(peak, last + 1 - END_FRAMES) : last + 1].mean() < STILL_BRIGHT:
+                last -= 1
+        # Gaps that are longer than it end an event.
+        before, after = steps[max(0, first - length) : first] > length, steps[last : last + length] > length
+        stop = last + (int(after.argmax()) if after.any() else length)
+        stop = min(stop, sigma.size - 1, last + int(quiet.sum()) - MIN_QUIET)
+        while last < stop and not taken[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > STILL_BRIGHT:
+            last += 1
+        start, ends = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0), END_FRAMES
+        while first > start and not taken[first - 1] and sigma[max(0, first - ends) : first].mean() > STILL_BRIGHT:
+            first -= 1
+        longer.append((first, last))
+    return longer
+
 
 #: Fall of chi-squared by which a step must fit better than a flare.
 STEP_GAIN = 9.0
@@ -65,25 +251,6 @@ def _kind(window: Window, fits: Sequence[Fit], summed: float, error: float) -> K
     if not survey.weighted and lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level:
         return "dip"
     return "step" if _is_step(window, fits) else "flare"
-
-
-def _directions(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> list[tuple[float, float]]:
-    """Return the log weight of each direction of the bank, and its light relative to that of the event's direction."""
-    if len(survey.bank.directions) == 1:
-        return [(0.0, 1.0)]
-    scores = []
-    for direction in range(len(survey.bank.directions)):
-        window = Window.of(survey, taken, one, direction)
-        noise = np.diag(window.process) + window.noise
-        model = window.model(survey.bank.shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
-        weight = model / noise
-        outside = ~window.inside
-        level = float(np.average(window.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0
-        value = float(weight @ (window.values - level)) / np.sqrt(float(weight @ model))
-        scores.append((value, window.scale))
-    mine = scores[one.direction]
-    return [(0.5 * np.sign(value) * value**2 - 0.5 * mine[0] ** 2, mine[1] / scale * value / mine[0])
-            for value, scale in scores if value > 0]  # fmt: skip
 
 
 def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: DetectedEvent) -> tuple[float, float]:
@@ -194,16 +361,15 @@ class ObservedEvent:
 
 
 def measure_events(
-    survey: SeriesSurvey, taken: Bool, found: list[DetectedEvent], causes: Sequence[Kind] | None = None,
-    steps: Steps = UNREPORTED,
-) -> list[ObservedEvent]:  # fmt: skip
+    survey: SeriesSurvey, taken: Bool, found: Sequence[DetectedEvent], causes: Sequence[Kind], steps: Steps
+) -> list[ObservedEvent]:
     """Measure detected events in order of time; `taken` are their frames, and `causes` follow from their spectra.
 
     Weaker events next to a step or a dip belong to it. `steps` reports each event.
     """
     level = survey.flux_level(~taken)
-    kinds: Sequence[Kind] = causes or ["flare"] * len(found)
-    measured = map_in_threads(lambda k: measure_event(survey, taken, level, found[k], kinds[k]), range(len(found)))
+    pairs = list(zip(found, causes, strict=True))
+    measured = map_in_threads(lambda pair: measure_event(survey, taken, level, *pair), pairs)
     events = list(steps.each(measured, len(found)))
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
@@ -269,7 +435,20 @@ def _posterior(window: Window, taken: Bool, fits: Sequence[Fit], poor: bool) -> 
         place = log_time(window.middle[window.inside], fits[int(np.argmax(totals))].flares[0])
         power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
         mixtures = [replace(m, log_weight=m.log_weight + (power - 1) * (m.log_total - totals.max())) for m in mixtures]
-    mixture = joined(mixtures)
-    # Flares of other temperatures have another light for the same sum.
+    mixture, survey, one = joined(mixtures), window.survey, window.one
+    if len(survey.bank.directions) == 1:
+        return mixture
+    # Flares of other temperatures have another light for the same sum: the S/N of each, and the value of its amplitude.
+    scores = []
+    for direction in range(len(survey.bank.directions)):
+        other = Window.of(survey, taken, one, direction)
+        noise = np.diag(other.process) + other.noise
+        model = other.model(survey.bank.shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+        weight, outside = model / noise, ~other.inside
+        level = float(np.average(other.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0
+        scores.append((float(weight @ (other.values - level)) / np.sqrt(float(weight @ model)), other.scale))
+    snr, scale = scores[one.direction]
+    every = [(0.5 * np.sign(value) * value**2 - 0.5 * snr**2, scale / own * value / snr)
+             for value, own in scores if value > 0]  # fmt: skip
     return joined([NormalMixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
-                   for weight, factor in _directions(window.survey, taken, window.one)])  # fmt: skip
+                   for weight, factor in every])  # fmt: skip

@@ -111,12 +111,6 @@ class FrameModel:
         sky = self.bins @ spectrum_of("sky", self.quiet) * self.per_dn
         return spectra | ({"sky": sky} if sky.any() else {})
 
-    @property
-    def star(self) -> Float:
-        """Expected light of the star in a frame, shape (n_value,)."""
-        dn = self.quiet.n_frames * self.quiet.source_electrons * self.quiet.gain_dn_per_electron
-        return np.asarray(self.bins @ dn * self.per_dn)
-
     def variance(self, light: Float) -> Float:
         """Return the instrument's variance of a frame with this light, shape (n_value,)."""
         quiet = self.quiet

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
 
 #: Standard deviation of a normal distribution in units of its median absolute deviation.
@@ -36,6 +37,10 @@ NO_WEIGHT = 1e4
 MOST_BELOW = 0.03
 #: Smallest variance of the noise of a frame relative to the typical one.
 LEAST_VARIANCE = 0.1
+#: Smallest step from frame to frame as a share of the light; numbers of single precision are rounded by 1e-7.
+LEAST_NOISE = 1e-10
+#: Smallest number of frames without a fault.
+MIN_USABLE = 10
 #: Smallest and largest number of simulated light curves from which the standard error of the level is estimated, to
 #: 1 / sqrt(2 times as many), and number of values in all of them, which bounds the time.
 LEVEL_DRAWS, LEVEL_VALUES = (8, 32), 2**22
@@ -111,25 +116,19 @@ def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) ->
     for rise_of, start, _ in sorted(rises, reverse=True):
         if inside[start]:
             continue
-        last = _first_faint(flux, start, float(flux[start]) + max(WITHIN * noise, DECAYED * rise_of))
+        # The first frames belong to the rise; it ends at the first of two faint frames in a row.
+        faint = float(flux[start]) + max(WITHIN * noise, DECAYED * rise_of)
+        first, size, last = start + 4, FIRST_PIECE, flux.size
+        while first + 1 < last:
+            below = flux[first : first + size + 1] < faint
+            ends = np.flatnonzero(below[:-1] & below[1:])
+            last = first + int(ends[0]) if ends.size else last
+            first, size = first + size, 2 * size
         more = int(np.count_nonzero(~inside[start + 1 : last + 1]))
         if n_inside + more <= MOST_GUESSED * flux.size:
             inside[start + 1 : last + 1] = True
             n_inside += more
     return inside
-
-
-def _first_faint(flux: Float, start: int, limit: float) -> int:
-    """Return the first of two frames in a row below a limit, from the fourth after `start` on, or the end."""
-    # The first frames belong to the rise.
-    first, size = start + 4, FIRST_PIECE
-    while first + 1 < flux.size:
-        faint = flux[first : first + size + 1] < limit
-        ends = np.flatnonzero(faint[:-1] & faint[1:])
-        if ends.size:
-            return first + int(ends[0])
-        first, size = first + size, 2 * size
-    return flux.size
 
 
 def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tuple[Float, float]:
@@ -145,6 +144,30 @@ def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tupl
         slope = max(float(apart @ (squared[quiet] - squared[quiet].mean())) / spread, 0.0)
     typical = float(np.median(squared[quiet]))
     return np.maximum(squared - slope * (flux - level), LEAST_VARIANCE * typical), slope
+
+
+def noise_of_frames(
+    frames: Frames, flux: Float, error: Float | None, level: Float, quiet: Bool, counts: float | None
+) -> tuple[Float, float]:
+    """Return the variance of the noise of each frame at its level, and its rise with the flux."""
+    if counts is not None:
+        return np.maximum(level, 1e-3 * float(np.median(level[quiet])) + 1e-300) / counts, 1.0 / counts
+    if error is not None:
+        return quiet_variance(flux, error, level, quiet)
+    spread = noise_of_steps(frames.numbers[quiet], flux[quiet])
+    return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
+
+
+def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
+    """Raise InputError if too few frames are without a fault, or if most of them have the same flux."""
+    usable = reasons == 0
+    if (n := usable.sum()) < MIN_USABLE:
+        raise InputError(f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {n}", key="frames")
+    flux = frames.white_light[0][usable]
+    if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
+        raise InputError(
+            f"{frames.name} must be a light curve with noise, but the flux of most frames is the same", key="flux"
+        )
 
 
 class LevelGiven:

@@ -1,9 +1,13 @@
-"""Light curves for a search, without sudden losses of light by drifts out of the fibre, eclipses and dips."""
+"""Quiescent light of light curves, without events and sudden losses of light by drifts out of the fibre and eclipses.
+
+Process and events are found in alternation: a process that is fitted to flares would hide them, and a flare that is
+searched with a wrong process would be too long or too short.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -12,24 +16,191 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
 from mauvecl.host.arrays import Bool, Float, true_runs
-from mauvecl.observations import detection
+from mauvecl.observations.event_fits import flares_of
+from mauvecl.observations.events import END_FRAMES, LONG_S, MIN_QUIET, detect_events, light_of_flare
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import (
     FAR,
     MOST_BELOW,
     PER_MAD,
     QuiescentLevel,
+    check_usable,
     counts_per_unit,
     guess_flares,
     level_error,
+    noise_of_frames,
     noise_of_steps,
-    quiet_variance,
     relative_level,
     single_frames,
 )
-from mauvecl.observations.process import UNREPORTED, Binned, Steps, criterion_of_process, fit_process
-from mauvecl.observations.search import SeriesSurvey, bank_of
+from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
+from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
+
+#: Statistic of events whose frames take no part in fits of the process.
+PROVISIONAL = 5.0
+#: Largest number of alternations of process and events.
+ALTERNATIONS = 12
+#: Largest number of events in independent noise that are compared with a process, and parameters of a flare.
+MAX_COMPARED, PARAMETERS = 8, 3
+#: Departures of flares from their shape that are tried for the criterion.
+DEPARTURES = (0.0, 0.03, 0.2)
+#: Shortest period of rotation (assumed: 0.2 d), and the rise of the criterion for a faster process of which
+#: the frames show fewer periods or time scales than a number (both assumed).
+FASTEST_ROTATION_S, SEEN_ONCE, REPEATED = 17_280.0, 20.0, 10.0
+#: Share of the frames in events that may change in the last alternation.
+SETTLED = 0.002
+
+
+def fit_quiet_light(
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps = UNREPORTED
+) -> tuple[SeriesSurvey, Bool]:
+    """Fit process and events in alternation, from the guess and, if need be, from the events in independent noise.
+
+    A bright, slow flare resembles a process that is seen once. There, the fit with the events in independent noise is
+    compared by the Bayesian information criterion, with the flares among the parameters. For arguments see `alternate`.
+    """
+    fitted, taken = alternate(survey, guessed, before, steps)
+    if not _seen_once(fitted):
+        return fitted, taken
+    noise = tuple(Process((), process.excess) for process in fitted.processes)
+    found, others = detect_events(replace(survey, processes=noise), PROVISIONAL)
+    if len(found) > MAX_COMPARED or not (others & ~taken).any():
+        return fitted, taken
+    other, others = alternate(survey, others, None, steps)
+    if float((others ^ taken).mean()) <= SETTLED:
+        return fitted, taken
+    light = light_of_events(fitted, taken)
+    first, second = criterion(fitted, light, taken), criterion(other, light_of_events(other, others), others, light)
+    return (other, others) if second < first else (fitted, taken)
+
+
+@dataclass(frozen=True, eq=False)
+class EventLight:
+    """Light of the flares that fit an event."""
+
+    event: DetectedEvent
+    rows: slice
+    light: Float  # along the direction of the event, shape (n_row,)
+    photon: Float  # variance that it adds
+    n_flares: int
+
+
+def light_of_events(survey: SeriesSurvey, taken: Bool) -> list[EventLight]:
+    """Return the light of the events above `PROVISIONAL`."""
+    fits = []
+    for event in detect_events(survey, PROVISIONAL)[0]:
+        flares, scale, photon = flares_of(survey, taken, event)
+        total = np.zeros(survey.stare.n_frames)
+        every = [light_of_flare(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
+        for rows, flux in every:
+            total[rows] += flux
+        rows = slice(min(rows.start for rows, _ in every), max(rows.stop for rows, _ in every))
+        fits.append(EventLight(event, rows, scale * total[rows], photon * total[rows], len(flares)))
+    return fits
+
+
+def criterion(
+    survey: SeriesSurvey,
+    fits: Sequence[EventLight],
+    taken: Bool,
+    further: Sequence[EventLight] = (),
+    *,
+    shapeless: bool = False,
+) -> float:
+    """Return the Bayesian information criterion of the processes of a survey and of the flares of `light_of_events`.
+
+    A process of minutes that is hardly seen to repeat costs `SEEN_ONCE`: stars and instruments repeat what they do. If
+    `shapeless`, or in independent noise, the light of an event may have any smooth shape, or depart from that of its
+    flares, or of `further` ones, by a process.
+    """
+    size = float(np.log(survey.stare.n_frames))
+    every = np.ones(survey.stare.n_frames, np.bool_)
+    total = min(_criterion_of(survey, fits, every, epsilon) for epsilon in DEPARTURES)
+    shapeless = shapeless or not any(process.terms for process in survey.processes)
+    if fits and shapeless and survey.sums.shape[1] == 1:
+        alone = []
+        for event in (fit.event for fit in fits):
+            rows, added = slice(event.first, event.last + 1), [(1, *_added(survey, [], 0.0))]
+            for others in (fits, further):
+                near = (fit for fit in others if event.first <= fit.event.last and fit.event.first <= event.last)
+                if number := sum(fit.n_flares for fit in near):
+                    added += [(number, *_added(survey, others, epsilon)) for epsilon in DEPARTURES]
+            costs = []
+            for n_flares, light, extra in added:
+                values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
+                data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
+                process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
+                costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
+            alone.append(min(costs))
+        total = min(total, _criterion_of(survey, [], ~taken, 0.0) + sum(alone))
+    return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
+
+
+def _added(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> tuple[Float, Float]:
+    """Return the light of flares in the sums, (n_frame, n_sum), and the variance of flares that depart by a share."""
+    light, variance = np.zeros_like(survey.sums), np.zeros(survey.stare.n_frames)
+    for fit in fits:
+        light[fit.rows] += fit.light[:, None] * survey.bank.directions[fit.event.direction]
+        variance[fit.rows] += fit.photon + (epsilon * fit.light) ** 2
+    return light, variance
+
+
+def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, epsilon: float) -> float:
+    """Return the criterion of some frames, with flares that depart by a share from their shape."""
+    start, size = survey.stare.start_s[kept], float(np.log(survey.stare.n_frames))
+    light, extra = _added(survey, fits, epsilon)
+    total = PARAMETERS * size * sum(fit.n_flares for fit in fits)
+    for process, column in zip(survey.processes, (survey.sums - light)[kept].T, strict=True):
+        noise = (survey.variance * process.excess**2 + extra)[kept]
+        if fits and not process.terms:
+            # Frames without events in the tail of a flare have more scatter than noise.
+            noise = (survey.variance + extra)[kept]
+            process = fit_process(Binned(start, column, noise, survey.stare.frame_s), process)
+            noise = noise * process.excess**2
+        # The excess is in the noise already.
+        data = Binned(start, column, noise, survey.stare.frame_s)
+        total += criterion_of_process(replace(process, excess=1.0), data, size)
+    return total
+
+
+def _seen_once(survey: SeriesSurvey) -> bool:
+    """Return whether a process is faster than rotation, but too slow to be seen to repeat."""
+    span = survey.stare.duration_s
+    return any(
+        span / REPEATED < term.scale_s < FASTEST_ROTATION_S for process in survey.processes for term in process.terms
+    )
+
+
+def alternate(
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None, steps: Steps
+) -> tuple[SeriesSurvey, Bool]:
+    """Fit process and events in alternation; return the survey with processes, and the frames above `PROVISIONAL`.
+
+    The terms of `before`, a survey of nearly the same frames, are kept as long as the events hardly change.
+    """
+    taken, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
+    for _ in range(ALTERNATIONS):
+        # Rounds may come back to the same frames.
+        key = taken.tobytes(), before
+        if key not in rounds:
+            # The flux of a light curve is its only sum.
+            columns, fits = [*survey.sums.T, *([survey.flux] if survey.weighted else [])], list[Process]()
+            befores = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
+            for column, start in zip(columns, befores, strict=False):
+                time, values, variance = (each[~taken] for each in (survey.stare.start_s, column, survey.variance))
+                fits.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), start, steps))
+            fitted = replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
+            rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
+        fitted, now = rounds[key]
+        changed = float((now ^ taken).mean())
+        taken = now
+        if changed <= SETTLED:
+            break
+        # Terms are chosen again as long as many frames change.
+        before = fitted if changed < 10 * SETTLED else None
+    return fitted, taken
+
 
 #: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
 #: stated one, above which losses are tried (assumed).
@@ -100,12 +271,12 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
-    guessed = detection.detect_events(down, detection.PROVISIONAL, steps)[1]
+    guessed = detect_events(down, PROVISIONAL, steps)[1]
 
     @cache
     def usual() -> float:
         """Return the criterion of flares without losses."""
-        return detection.criterion(fitted, detection.light_of_events(fitted, taken), taken)
+        return criterion(fitted, light_of_events(fitted, taken), taken)
 
     # Those of a star that varies are most of its frames; eclipses repeat.
     if active and guessed.mean() >= MOST_LOST:
@@ -113,15 +284,15 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
         if lost.any():
             none[dark] = lost
             return none
-    other, losses = detection.alternate(down, guessed, None, steps)
+    other, losses = alternate(down, guessed, None, steps)
     # The star is constant between losses, or before and after one; not only before or after a step.
-    returns = np.count_nonzero(np.diff(true_runs(~losses)) > detection.END_FRAMES) > 1
+    returns = np.count_nonzero(np.diff(true_runs(~losses)) > END_FRAMES) > 1
     constant = returns and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
         simpler = constant and losses.mean() < taken.mean() and process.excess > MOST_EXCESS
-        light = detection.light_of_events(other, losses)
-        if simpler or detection.criterion(other, light, losses, shapeless=True) < usual():
+        light = light_of_events(other, losses)
+        if simpler or criterion(other, light, losses, shapeless=True) < usual():
             none[dark] = losses
     return none
 
@@ -133,23 +304,23 @@ def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     if not 0 < guessed.mean() < MOST_LOST:
         return none
     part = survey.frames(~guessed)
-    fitted, taken = detection.fit_quiet_light(part, guess_flares(part.stare.numbers, part.flux))
+    fitted, taken = fit_quiet_light(part, guess_flares(part.stare.numbers, part.flux))
     # The light in eclipses may have any smooth shape.
     dim = survey.frames(guessed)
     data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
     size = float(np.log(guessed.size))
     cost = EPHEMERIS * size + criterion_of_process(fit_process(data), data, size)
-    if detection.criterion(fitted, detection.light_of_events(fitted, taken), taken) + cost >= usual():
+    if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual():
         return none
     quiet = ~guessed
     quiet[quiet] = ~taken
     whole = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
-    sigma = uniform_filter1d(whole.along(0, quiet), detection.END_FRAMES)
+    sigma = uniform_filter1d(whole.along(0, quiet), END_FRAMES)
     # Frames at the ends of the guess that are as bright as the star are searched.
     for first, end in true_runs(guessed):
         faint = first + np.flatnonzero(sigma[first:end] < -FAINT)
         if faint.size:
-            none[max(first, faint[0] - detection.END_FRAMES) : min(end, faint[-1] + detection.END_FRAMES + 1)] = True
+            none[max(first, faint[0] - END_FRAMES) : min(end, faint[-1] + END_FRAMES + 1)] = True
     return none
 
 
@@ -213,12 +384,8 @@ def _bright(survey: SeriesSurvey) -> Bool:
     return bright if bright.mean() < MOST_BRIGHT else np.zeros_like(bright)
 
 
-#: Smallest step from frame to frame as a share of the light; numbers of single precision are rounded by 1e-7.
-LEAST_NOISE = 1e-10
 #: Number of frames whose median is the level around a single bright frame.
 SPIKE_FRAMES = 9
-#: Smallest number of frames without a fault.
-MIN_USABLE = 10
 #: Largest number of times that single frames are left out and the rest is fitted again.
 ROUNDS = 3
 
@@ -245,10 +412,10 @@ def survey_light_curve(
             guessed[used] = guess_flares(frames.numbers[used], flux[used], least)
             level = np.full(flux.size, _mean(frames.name, flux[used & ~guessed], least))
         quiet = used & ~guessed
-        variance, photon = _noise(frames, flux, error, level, quiet, counts)
+        variance, photon = noise_of_frames(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
-        survey, taken = detection.fit_quiet_light(new, guessed[used], survey, fits)
+        survey, taken = fit_quiet_light(new, guessed[used], survey, fits)
         if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken, fits)).any():
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
@@ -288,24 +455,12 @@ def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], 
         above = flux[fine] - median_filter(flux[fine], size=SPIKE_FRAMES, mode="nearest")
         sigmas[fine] = np.divide(above, sd, out=np.zeros(sd.size), where=sd > 0)
         reasons[single_frames(frames.numbers, sigmas, fine)] |= Reason.SPIKE
-        if np.ptp(frames.time_s) > detection.LONG_S:
+        if np.ptp(frames.time_s) > LONG_S:
             at = np.flatnonzero(reasons == 0)
             relative = relative_level(frames.time_s[at], frames.numbers[at], flux[at], frames.cadence_s)
             # Frames that are not searched have the level of the next one that is.
             level = relative[np.clip(np.searchsorted(at, np.arange(flux.size)), 0, at.size - 1)]
     return frames, counts, reasons, level
-
-
-def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
-    """Raise InputError if too few frames are without a fault, or if most of them have the same flux."""
-    usable = reasons == 0
-    if (n := usable.sum()) < MIN_USABLE:
-        raise InputError(f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {n}", key="frames")
-    flux = frames.white_light[0][usable]
-    if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
-        raise InputError(
-            f"{frames.name} must be a light curve with noise, but the flux of most frames is the same", key="flux"
-        )
 
 
 def _mean(name: str, flux: Float, least: float) -> float:
@@ -316,18 +471,6 @@ def _mean(name: str, flux: Float, least: float) -> float:
     if (mean := float(flux[near].mean())) == 0.0:
         raise InputError(f"{name}: the level of the star's light must not be zero", key="flux")
     return mean
-
-
-def _noise(
-    frames: Frames, flux: Float, error: Float | None, level: Float, quiet: Bool, counts: float | None
-) -> tuple[Float, float]:
-    """Return the variance of the noise of each frame at its level, and its rise with the flux."""
-    if counts is not None:
-        return np.maximum(level, 1e-3 * float(np.median(level[quiet])) + 1e-300) / counts, 1.0 / counts
-    if error is not None:
-        return quiet_variance(flux, error, level, quiet)
-    spread = noise_of_steps(frames.numbers[quiet], flux[quiet])
-    return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
 
 
 def _single(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -18,8 +18,8 @@ from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.spectrum import Measurement, fit
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.noise.unknowns import NUISANCES
-from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.detector import variance_of_steps
+from mauvecl.observations.events import Kind
 from mauvecl.observations.frame_model import (
     CLEARLY,
     CleanedSpectra,
@@ -30,8 +30,8 @@ from mauvecl.observations.frame_model import (
     light_changes,
 )
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.level import QuiescentLevel, guess_flares, single_frames
-from mauvecl.observations.light_curve import check_usable, quiescent_light
+from mauvecl.observations.level import QuiescentLevel, check_usable, guess_flares, single_frames
+from mauvecl.observations.light_curve import fit_quiet_light, quiescent_light
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.errors import InputError
@@ -100,7 +100,9 @@ class SpectralSeries:
         model = self.cleaned.model
         if not model.star_is_known:
             return float("nan")
-        star = model.star
+        quiet = model.quiet
+        dn = quiet.n_frames * quiet.source_electrons * quiet.gain_dn_per_electron
+        star = model.bins @ dn * model.per_dn
         others = [spectrum for name, spectrum in model.unknowns(self.light).items() if name != "light"]
         columns = np.array([star, *others]).T / self.noise.used[:, None]
         amplitude = np.linalg.lstsq(columns, self.light / self.noise.used, rcond=None)[0][0]
@@ -287,9 +289,8 @@ def _multiple(excess: Float, star: Float, variance: Float) -> tuple[float, float
     return float((excess * star / variance).sum()) / information, information**-0.5
 
 
-Cause = Literal["flare", "throughput", "dark current", "sky", "cosmic ray"]
 #: Words for the unknowns of frames that may cause an event.
-CAUSES: dict[str, Cause] = {"light": "throughput", "dark": "dark current", "sky": "sky"}
+CAUSES: dict[str, Kind] = {"light": "throughput", "dark": "dark current", "sky": "sky"}
 #: S/N of a flare, next to unknown changes of star, dark current and sky, from which an event is a flare.
 FLARE_SNR = 4.0
 #: Share of an event's chi-squared in a single pixel from which it is that of a cosmic ray.
@@ -306,9 +307,9 @@ NO_FIT = 1e-6
 class EventSpectrum:
     """Spectrum of an event and its fits."""
 
-    cause: Cause  # explanation of the spectrum: a flare, or a change that resembles one
+    cause: Kind  # explanation of the spectrum: a flare, or a change that resembles one
     snr: float  # S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky
-    chi2: dict[Cause, float]  # of single causes, with the best amplitude, and of flares of the best temperature
+    chi2: dict[Kind, float]  # of single causes, with the best amplitude, and of flares of the best temperature
     dof: int
     p_value: float  # probability of a chi-squared at least as large as the smallest, if its cause is right
 
@@ -346,7 +347,7 @@ def event_spectrum(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, on
     photons = model.gain * np.maximum(spectrum, 0.0) * float((weights**2) @ np.maximum(shape, 0.0))
     variance = (weights**2).sum() * series.noise.used**2 + photons
     flares, unknown = model.flares(TEMPERATURES_K), model.unknowns(series.light)
-    causes: dict[Cause, Float] = {"flare": flares}
+    causes: dict[Kind, Float] = {"flare": flares}
     causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
     fits = {cause: chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
     chi2 = {cause: float(each.min()) for cause, each in fits.items()}
@@ -358,7 +359,7 @@ def event_spectrum(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, on
     optimal = flares / variance - (flares @ rows.T) @ rows
     values = (optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))
     snr = float(values.max())
-    cause: Cause = min(chi2, key=lambda name: chi2[name])
+    cause: Kind = min(chi2, key=lambda name: chi2[name])
     dof = spectrum.size - 1
     least = chi2[cause]
     row = causes[cause][fits[cause].argmin()]

@@ -25,7 +25,7 @@ from mauvecl.host.exposure.background import Sky
 from mauvecl.host.exposure.expectation import continued_to_reach, expect
 from mauvecl.host.exposure.response import Order, response_matrix
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.observations.detector import CalibrationFrames, DarkFit, PhotonTransfer
+from mauvecl.observations.detector import CalibrationFrames, DarkFit, GoodnessOfFit, PhotonTransfer
 from mauvecl.schema.errors import InputError
 
 #: Knots of the errors of a star's spectrum, and their relative size if one star alone cannot tell: an assumption.
@@ -46,16 +46,8 @@ LARGEST_STEP, LARGEST_LOG = 1.0, 10.0
 LOG_SMOOTHING, LOG_ERROR = (-25.0, 25.0), (-9.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Value:
-    """A fitted value with its standard error."""
-
-    value: float
-    error: float
-
-
 @dataclass(frozen=True, eq=False)
-class ThroughputFit:
+class ThroughputFit(GoodnessOfFit):
     """Fit of the throughput."""
 
     wavelength_nm: Float  # shape (n_pixel,)
@@ -63,14 +55,13 @@ class ThroughputFit:
     # Shape (n_pixel + n_shape, n_pixel + n_shape); covariance of `log_factor` and, if they are fitted, of shift and
     # stretch in nm and of the relative width and its change.
     joint: Float
-    shift_nm: Value | None  # wavelength of a feature less the nominal one in the middle of the spectrum
-    stretch_nm: Value | None  # change of the shift to either end
-    fwhm_nm: Value | None  # width of the line function's Gaussian in the middle of the spectrum
-    fwhm_change_nm: Value | None  # its change to the red end
+    # Wavelength of a feature less the nominal one in the middle of the spectrum, change of this shift to either end,
+    # width of the line function's Gaussian in the middle, and its change to the red end, nm; nominal if not fitted.
+    shape_nm: Float
+    shape_error_nm: Float  # shape (4,); NaN if not fitted
     residual: Float  # shape (n_star, n_pixel); observed less fitted counts in standard deviations; NaN if not used
     chi2: float
     dof: float  # pixels less the effective number of parameters
-    smoothing: float  # weight of the squared second derivative
     spectrum_error: float  # relative error of the stars' spectra at each of `ERROR_KNOTS` knots
     structure: float  # relative standard deviation of the pixels about the spline; 0 if it follows the throughput
     assumed: tuple[str, ...]  # quantities that these stars do not determine
@@ -79,22 +70,6 @@ class ThroughputFit:
     def error(self) -> Float:
         """Standard error of `log_factor`, shape (n_pixel,)."""
         return np.asarray(np.sqrt(np.diag(self.joint)[: self.wavelength_nm.size]))
-
-    @property
-    def p_value(self) -> float:
-        """Probability of a chi-squared at least as large."""
-        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
-
-    def binned_residuals(self, pixels: int) -> tuple[Float, Float]:
-        """Return middles of groups of pixels, nm, and the residuals of each star, in their standard deviations.
-
-        Residuals are NaN in groups of which no pixel is used.
-        """
-        n = self.wavelength_nm.size // pixels
-        nm = self.wavelength_nm[: n * pixels].reshape(n, pixels).mean(axis=1)
-        part = self.residual[:, : n * pixels].reshape(-1, n, pixels)
-        count = np.isfinite(part).sum(axis=2)
-        return nm, np.divide(np.nansum(part, axis=2), np.sqrt(count), out=np.full(count.shape, np.nan), where=count > 0)
 
 
 class _Linearised:
@@ -137,13 +112,13 @@ class _Linearised:
         n, pull = len(penalty), np.zeros_like(covariance)
         pull[:, :n] = self.smoothing * covariance[:, :n] @ penalty
         noise = covariance - pull @ covariance
-        variance = _diagonal(basis, covariance[:n, :n])
 
-        def mean(values: Float) -> float:
-            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
+        def spread(values: Float) -> Float:
+            """Return the variance of a curve at the pixels from the covariance of its coefficients."""
+            return np.asarray(np.einsum("pi,pi->p", basis @ values[:n, :n], basis))
 
-        bias = basis @ (pull @ self.found)[:n]
-        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
+        variance, bias = spread(covariance), basis @ (pull @ self.found)[:n]
+        of_noise, expected = (float(np.mean(spread(each) / variance)) for each in (pull @ noise @ pull.T, pull @ noise))
         if not expected > of_noise:
             return covariance
         scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
@@ -331,14 +306,12 @@ def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) 
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
-    sd = np.sqrt(np.diag(joint))[nm.size :]
-    shift, stretch, width, change = (
-        Value(scale * float(shape[k] + (k == 2)), scale * float(sd[k])) if k < m else None
-        for k, scale in enumerate((1.0, 1.0, fwhm, fwhm))
-    )
+    # Widths are relative to the nominal one.
+    scale, errors = np.array([1.0, 1.0, fwhm, fwhm]), np.append(np.sqrt(np.diag(joint))[nm.size :], [np.nan] * (4 - m))
     return ThroughputFit(
-        nm, log_factor, joint, shift, stretch, width, change, residual=residual, chi2=chi2, dof=dof,
-        smoothing=best.smoothing, spectrum_error=apart or error, structure=structure, assumed=tuple(assumed),
+        nm, log_factor, joint, scale * (np.append(shape, np.zeros(4 - m)) + [0, 0, 1, 0]), scale * errors,
+        residual=residual, chi2=chi2, dof=dof,
+        spectrum_error=apart or error, structure=structure, assumed=tuple(assumed),
     )  # fmt: skip
 
 
@@ -374,11 +347,6 @@ def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
     second = BSpline(full, np.eye(knots + 3), 3).derivative(2)(nodes.ravel())
     weight = np.repeat(half, 2, axis=1).ravel()
     return design, np.asarray((second * weight[:, None]).T @ second)
-
-
-def _diagonal(basis: Float, covariance: Float) -> Float:
-    """Return the variance of a curve at the pixels from the covariance of its coefficients, shape (n_pixel,)."""
-    return np.asarray(np.einsum("pi,pi->p", basis @ covariance, basis))
 
 
 def _linear_basis(nm: Float) -> Float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
@@ -425,7 +424,7 @@ class Change:
             nm = np.unique(np.concatenate([nm, line.nodes_nm]))
             flux, unit, meaning = line.profile(nm), "erg / (s cm2)", f"flux of {line.name}"
         rate = electrons_per_second(instrument, nm, flux, order)
-        return cls(name.strip(), unit, meaning, rate * exposure_dn_per_electron(quiet, instrument))
+        return cls(name.strip(), unit, meaning, rate * _exposure_dn_per_electron(quiet, instrument))
 
 
 def _below(edge_nm: float) -> Float:
@@ -447,7 +446,7 @@ def _band(name: str) -> tuple[float, float] | None:
     return low, high
 
 
-def exposure_dn_per_electron(quiet: Expectation, instrument: Instrument) -> Float:
+def _exposure_dn_per_electron(quiet: Expectation, instrument: Instrument) -> Float:
     """Return the DN of an exposure for a rate of one electron per second, shape (n_pixel,)."""
     return np.asarray(quiet.exposure_s * quiet.gain_dn_per_electron * instrument.per_pixel("response", 1.0))
 
@@ -458,31 +457,6 @@ def flux_per_dn(quiet: Expectation, instrument: Instrument) -> Float:
     This is the calibration of an observer: counts over the effective area at the wavelength of the pixel.
     """
     flam = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm)
-    per_flam = flam * instrument.dispersion_nm_per_pixel * exposure_dn_per_electron(quiet, instrument)
+    per_flam = flam * instrument.dispersion_nm_per_pixel * _exposure_dn_per_electron(quiet, instrument)
     # Per nm in place of per Angstrom.
     return np.divide(10.0, per_flam, out=np.zeros_like(per_flam), where=per_flam > 0)
-
-
-def index_of(
-    index: Index, quiet: Expectation, instrument: Instrument, order: Order
-) -> tuple[Float, float, float, float]:
-    """Return weights of the pixels, value, equivalent width and captured share of a line index; see `IndexRow`.
-
-    Raises InputError if the instrument does not cover the bands.
-    """
-    calibration = flux_per_dn(quiet, instrument)
-    nm = quiet.wavelength_nm
-    # The index is linear in the pixels near it.
-    windows = (index.band_nm, *index.continuum_nm)
-    near = (nm > min(low for low, _ in windows) - 1.0) & (nm < max(high for _, high in windows) + 1.0)
-    find = partial(line_index, nm[near], band_nm=index.band_nm, continuum_nm=index.continuum_nm)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # Pixels of the band alone have no continuum, and no equivalent width.
-        part = find(np.eye(int(near.sum())))
-    weights = np.zeros(nm.size)
-    weights[near] = part.flux * calibration[near]
-    mean = find((calibration * quiet.signal_dn)[near])
-    lines = EmissionLine.named(index.name)
-    rate = electrons_per_second(instrument, lines.nodes_nm, lines.profile(lines.nodes_nm), order)
-    captured = float(weights @ (rate * exposure_dn_per_electron(quiet, instrument)))
-    return weights, float(mean.flux), float(mean.equivalent_width_nm), captured

@@ -8,15 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
 from bokeh.palettes import interp_palette
-from numpy.typing import NDArray
 
 from mauvecl.answers.plan import COLUMNS
-from mauvecl.charts import chart, spectra
-from mauvecl.charts.chart import WAVELENGTH, Axis, Chart, ChartData, Custom, Dots, Line, Own, Rule, Strips, Targets
-from mauvecl.charts.light_curves import SCATTER, scatter_series
-from mauvecl.host.arrays import Float
+from mauvecl.charts import chart, light_curves, spectra
+from mauvecl.charts.chart import Axis, Chart, ChartData, Custom, Own, Targets
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.columns import with_error
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
@@ -26,8 +22,6 @@ from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, unpack
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
-    from mauvecl.answers.analyse import AnalyseAnswer
-    from mauvecl.answers.calibrate import CalibrateAnswer
     from mauvecl.answers.change import ChangeAnswer
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.observations.analysis import Analysis
@@ -39,65 +33,26 @@ if TYPE_CHECKING:
 
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
-#: Verdicts on events, with their colours.
-VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
 #: Colours of the dynamic spectrum, from low to high.
 BLUE, MIDDLE, RED = "#0072B2", "#F7F7F7", "#D55E00"
 NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
 
 
-def minutes(frames: Frames, time_s: Any) -> Float:
-    """Return times in minutes from the first frame."""
-    return np.asarray(time_s - frames.time_s[0]) / 60.0
-
-
-def thinned(values: Float, most: int) -> NDArray[np.int64]:
-    """Return the indices of at most `most` values, including the smallest and largest of each part."""
-    if values.size <= most:
-        return np.arange(values.size)
-    parts = np.array_split(np.arange(values.size), most // 2)
-    ends = [(part[np.argmin(values[part])], part[np.argmax(values[part])]) for part in parts]
-    return np.unique(np.array(ends))
-
-
-@Chart(
-    "frames", "Light curve", Axis("time from the first frame (min)"), Axis("flux"),
-    (
-        *(Strips(verdict, colour, f"{verdict} events") for verdict, colour in VERDICTS.items()),
-        Line("quiescent level", "flare", "level"),
-        # A bad frame far away does not compress the others.
-        Dots("frames", "text", "searched", size=3, tips=("minute", "flux"), alone=True),
-        Dots("not searched", "own", "left out", size=6, marker="x"),
-    ),
-    logs=("y",),
-).data()  # fmt: skip
+@light_curves.LIGHT_CURVE.data()
 def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the light curve, its quiescent level, and the events."""
     frames: Frames | None = closed.given.get("frames")
-    series = dict[str, Any]()
     if frames is None:
         return ChartData(NO_FRAMES)
-    flux, used = frames.white_light[0], frames.faults == 0
-    text = f"{frames.n_frames} frames of {frames.name}. Analyse searches them for flares."
+    text, answer = f"{frames.n_frames} frames of {frames.name}. Analyse searches them for flares.", None
     if "analyse" in answers:
         answer = answers["analyse"]
-        analysis: Analysis = answer.analysis
-        flux, used = analysis.flux, analysis.level.used
-        chosen = thinned(analysis.level.level, MOST_POINTS)
-        series["level"] = minutes(frames, frames.time_s[chosen]), analysis.level.level[chosen]
-        verdicts, half = [row.verdict for row in answer.rows], frames.cadence_s / 2
-        named = [verdict for verdict in VERDICTS if verdict != "undecided" or verdict in verdicts]
+        verdicts = [row.verdict for row in answer.rows]
+        named = [verdict for verdict in light_curves.VERDICTS if verdict != "undecided" or verdict in verdicts]
         counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in named)
-        text = f"Events in {short(analysis.days)} star-days: {counts}; detected above an S/N of "
-        text += f"{analysis.threshold:.2f}."
-        for verdict in VERDICTS:
-            ends = [(row.event.first, row.event.last) for row in answer.rows if row.verdict == verdict]
-            times = analysis.survey.time_s[np.reshape(np.array(ends, int), (-1, 2))]
-            series[f"{verdict} events"] = minutes(frames, times + [-half, half]).T
-    for name, which in (("searched", used), ("left out", ~used & np.isfinite(flux))):
-        chosen = np.flatnonzero(which)
-        chosen = chosen[thinned(flux[chosen], MOST_POINTS)]
-        series[name] = minutes(frames, frames.time_s[chosen]), flux[chosen]
+        text = f"Events in {short(answer.analysis.days)} star-days: {counts}; detected above an S/N of "
+        text += f"{answer.analysis.threshold:.2f}."
+    series = light_curves.light_curve_series(frames, answer, most=MOST_POINTS)
     return ChartData(text, series, {"y axis": {"axis_label": f"flux ({frames.unit})" if frames.unit else "flux"}})
 
 
@@ -123,49 +78,27 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     frames: Frames | None = closed.given.get("frames")
     if frames is None or frames.wavelength_nm is None:
         return ChartData("A light curve has no spectra." if frames else NO_FRAMES)
-    nm, columns = frames.wavelength_nm, _means(frames.flux, frames.numbers, MOST_COLUMNS)
-    image = _means(columns.T, np.arange(nm.size), MOST_ROWS)
+    nm = frames.wavelength_nm
+    # Columns without frames are 0 / 0.
     with np.errstate(invalid="ignore", divide="ignore"):
+        sums, counts, _ = light_curves.column_sums(frames.flux, frames.numbers, MOST_COLUMNS)
+        sums, counts, _ = light_curves.column_sums((sums / counts).T, np.arange(nm.size), MOST_ROWS)
+        image = sums / counts
         image = image - np.nanmedian(image, axis=1, keepdims=True)
         steps = np.diff(image, axis=1)
         # Differences of neighbouring columns hold noise alone; 1.4826 makes a median absolute deviation a normal one's.
         image = image / (1.4826 / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True))
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
-    length = float(minutes(frames, frames.time_s[-1] + frames.cadence_s))
+    length = float(frames.time_s[-1] + frames.cadence_s - frames.time_s[0]) / 60.0
     series: dict[str, Any] = {"dynamic": (image[None], [0.0], [nm[0]], [length], [max(nm[-1] - nm[0], 1.0)])}
     if "analyse" in answers:
         analysis: Analysis = answers["analyse"].analysis
-        ends = [minutes(frames, analysis.survey.time_s[[event.first, event.last]]) for event in analysis.events]
+        minutes = (analysis.survey.time_s - frames.time_s[0]) / 60.0
+        ends = [minutes[[event.first, event.last]].tolist() for event in analysis.events]
         above = float(nm[-1] + 0.02 * (nm[-1] - nm[0]))
-        series["marks"] = [list(map(float, x)) for x in ends], [[above, above]] * len(ends)
+        series["marks"] = ends, [[above, above]] * len(ends)
     text = f"{frames.n_frames} spectra of {nm.size} pixels, {nm[0]:.0f} to {nm[-1]:.0f} nm."
     return ChartData(text, series, {"deviation": {"low": -reach, "high": reach}})
-
-
-def _means(values: Float, numbers: NDArray[np.int64], most: int) -> Float:
-    """Return the means of rows by their number, at most `most`; rows that do not exist are NaN."""
-    bins = numbers // -(-(int(numbers[-1]) + 1) // most)
-    sums = np.zeros((int(bins[-1]) + 1, values.shape[1]))
-    counts = np.zeros_like(sums)
-    finite = np.isfinite(values)
-    np.add.at(sums, bins, np.where(finite, values, 0.0))
-    np.add.at(counts, bins, finite)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(sums / counts)
-
-
-@SCATTER.data("analyse", "Analyse checks the noise.")
-def scatter(closed: ClosedForms, answer: AnalyseAnswer) -> ChartData:
-    """Return the scatter of means of quiescent frames against that of independent ones."""
-    rows, series = answer.analysis.scatter, scatter_series(answer)
-    red = next((row for row in rows if row.red), None) if series else None
-    text = "Analyse checks the noise."
-    if rows:
-        text = "Quiescent frames are independent." if series else "Too few consecutive quiescent frames for means."
-    if red is not None:
-        of = "Single frames" if red.frames == 1 else f"Means of {red.frames} frames"
-        text = f"{of} scatter {red.measured / red.white:.2f} times as much as independent frames."
-    return ChartData(text, series)
 
 
 def read_frames(question: FieldValues) -> dict[str, Any]:
@@ -188,50 +121,13 @@ ANALYSE = Tab(
     about="Flares in your own light curve or spectra: the noise is checked first, and every event has its false-alarm "
     "rate in the noise as measured. The star's fields are for spectra of Mauve.",
     chance=False,
-    pictures=(light_curve, dynamic_spectrum, scatter),
+    pictures=(light_curve, dynamic_spectrum, light_curves.scatter_of_means),
     files=dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse"),
     documents={"analyse.html": "analyse"},
     needs="frames",
     given=read_frames,
     words=name_of("frames", "no file of frames yet"),
 )
-
-
-NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
-
-
-@spectra.THROUGHPUT.data("calibrate", NO_OBSERVATIONS)
-def throughput(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
-    """Return the fitted throughput with its 95 % band, and the nominal one."""
-    ratio = answer.throughput_table["ratio"]
-    text = f"{answer.notice} It is {ratio.min():.3g} to {ratio.max():.3g} times the nominal one."
-    return ChartData(text, spectra.throughput_series(answer))
-
-
-@Chart(
-    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {spectra.BIN} pixels (sigma)"),
-    (
-        Targets("residual", tips=("residual (sigma)",)),
-        Rule("2 sigma", "threshold", "above", along="y", at=2.0),
-        Rule("2 sigma", "threshold", "below", along="y", listed=False, at=-2.0),
-    ),
-).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
-def residuals(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
-    """Return the residuals of each star."""
-    rows = spectra.residual_series(answer)
-    words = "; ".join(f"{name} {np.sqrt(np.mean(row**2)):.2f}" for name, _, row in rows)
-    text = f"Root mean square, 1 for noise alone: {words}; p = {answer.throughput.p_value:.2g}."
-    return ChartData(text, {"residual": rows})
-
-
-@spectra.TRANSFER.data("calibrate", NO_OBSERVATIONS)
-def photon_transfer(closed: ClosedForms, answer: CalibrateAnswer) -> ChartData:
-    """Return the measured over the fitted variance."""
-    t = answer.transfer
-    text = f"Gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise {t.read_noise_dn:.3g} DN."
-    if "gain" in t.assumed:
-        text = "The frames do not determine the gain: it is nominal."
-    return ChartData(text, spectra.transfer_series(answer)[0])
 
 
 def read_observations(question: FieldValues) -> dict[str, Any]:
@@ -258,7 +154,7 @@ CALIBRATE = Tab(
     about="The instrument from frames of standard stars and of no light: throughput with its errors, dark current, "
     "gain and line width, next to the nominal values.",
     chance=False,
-    pictures=(throughput, residuals, photon_transfer),
+    pictures=(spectra.calibrated_throughput, spectra.residuals_of_stars, spectra.variances_of_frames),
     files=dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate"),
     documents={"instrument.zip": "calibrate"},
     needs="observations",
@@ -272,17 +168,15 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
 
     def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
         here = [row for row in answer.changes if row.change.unit in units]
-        lines, words, own = [], list[str](), list[float]()
-        for row in here:
-            change, scale = row.change.name, units[row.change.unit]
-            lines += spectra.along_magnitude(answer, [change], scale)
-            hidden = np.isinf(row.smallest.one)
-            words.append(f"{spectra.shown_name(change)} {'hidden' if hidden else f'{scale * row.smallest.one:.3g}'}")
-            own += [] if hidden else [scale * row.smallest.one]
+        sizes = [units[row.change.unit] * row.smallest.one for row in here]
+        words = [f"{spectra.shown_name(row.change.name)} {'hidden' if np.isinf(size) else f'{size:.3g}'}"
+                 for row, size in zip(here, sizes, strict=True)]  # fmt: skip
+        own = [size for size in sizes if not np.isinf(size)]
         text = (
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
             f"{'; '.join(words) or 'none of this kind'}."
         )
+        lines = spectra.along_magnitude(answer, units)
         return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
 
     axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))

@@ -13,7 +13,7 @@ from scripts import loaded
 
 import mauvecl
 from mauvecl import SHAPES, Frames, Instrument, Source, Stares, Study, TableShape, analyse, expect, read_frames, stare
-from mauvecl.observations import detection, events
+from mauvecl.observations import events
 from mauvecl.observations import level as levels
 from mauvecl.observations import search as searches
 from mauvecl.observations.light_curve import survey_light_curve
@@ -46,7 +46,7 @@ def test_false_alarms_in_white_noise_are_as_many_as_promised(threshold: float) -
     count, days = 0, 0.0
     for _ in range(250):
         survey = survey_of(light_curve(rng))
-        count += len(detection.detect_events(survey, threshold)[0])
+        count += len(events.detect_events(survey, threshold)[0])
         days += survey.stare.observed_s / 86_400
     # The threshold has a standard error of some 3 %, and an estimated noise makes alarms more frequent: by
     # exp(u^2 s^2 / 2) u^2 of 4 % in the noise.
@@ -64,7 +64,7 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
         peak = rng.uniform((4000, 20_000), (10_000, 28_000))
         light = sum(size * flare(*each) for size, *each in zip(amplitude, peak, width, strict=True))
         survey = survey_of(light_curve(rng, LEVEL * (1 + light)))
-        found, taken = detection.detect_events(survey, threshold)
+        found, taken = events.detect_events(survey, threshold)
         level = survey.flux_level(~taken)
         for truth, at in zip(amplitude * width * SHAPE.equivalent_duration, peak, strict=True):
             near = (one for one in found if abs(one.peak_s - at) < 2000)
@@ -90,7 +90,7 @@ def test_flares_at_the_limit_are_detected_nine_times_in_ten() -> None:
         peaks = rng.uniform((4000, 20_000), (16_000, 32_000))
         light = amplitude * sum(flare(peak, width) for peak in peaks)
         survey = survey_of(light_curve(rng, LEVEL * (1 + light)))
-        found, _ = detection.detect_events(survey, answer.analysis.threshold)
+        found, _ = events.detect_events(survey, answer.analysis.threshold)
         seen += sum(any(abs(one.peak_s - peak) < 4 * width + 300 for one in found) for peak in peaks)
     # The limit itself comes from forty injections per size: its completeness is known to some 5 %.
     low, high = stats.binom.ppf([0.0005, 0.9995], number, [0.78, 0.97])

@@ -12,7 +12,7 @@ from scenes import flare, noisy
 from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse
-from mauvecl.observations import detection, event_fits, event_windows, events
+from mauvecl.observations import event_fits, event_windows, events
 from mauvecl.observations import level as levels
 from mauvecl.observations import process as processes
 from mauvecl.observations import search as searches
@@ -109,7 +109,7 @@ def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve
     sizes, work = list[tuple[str, int]](), []
     watch(monkeypatch, processes.Covariance, "squared_norms", 1, sizes)
     for n in (SHORT, LONG):
-        found, _ = detection.detect_events(survey_of(n, SMOOTH), 7.0)
+        found, _ = events.detect_events(survey_of(n, SMOOTH), 7.0)
         assert len(found) == 1
         work.append(sum(size for _, size in sizes))
         sizes.clear()
@@ -181,7 +181,7 @@ def test_progress_rises_to_the_number_of_frames_and_may_stop_the_analysis(monkey
         analyse(often, progress=Mock(side_effect=[None, KeyboardInterrupt]), frames=frames)
     measure = Mock(side_effect=lambda *given: time.sleep(0.02))
     monkeypatch.setattr(events, "measure_event", measure)
-    survey, quiet = Mock(), np.zeros(3, np.bool_)
+    survey, quiet, steps = Mock(), np.zeros(3, np.bool_), processes.Steps(Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        events.measure_events(survey, quiet, [None] * 100, steps=processes.Steps(Mock(side_effect=KeyboardInterrupt)))
+        events.measure_events(survey, quiet, [None] * 100, ["flare"] * 100, steps)
     assert 0 < measure.call_count < 30

@@ -13,7 +13,7 @@ from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
-from mauvecl.observations import detection, spectra
+from mauvecl.observations import events, spectra
 from mauvecl.observations import frame_model as models
 from mauvecl.observations import search as searches
 
@@ -258,7 +258,7 @@ def test_false_alarms_are_as_many_as_promised(threshold: float) -> None:
     rng, count, days = np.random.default_rng(308), 0, 0.0
     for _ in range(60):
         _, survey, _ = prepared(drawn(rng))
-        count += len(detection.detect_events(survey, threshold)[0])
+        count += len(events.detect_events(survey, threshold)[0])
         days += survey.stare.observed_s / 86_400
     low, high = stats.poisson.ppf([0.0005, 0.9995], 20.0 * days)
     assert 0.9 * low < count < 1.15 * high
@@ -298,7 +298,7 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
         added = flare(rng.uniform(900, 2700), rng.uniform(30, 90), size, kelvin)
         drift = rng.choice([-0.05, 0.05]) * (TIME - TIME.mean()) / 3600
         _, survey, series = prepared(drawn(rng, added + np.outer(drift, light())))
-        found, taken = detection.detect_events(survey, threshold)
+        found, taken = events.detect_events(survey, threshold)
         one = max(found, key=lambda each: each.value)
         assert spectra.event_spectrum(survey, series, taken, one).cause == "flare"
         measured = spectra.measure_flare(survey, series, taken, one)

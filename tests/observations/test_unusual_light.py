@@ -9,7 +9,7 @@ from marks import long_but
 from scenes import PER_MONTH, analysed, detected, flare, noisy
 
 from mauvecl import SHAPES, Frames, Study, analyse
-from mauvecl.observations import detection
+from mauvecl.observations import events
 
 DURATION = SHAPES["davenport2014"].equivalent_duration
 
@@ -52,7 +52,7 @@ def test_end_of_a_search_at_its_largest_number_of_events_is_stated(monkeypatch: 
     light = 1 + 0.1 * sum(flare(time, 20.0, peak, 60.0) for peak in np.linspace(2e3, 18e3, 4))
     frames = noisy(503, time, light, 1e-3)
     assert not any("ended at" in line for line in analysed(frames).analysis.messages)
-    monkeypatch.setattr(detection, "MOST_EVENTS", 3)
+    monkeypatch.setattr(events, "MOST_EVENTS", 3)
     ended = analysed(frames).analysis
     assert any(f"ended at {len(ended.events)} events" in line for line in ended.messages)
 
