@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import calendar
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -135,6 +135,16 @@ class Planned:
     def energy_at(self, probability: float) -> float:
         """Return the bolometric energy above which flares are recovered with a probability, erg; infinite if none."""
         return math.inf if self.completeness is None else self.completeness.energy_at(probability)
+
+    @property
+    def by_energy(self) -> dict[str, Any]:
+        """Rows of the table of energies, by column, for a target that is visible."""
+        assert self.completeness is not None
+        energies, p = self.completeness.energy_erg, self.completeness.probability
+        first = max(int(np.argmax(p > 0)) - 1, 0)
+        part = slice(first, first + 161)
+        rate = np.nan if self.rates is None else self.rates.per_day_above(energies[part])
+        return {"target": self.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
 
     @property
     def published(self) -> str:
@@ -405,7 +415,9 @@ class PlanAnswer(Answer):
     #: Inputs, one row per target.
     stars = TableOf("stars", STAR_COLUMNS, "planned")
     #: Recovered fraction and rate by energy, one row per target and energy where either changes.
-    by_energy = TableOf("energies", ENERGY_COLUMNS, "_energy_rows")
+    by_energy = TableOf(
+        "energies", ENERGY_COLUMNS, lambda answer: [each.by_energy for each in answer.planned if each.completeness]
+    )
     months = TableOf("months", (), "seen.months")
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
@@ -433,16 +445,6 @@ class PlanAnswer(Answer):
         times = self.seen.times
         targets = "1 target" if len(self.planned) == 1 else f"{len(self.planned)} targets"
         return f"{targets}, {times.days:g} days from {times.iso(0.0)[:10]} (UTC)"
-
-    @property
-    def _energy_rows(self) -> Iterator[dict[str, Any]]:
-        for target in self.planned:
-            if target.completeness is not None:
-                energies, p = target.completeness.energy_erg, target.completeness.probability
-                first = max(int(np.argmax(p > 0)) - 1, 0)
-                part = slice(first, first + 161)
-                rate = np.nan if target.rates is None else target.rates.per_day_above(energies[part])
-                yield {"target": target.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
 
     @property
     def _assumptions(self) -> list[tuple[str, str, str]]:
