@@ -442,7 +442,7 @@ class Ratio:
         The end is infinite if the bottom may be zero, and of the other sign, no end, if it cannot be positive.
         """
         left = np.maximum(left, 0.0)
-        if not self.bottom_variance.any():
+        if self.bottom.all() and not self.bottom_variance.any():
             return np.asarray((self.top + sign * np.sqrt(left * self.top_variance)) / self.bottom)
         end, may_be_zero = self.root(left, sign), self.bottom**2 <= left * self.bottom_variance
         # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.

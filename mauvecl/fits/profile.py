@@ -287,7 +287,10 @@ def intervals(
                 known[alike] = [end / size for end in ends_of_sum(spline)]
             ends = size * known[alike][0], size * known[alike][1]
         else:
-            lowest, highest = _ratio_ends(faces, spline(x), least)
+            # The first fixed component over the blackbody.
+            factors, falls = np.zeros((2, len(model.linear), *x.shape))
+            factors[1], falls[0] = spline(x), -1.0
+            lowest, highest = _linear_ends(faces, factors, least, FactorAt(np.zeros(()), falls, 0.0))
             ends = derived.offset + lowest, derived.offset + highest
         # Light that contradicts every factor above zero limits nothing.
         none = ends[0] > ends[1]
@@ -300,7 +303,7 @@ def intervals(
 def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:
     """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
 
-    It is divided by the factor on all light if that is unknown.
+    It is divided by the factor on all light, or by another linear function of the amplitudes, if there is one.
     """
     lows, highs = np.full(factors.shape[1:], np.inf), np.full(factors.shape[1:], -np.inf)
     for face in faces:
@@ -309,35 +312,10 @@ def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: Fac
         if not inside.any():
             continue
         ratio = face.ratio(factors, factor_at)
-        for sign, bounds, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
+        for sign, bounds, which in ((-1.0, lows, np.fmin), (1.0, highs, np.fmax)):
             end = ratio.end(left, sign)
             there = inside & face.positive(*face.reached(ratio, end, factors, factor_at)) if face.bounded else inside
             which(bounds, end, out=bounds, where=there)
-    return extreme(lows, -1.0), extreme(highs, 1.0)
-
-
-def _ratio_ends(faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
-    """Return the ends of per x (fixed component 0) / (blackbody): Fieller's at each temperature, then the hull."""
-    lows, highs = np.full(per.shape, np.inf), np.full(per.shape, -np.inf)
-    factors, falls = np.zeros((2, 1 + max(len(face.some) for face in faces), *per.shape))
-    factors[1], falls[0] = per, -1.0
-    body = FactorAt(np.zeros(()), falls, 0.0)
-    for face in faces:
-        left = face.gain - least
-        allowed = (left >= 0.0) & face.positive(face.amplitude, face.others)
-        if 0 not in face.some:
-            np.copyto(lows, 0.0, where=allowed)
-            np.maximum(highs, 0.0, out=highs, where=allowed)
-        if not face.hot:
-            # Without a blackbody the light is recombination, or there is none, which every ratio allows.
-            np.copyto(highs, np.inf, where=allowed)
-        elif 0 in face.some:
-            ratio = face.ratio(factors, body)
-            for sign in (-1.0, 1.0):
-                end = ratio.root(left, sign)
-                there = (left >= 0.0) & face.positive(*face.reached(ratio, end, factors, body))
-                np.minimum(lows, end, out=lows, where=there)
-                np.maximum(highs, end, out=highs, where=there)
     return extreme(lows, -1.0), extreme(highs, 1.0)
 
 
