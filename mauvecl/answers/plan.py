@@ -138,12 +138,13 @@ class Planned:
 
     @property
     def by_energy(self) -> dict[str, Any]:
-        """Rows of the table of energies, by column, for a target that is visible."""
-        assert self.completeness is not None
+        """Rows of the table of energies by column: none of a target that is never visible."""
+        if self.completeness is None:
+            return {"target": self.name, "energy": np.zeros(0), "recovered": np.zeros(0), "rate_above": np.zeros(0)}
         energies, p = self.completeness.energy_erg, self.completeness.probability
         first = max(int(np.argmax(p > 0)) - 1, 0)
         part = slice(first, first + 161)
-        rate = np.nan if self.rates is None else self.rates.per_day_above(energies[part])
+        rate = np.full(p[part].size, np.nan) if self.rates is None else self.rates.per_day_above(energies[part])
         return {"target": self.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
 
     @property
@@ -415,9 +416,7 @@ class PlanAnswer(Answer):
     #: Inputs, one row per target.
     stars = TableOf("stars", STAR_COLUMNS, "planned")
     #: Recovered fraction and rate by energy, one row per target and energy where either changes.
-    by_energy = TableOf(
-        "energies", ENERGY_COLUMNS, lambda answer: [each.by_energy for each in answer.planned if each.completeness]
-    )
+    by_energy = TableOf("energies", ENERGY_COLUMNS, lambda answer: [target.by_energy for target in answer.planned])
     months = TableOf("months", (), "seen.months")
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
