@@ -16,7 +16,7 @@ on the temperature, so each face has constant matrices.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
@@ -106,10 +106,12 @@ class Profile:
                 alone, share = (_product(inverse, each[some]) for each in (of_fixed, cross))
                 gain = np.sum(of_fixed[some] * alone, axis=0)
                 power = whole - np.sum(cross[some] * share, axis=0)
-                yield Face(some, False, self.bounded, inverse, alone, gain, np.zeros_like(power), power, share)
+                cold = Face(some, self.bounded, inverse, power, share, hot=False, others=alone, gain=gain,
+                            amplitude=np.zeros_like(power))  # fmt: skip
+                yield cold
                 amplitude = (along - np.sum(cross[some] * alone, axis=0)) / power
                 others, gain = alone - amplitude * share, gain + amplitude**2 * power
-                yield Face(some, True, self.bounded, inverse, others, gain, amplitude, power, share)
+                yield replace(cold, hot=True, others=others, gain=gain, amplitude=amplitude)
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
@@ -598,14 +600,14 @@ class Face:
     """Unbounded fit of a subset of the components."""
 
     some: list[int]  # fixed components
-    hot: bool  # whether the blackbody is fitted as well
     bounded: bool  # whether amplitudes of fixed components are at least zero
     inverse: Float  # of their information, shape (n_some, n_some)
-    others: Float  # their amplitudes, shape (n_some, n, ...)
+    power: Float  # inverse of the variance of the blackbody's amplitude, shape (n or 1, ...)
+    share: Float  # decrease of the others per unit of the blackbody's, shape (n_some, n or 1, ...)
+    hot: bool  # whether the blackbody is fitted as well
+    others: Float  # amplitudes of the fixed components, shape (n_some, n, ...)
     gain: Float  # decrease of chi-squared by the components, shape (n, ...)
     amplitude: Float  # of the blackbody, shape (n, ...)
-    power: Float  # inverse of its variance, shape (n or 1, ...)
-    share: Float  # decrease of the others per unit of the blackbody's, shape (n_some, n or 1, ...)
 
     @cached_property
     def rounding(self) -> Float:

@@ -542,7 +542,10 @@ def _data(
     each_frame = tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0)
     added = np.einsum("ip,jp,tp->tij", weights, weights, model.hot * quiet.gain_dn_per_electron, optimize=True)
     spread = scipy.interpolate.CubicSpline(model.log_k, added)
-    return _Data(sums, edges, light, covariance, tuple(unknown), each_frame, reduction, model, shape, spread)
+    return _Data(
+        sums=sums, edges=edges, light=light, quiet_covariance=covariance, unknown=tuple(unknown), jitters=each_frame,
+        reduction=reduction, model=model, shape=shape, spread=spread,
+    )  # fmt: skip
 
 
 def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cooling: bool) -> Float:
