@@ -206,11 +206,7 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """
     target = text.target(simbad)
-    given: dict[str, Any] = {
-        "spectral_type": text.spectral_type or target.spectral_type,
-        "magnitude": target.magnitude if text.magnitude is None else text.magnitude,
-        "distance_pc": target.distance_pc if text.distance_pc is None else text.distance_pc,
-    }
+    given: dict[str, Any] = {name: getattr(target, name) for name in ("spectral_type", "magnitude", "distance_pc")}
     missing = [name for name, value in given.items() if value is None]
     if missing:
         gaia = [name for name in text.unused if name.casefold() == "phot_g_mean_mag" and "magnitude" in missing]
@@ -234,8 +230,6 @@ def observe(
     None for those of the study.
     """
     target, study, when = seen.targets[k], case.study, seen.visibility.seen[:, k]
-    if (given := study.plan.targets[k].spectral_type) is not None:
-        target = replace(target, spectral_type=given)
     windows, zodiacal = seen.windows[k], seen.zodiacal[k]
     changes: dict[str, Any] = {"star": (star,)}
     sky, window_s, swing = None, 0.0, tuple[tuple[float, float], ...]()

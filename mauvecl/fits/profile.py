@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -384,7 +384,9 @@ def _simulated_thresholds(
     held = _held_direction(profile.reduction, spline, nodes)
     length = np.linalg.norm(held, axis=1)[:, None]
     sums, value = _sums_at_end(profile, spline, rows, x, moved)
-    noise, z = _noise(sums.shape[1] - 2), np.sqrt(allowed)
+    # A cubature of normal noise, exact for polynomials of third degree.
+    n, z = sums.shape[1] - 2, np.sqrt(allowed)
+    noise = np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)])
     distances = ALONG * np.arange(0.5, (z + BEYOND) / ALONG)
     distances = np.concatenate([-distances, distances])
     out = np.repeat(distances, len(noise))
@@ -434,14 +436,9 @@ def _sums_at_end(
     normal = there + np.divide(steeper, power, out=np.zeros_like(power), where=power > 0.0)[:, None] * change
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
-    changes = np.linalg.qr(np.dstack([slope, hot, *fixed, reduction.spline(x, 2)]))[0]
-    # The directions orthogonal to the gradient: its largest component comes first, so that rounding does not decide on
-    # the sign of the reflection.
-    along = normal[:, None] @ changes
-    order = (np.abs(along).argmax(axis=2)[:, :, None] + np.arange(along.shape[2])) % along.shape[2]
-    along, changes = (np.take_along_axis(values, order, axis=2) for values in (along, changes))
-    changes = changes @ np.linalg.qr(along.transpose(0, 2, 1), mode="complete")[0][:, :, 1:]
-    return np.concatenate([mean[:, None], normal[:, None], changes.transpose(0, 2, 1)], axis=1), np.vecdot(mean, there)
+    changes = np.linalg.qr(np.dstack([slope, hot, *fixed]))[0].transpose(0, 2, 1)
+    across = changes - (changes @ normal[:, :, None]) * normal[:, None]
+    return np.concatenate([mean[:, None], normal[:, None], across], axis=1), np.vecdot(mean, there)
 
 
 def _as_probable(root: Float, out: Float, z: float) -> Float:
@@ -496,13 +493,6 @@ def _held_direction(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> F
     return np.asarray((slope / np.vecdot(body, body))[:, None] * body + others @ basis)
 
 
-@cache
-def _noise(n: int) -> Float:
-    """Return a cubature of normal noise in n dimensions, shape (2 n, n), exact for polynomials of third degree."""
-    half = np.sqrt(n) * scipy.stats.ortho_group.rvs(n, random_state=28)
-    return np.concatenate([half, -half])
-
-
 #: Derivatives of n fits with respect to a parameter: of the sums, (n, n_sum), of the quantities as they are recorded,
 #: (n, n_derived), and of the sum of the factor on light, (n,).
 Slopes = tuple[Float, Float, Float]
@@ -540,7 +530,7 @@ def covariance(
     gradient[:, which] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
     by_factor = np.where(which, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
-    slopes = [linear[:, 0] * light.spline(log_k, 1)] + ([] if other is None else [other[2]])
+    slopes = [linear[:, 0] * light.spline(log_k, 1)[:, 0]] + ([] if other is None else [other[2]])
     follows = -np.column_stack([light.weights_of(log_k), *(slope / light.scale for slope in slopes)])
     gradient += by_factor[:, :, None] * follows[:, None, :]
     own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2

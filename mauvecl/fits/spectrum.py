@@ -569,7 +569,7 @@ class TwoTemperatures:
         quantities[:, -2] = np.exp(log_k)
         areas = derived_values(model, lower, linear, np.ones(1))[:, -1]
         quantities[:, -1] = areas * (self._bolometric(log_k, 1)[0] / self._bolometric(log_k)[0] - 4.0)
-        light = np.zeros(1) if reduction.light is None else reduction.light.spline(log_k, 1)
+        light = np.zeros(1) if reduction.light is None else reduction.light.spline(log_k, 1)[0]
         return amplitude[:, None] * reduction.spline(log_k, 1), quantities, amplitude * light
 
 
