@@ -65,6 +65,26 @@ SEEN_H = 0.5
 #: Largest number of targets with printed hours per month.
 MOST_MONTHLY = 12
 TARGET_COLUMN = Column("target", description="name of the target", heading="target", kind=str)
+#: Columns of the table of targets; one for each limit in force follows `share`.
+COLUMNS = (
+    TARGET_COLUMN,
+    Column("ra", "", "deg", "right ascension", "RA", ".3f", detail=True),
+    Column("dec", "", "deg", "declination", "dec", ".3f", detail=True),
+    Column("hours", "", "h", "exposure in the whole time, with the duty cycle", "hours", ".0f"),
+    Column("share", "", "", "of the time in which the target is seen", "share", percent(".1f")),
+    Column("windows", "", "", "stretches in which it is seen", "windows", detail=True),
+    Column("median_window", "", "min", "length of a stretch", "median", lambda minutes: f"{minutes:.0f} min"),
+    Column("longest_gap", "", "day", "longest time without one", "longest gap", lambda days: f"{days:.1f} d",
+           detail=True),
+    Column("per_orbit", "", "min", "exposure in a mean orbit"),
+    Column("in_shadow", "", "", "share of the windows in the Earth's shadow"),
+    Column("best_month", "", "", "that with most exposure", "best month"),
+    Column("least_elongation", "", "deg", "least angle from the Sun", "least elongation",
+           lambda degrees: f"{degrees:.0f} deg", detail=True),
+    Column("most_elongation", "", "deg", "largest angle from the Sun"),
+    Column("brightest_sky", "", "mag / arcsec2", "zodiacal light at its brightest, V, where the table has it"),
+    Column("faintest_sky", "", "mag / arcsec2", "zodiacal light at its faintest, V"),
+)  # fmt: skip
 DAY_COLUMNS = (
     TARGET_COLUMN,
     Column("day", description="UTC"),
@@ -88,32 +108,13 @@ def assumption_columns(first: str) -> tuple[Column, ...]:
 
 
 def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
-    """Return the columns of the table of targets, with one for each limit in force."""
     limits = (
         Column(f"leaves_{name}", itemgetter(f"leaves_{name}"), "",
                f"share of the time that the limit of {name} alone leaves")
         for name in answer.visibility.kept_by
     )  # fmt: skip
-    return (
-        TARGET_COLUMN,
-        Column("ra", "", "deg", "right ascension", "RA", ".3f", detail=True),
-        Column("dec", "", "deg", "declination", "dec", ".3f", detail=True),
-        Column("hours", "", "h", "exposure in the whole time, with the duty cycle", "hours", ".0f"),
-        Column("share", "", "", "of the time in which the target is seen", "share", percent(".1f")),
-        *limits,
-        Column("windows", "", "", "stretches in which it is seen", "windows", detail=True),
-        Column("median_window", "", "min", "length of a stretch", "median", lambda minutes: f"{minutes:.0f} min"),
-        Column("longest_gap", "", "day", "longest time without one", "longest gap", lambda days: f"{days:.1f} d",
-               detail=True),
-        Column("per_orbit", "", "min", "exposure in a mean orbit"),
-        Column("in_shadow", "", "", "share of the windows in the Earth's shadow"),
-        Column("best_month", "", "", "that with most exposure", "best month"),
-        Column("least_elongation", "", "deg", "least angle from the Sun", "least elongation",
-               lambda degrees: f"{degrees:.0f} deg", detail=True),
-        Column("most_elongation", "", "deg", "largest angle from the Sun"),
-        Column("brightest_sky", "", "mag / arcsec2", "zodiacal light at its brightest, V, where the table has it"),
-        Column("faintest_sky", "", "mag / arcsec2", "zodiacal light at its faintest, V"),
-    )  # fmt: skip
+    place = [column.name for column in COLUMNS].index("share") + 1
+    return (*COLUMNS[:place], *limits, *COLUMNS[place:])
 
 
 @dataclass(frozen=True, eq=False)
