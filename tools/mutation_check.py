@@ -334,7 +334,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "intervals of events that are not truncated at zero": (
         "test_quantiles_are_those_of_a_truncated_normal_distribution[0.0]",
-        ("goal = _log_above(0.0, *held, 0.0) + float", "goal = float"),
+        ("goal = _above(0.0, weight, mean, sd, 0.0) * ", "goal = "),
     ),
     "a flare added to the level of its star": (
         "test_table_of_events_has_the_flare_in_its_units",
@@ -498,10 +498,9 @@ MUTATIONS: dict[str, Mutation] = {
     "noise of a faint flare in a direction that rounding chooses": (
         "test_rounding_moves_no_interval[M3V]",
         (
-            "np.dstack([slope, hot, *fixed, reduction.spline(x, 2)]))[0]",
-            "np.dstack([normal, slope, hot, *fixed, reduction.spline(x, 2)]))[0][:, :, 1:]",
+            "np.dstack([slope, hot, *fixed]))[0].transpose(0, 2, 1)",
+            "np.dstack([normal, slope, hot, *fixed]))[0].transpose(0, 2, 1)[:, 1:]",
         ),
-        ('    changes = changes @ np.linalg.qr(along.transpose(0, 2, 1), mode="complete")[0][:, :, 1:]\n', ""),
     ),
     "one star without errors of its spectrum": (
         "test_one_star_determines_throughput_alone",

@@ -156,7 +156,7 @@ class ExpectedMeasurement(InCell):
         of_light = None
         if light is not None:
             # The sum of the factor on light for the fitted flare.
-            flare = linear[0] * light.spline(best) + linear[1:] @ light.fixed
+            flare = linear[0] * light.spline(best)[:, 0] + linear[1:] @ light.fixed[:, 0]
             of_light = light.scale * (self.perfect.factor - light.expected) + flare
         profile = Profile(reduction, mean, of_light)
         gain = float(mean[0] @ mean[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import calendar
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -137,6 +137,17 @@ class Planned:
         return math.inf if self.completeness is None else self.completeness.energy_at(probability)
 
     @property
+    def by_energy(self) -> dict[str, Any]:
+        """Rows of the table of energies by column: none of a target that is never visible."""
+        if self.completeness is None:
+            return {"target": self.name, "energy": np.zeros(0), "recovered": np.zeros(0), "rate_above": np.zeros(0)}
+        energies, p = self.completeness.energy_erg, self.completeness.probability
+        first = max(int(np.argmax(p > 0)) - 1, 0)
+        part = slice(first, first + 161)
+        rate = np.full(p[part].size, np.nan) if self.rates is None else self.rates.per_day_above(energies[part])
+        return {"target": self.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
+
+    @property
     def published(self) -> str:
         """Energies at which the rates were measured, for sentences; empty if rates are unknown."""
         return "" if self.rates is None else "published for {:.2g} to {:.2g} erg".format(*self.rates.measured_erg)
@@ -195,11 +206,7 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """
     target = text.target(simbad)
-    given: dict[str, Any] = {
-        "spectral_type": text.spectral_type or target.spectral_type,
-        "magnitude": target.magnitude if text.magnitude is None else text.magnitude,
-        "distance_pc": target.distance_pc if text.distance_pc is None else text.distance_pc,
-    }
+    given: dict[str, Any] = {name: getattr(target, name) for name in ("spectral_type", "magnitude", "distance_pc")}
     missing = [name for name, value in given.items() if value is None]
     if missing:
         gaia = [name for name in text.unused if name.casefold() == "phot_g_mean_mag" and "magnitude" in missing]
@@ -223,8 +230,6 @@ def observe(
     None for those of the study.
     """
     target, study, when = seen.targets[k], case.study, seen.visibility.seen[:, k]
-    if (given := study.plan.targets[k].spectral_type) is not None:
-        target = replace(target, spectral_type=given)
     windows, zodiacal = seen.windows[k], seen.zodiacal[k]
     changes: dict[str, Any] = {"star": (star,)}
     sky, window_s, swing = None, 0.0, tuple[tuple[float, float], ...]()
@@ -405,7 +410,7 @@ class PlanAnswer(Answer):
     #: Inputs, one row per target.
     stars = TableOf("stars", STAR_COLUMNS, "planned")
     #: Recovered fraction and rate by energy, one row per target and energy where either changes.
-    by_energy = TableOf("energies", ENERGY_COLUMNS, "_energy_rows")
+    by_energy = TableOf("energies", ENERGY_COLUMNS, lambda answer: [target.by_energy for target in answer.planned])
     months = TableOf("months", (), "seen.months")
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
@@ -433,16 +438,6 @@ class PlanAnswer(Answer):
         times = self.seen.times
         targets = "1 target" if len(self.planned) == 1 else f"{len(self.planned)} targets"
         return f"{targets}, {times.days:g} days from {times.iso(0.0)[:10]} (UTC)"
-
-    @property
-    def _energy_rows(self) -> Iterator[dict[str, Any]]:
-        for target in self.planned:
-            if target.completeness is not None:
-                energies, p = target.completeness.energy_erg, target.completeness.probability
-                first = max(int(np.argmax(p > 0)) - 1, 0)
-                part = slice(first, first + 161)
-                rate = np.nan if target.rates is None else target.rates.per_day_above(energies[part])
-                yield {"target": target.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
 
     @property
     def _assumptions(self) -> list[tuple[str, str, str]]:

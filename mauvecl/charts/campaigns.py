@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Axis, Dots, Line, Mesh, Panel, Picture, Series, pictures_of, register
+from mauvecl.charts.chart import Area, Axis, Dots, Line, Mesh, Panel, Picture, Rule, Series, pictures_of, register
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 from mauvecl.schema.columns import without_empty
@@ -34,28 +34,30 @@ MOST_MONTHS = 8
 
 def overview(answer: PlanAnswer) -> Picture:
     """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
-    planned, left, right = answer.planned, list[Series](), list[Series]()
-    ends = [(target.energy_at(0.5), target.energy_at(0.9)) for target in planned]
-    for k, target in enumerate(planned):
-        if target.recovered is not None and target.recovered.high > 0:
-            # A logarithmic axis cannot show zero.
-            yields = target.recovered
-            low, high, expected = np.maximum([yields.low, yields.high, yields.expected], 0.05)
-            bar = Line("", "star", width=3.3, alpha=0.5, at=((low, high), [k, k]))
-            left += [bar, Dots("", "star", size=7, at=([expected], [k]))]
-        if np.isfinite(ends[k][0]):
-            bar = Line("", "flare", width=3.3, alpha=0.5, at=(ends[k], [k, k]))
-            right += [bar, Dots("", "flare", size=7, at=([ends[k][0]], [k]))]
+    planned, nothing = answer.planned, [np.nan] * 3
+    yields = [target.recovered for target in planned]
+    # A logarithmic axis cannot show zero.
+    flares = np.array([(it.low, it.high, it.expected) if it and it.high > 0 else nothing for it in yields])
+    energies = np.array([[target.energy_at(share) for share in (0.5, 0.9, 0.5)] for target in planned])
+    energies[np.isinf(energies)] = np.nan
     # Limits at whole decades avoid labels that overlap.
-    logs = np.log10([energy for pair in ends for energy in pair if np.isfinite(energy)])
+    logs = np.log10(energies[np.isfinite(energies)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, above = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), "mean (dot), and 95 % of campaigns"
+    y, flare_axis = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), Axis("flares recovered", True, (0.05, None))
+    energy_axis, above = Axis("bolometric energy (erg)", True, decades), "mean (dot), and 95 % of campaigns"
     row = [
-        Panel(Axis("flares recovered", log=True, limits=(0.05, None)), y, left, above),
-        Panel(Axis("bolometric energy (erg)", log=True, limits=decades), y, right, "recovered in 50 % (dot) to 90 %"),
+        Panel(flare_axis, y, _bars(np.maximum(flares, 0.05), "star"), above),
+        Panel(energy_axis, y, _bars(energies, "flare"), "recovered in 50 % (dot) to 90 %"),
     ]
     return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
+
+
+def _bars(values: Any, colour: str) -> list[Series]:
+    """Return a range and a dot of each target, from low, high and middle values, shape (n, 3)."""
+    x, y = np.column_stack([values[:, :2], np.full(len(values), np.nan)]).ravel(), np.arange(len(values))
+    bars = Line("", colour, width=3.3, alpha=0.5, at=(x, np.repeat(y, 3)))
+    return [bars, Dots("", colour, size=7, at=(values[:, 2], y))]
 
 
 # Reports draw it in figures of their own.
@@ -96,11 +98,15 @@ def _rows(answer: VisibleAnswer, hours: Any) -> Picture:
     mesh = Mesh("hours a day", high=None, at=(np.arange(len(answer.days) + 1) - 0.5, np.arange(n + 1) - 0.5, hours))
     step = max(1, n // 60)
     names = np.arange(0, n, step), [target.name for target in answer.targets[::step]]
-    firsts = [i for i, day in enumerate(answer.days) if day.endswith("-01")]
-    firsts = firsts[:: -(-len(firsts) // MOST_MONTHS) or 1]
-    x = Axis(ticks=(firsts, [_month(answer.days[i]) for i in firsts]))
-    panel = Panel(x, Axis(limits=(n - 0.5, -0.5), ticks=names), [mesh])
+    panel = Panel(Axis(ticks=_first_days(answer, MOST_MONTHS)), Axis(limits=(n - 0.5, -0.5), ticks=names), [mesh])
     return Picture([[panel]], (7.4, min(0.16 * n + 1.4, 20.0)))
+
+
+def _first_days(answer: VisibleAnswer, most: int) -> tuple[list[int], list[str]]:
+    """Return the places of at most some first days of months, and the months."""
+    firsts = [i for i, day in enumerate(answer.days) if day.endswith("-01")]
+    firsts = firsts[:: -(-len(firsts) // most) or 1]
+    return firsts, [_month(answer.days[i]) for i in firsts]
 
 
 def _month(day: str) -> str:
@@ -120,7 +126,7 @@ SMALL, NORMAL, MANY = 5.5, 7.0, 9
 #: Number of colours kept in the pictures of an HTML report.
 COLOURS_KEPT = 64
 #: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
-PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
+PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 0.09, "hspace": 0.35, "wspace": 0.3}
 
 
 @dataclass(frozen=True)
@@ -280,59 +286,41 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[Part]]:
 
 
 def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
-    """Plot daily hours with elongation, monthly hours, and recovered fraction with the rate by energy."""
-    target, seen = answer.planned[k], answer.seen
-    figure = new_figure((7.4, 5.4), layout="none") if figure is None else figure
-    top, bottom = figure.subplots(2, 1)
+    """Plot the daily hours of a target, its angle from the Sun, and its recovered fraction and rate by energy."""
+    target, seen, days = answer.planned[k], answer.seen, np.arange(len(answer.seen.days))
+    x = Axis(limits=(0, max(len(days) - 1, 1)), ticks=_first_days(seen, MOST_MONTHS // 2))
+    hours = Area("", COLOURS[3], alpha=1.0, step=True, at=(days, np.zeros(days.size), seen.visibility.by_day(k)))
+    away = Line("", "flare", at=(days, seen.elongation_deg(k)))
+    rows = [[
+        Panel(x, Axis("hours a day", limits=(0, None)), [hours], "when it is seen"),
+        Panel(x, Axis("angle from the Sun (deg)", limits=(0, 180)), [away]),
+    ]]  # fmt: skip
+    if target.completeness is not None:
+        row, x = target.by_energy, Axis("bolometric energy (erg)", log=True)
+        energy, often = row["energy"], row["rate_above"] * target.hours / 24
+        share = Line("", "star", at=(energy, row["recovered"]))
+        limits = [Rule("", dash=dash, at=target.energy_at(part)) for part, dash in ((0.5, "--"), (0.9, ":"))]
+        shares = Axis("share recovered", limits=(0, 1.02)), [share, *(one for one in limits if np.isfinite(one.at))]
+        rows.append([Panel(x, *shares, "flares recovered (E50 dashed, E90 dotted)", _plain_decades)])
+        if target.rates is not None:
+            rate = Line("", "flare", at=(energy, np.where(often > 0, often, np.nan)))
+            above = Axis(f"flares above this energy in {target.hours:.0f} h", log=True)
+            rows[-1].append(Panel(x, above, [rate], "how often they are", _plain_decades))
+    figure = draw_picture(Picture(rows), figure or new_figure((7.4, 5.4), layout="none"))
     figure.subplots_adjust(**PANELS)
-    days = np.arange(len(seen.days))
-    top.fill_between(days, seen.visibility.by_day(k), step="mid", color=COLOURS[3], linewidth=0)
-    top.set(ylabel="hours a day", xlim=(0, max(len(days) - 1, 1)), ylim=(0, None))
-    firsts = [i for i, day in enumerate(seen.days) if day.endswith("-01")]
-    step = max(1, len(firsts) // 12)
-    top.set_xticks(firsts[::step], [seen.days[i][:7] for i in firsts[::step]], fontsize=7, rotation=30)
-    sun = _right_axis(top)
-    sun.plot(days, seen.elongation_deg(k), color=COLOURS[4])
-    sun.set(ylabel="angle from the Sun (deg)", ylim=(0, 180))
-    top.set_title("when it is seen")
-    if target.completeness is None:
-        bottom.set_visible(False)
-        return figure
-    energy, p = target.completeness.energy_erg, target.completeness.probability
-    first = int(np.argmax(p > 0))
-    shown = slice(max(first - 4, 0), min(first + 100, energy.size))
-    bottom.plot(energy[shown], p[shown], color=COLOURS[0])
-    bottom.set(xscale="log", xlabel="bolometric energy (erg)", ylabel="share recovered", ylim=(0, 1.02))
-    bottom.yaxis.label.set_color(COLOURS[0])
-    _plain_decades(bottom.xaxis)
-    for share, dash in ((0.5, "--"), (0.9, ":")):
-        if np.isfinite(target.energy_at(share)):
-            bottom.axvline(target.energy_at(share), color=NULL, linestyle=dash, linewidth=0.8)
-    bottom.set_title("flares recovered (E50 dashed, E90 dotted), and how often they are")
-    if target.rates is not None:
-        often = _right_axis(bottom)
-        rate = target.rates.per_day_above(energy[shown]) * target.hours / 24
-        used = rate > 0
-        often.plot(energy[shown][used], rate[used], color=COLOURS[4])
-        often.set(yscale="log", ylabel=f"flares above this energy in {target.hours:.0f} h")
-        _plain_decades(often.yaxis)
     return figure
 
 
-def _right_axis(axes: Any) -> Any:
-    """Return axes with a visible y axis on the right, whose label has the colour of its curve."""
-    twin = axes.twinx()
-    twin.spines["right"].set_visible(True)
-    twin.yaxis.label.set_color(COLOURS[4])
-    return twin
-
-
-def _plain_decades(axis: Any) -> None:
+def _plain_decades(axes: Any) -> None:
     """Label whole decades as 1e33, since minor ticks and formulas take most of the drawing time."""
-    from matplotlib.ticker import FuncFormatter, NullLocator
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}"))
+    for axis in (axis for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
+        axis.set_major_locator(LogLocator())
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter(
+            FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}")
+        )
 
 
 def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[Part]]:

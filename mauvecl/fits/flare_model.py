@@ -349,49 +349,6 @@ def _thresholds(prior: bytes, allowed: float) -> Float:
     ]) ** 2  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class LightFactor:
-    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model."""
-
-    weights: Float  # per DN, shape (n_pixel,); the sum has unit variance if the flare is known
-    scale: float  # change of the sum for a change of the factor by one
-    expected: float  # factor for which the mean of the sum is zero without a flare
-    log_k: Float  # temperatures of the model, shape (n_node,)
-    hot: Float  # mean sums for a blackbody of amplitude 1, shape (n_node,)
-    fixed: Float  # mean sums of the other components for unit amplitude, shape (n_linear - 1,)
-    prior_share: float  # share of the prior in the information on the factor if the flare is known
-    # Deviations of the prior in standard deviations, and their probabilities, shape (2, n); empty if it is normal.
-    prior: Float
-
-    @cached_property
-    def spline(self) -> scipy.interpolate.CubicSpline:
-        """Mean sum of the blackbody over log temperature."""
-        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
-
-    def with_second(self, log_k: float, end: int) -> Self:
-        """Return the factor next to a blackbody of a second temperature, as another component of fixed shape."""
-        fixed = np.concatenate([[float(self.spline(log_k))], self.fixed])
-        return replace(self, log_k=self.log_k[:end], hot=self.hot[:end], fixed=fixed)
-
-    def change(self, value: Float, factor: Float, width: Float, allowed: float) -> Float:
-        """Return how far the thresholds of quantities are from `allowed`, since the prior is not normal, shape (n,).
-
-        The part of a quantity's scatter that comes from the prior has the distribution of the prior. `width` is that of
-        the quantity's interval for a rise of chi-squared by `allowed`.
-        """
-        share = np.zeros_like(value)
-        usable = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
-        by_prior = value[usable] * np.sqrt(self.prior_share) / (self.scale * factor[usable])
-        share[usable] = np.clip(4.0 * allowed * (by_prior / width[usable]) ** 2, 0.0, 1.0)
-        return np.asarray(np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed)
-
-    def weights_of(self, log_k: Float) -> Float:
-        """Return the decrease of the best factor per unit of each amplitude, shape (..., n_linear)."""
-        hot = self.spline(log_k)[..., None]
-        return np.asarray(np.concatenate([hot, np.broadcast_to(self.fixed, (*log_k.shape, self.fixed.size))], -1)
-                          / self.scale)  # fmt: skip
-
-
 def undimmed(values: Float, factor: Float) -> Float:
     """Return light (n, k) over the factor by which it was dimmed, (n,); infinite where the factor is not above zero."""
     lost = (factor <= 0.0)[:, None]
@@ -442,7 +399,7 @@ class Ratio:
         The end is infinite if the bottom may be zero, and of the other sign, no end, if it cannot be positive.
         """
         left = np.maximum(left, 0.0)
-        if not self.bottom_variance.any():
+        if self.bottom.all() and not self.bottom_variance.any():
             return np.asarray((self.top + sign * np.sqrt(left * self.top_variance)) / self.bottom)
         end, may_be_zero = self.root(left, sign), self.bottom**2 <= left * self.bottom_variance
         # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.
@@ -507,6 +464,35 @@ class MeanSums:
 
 
 @dataclass(frozen=True, eq=False)
+class LightFactor(MeanSums):
+    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model."""
+
+    weights: Float  # per DN, shape (n_pixel,); the sum has unit variance if the flare is known
+    scale: float  # change of the sum for a change of the factor by one
+    expected: float  # factor for which the mean of the sum is zero without a flare
+    prior_share: float  # share of the prior in the information on the factor if the flare is known
+    # Deviations of the prior in standard deviations, and their probabilities, shape (2, n); empty if it is normal.
+    prior: Float
+
+    def change(self, value: Float, factor: Float, width: Float, allowed: float) -> Float:
+        """Return how far the thresholds of quantities are from `allowed`, since the prior is not normal, shape (n,).
+
+        The part of a quantity's scatter that comes from the prior has the distribution of the prior. `width` is that of
+        the quantity's interval for a rise of chi-squared by `allowed`.
+        """
+        share = np.zeros_like(value)
+        usable = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
+        by_prior = value[usable] * np.sqrt(self.prior_share) / (self.scale * factor[usable])
+        share[usable] = np.clip(4.0 * allowed * (by_prior / width[usable]) ** 2, 0.0, 1.0)
+        return np.asarray(np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed)
+
+    def weights_of(self, log_k: Float) -> Float:
+        """Return the decrease of the best factor per unit of each amplitude, shape (..., n_linear)."""
+        fixed = np.broadcast_to(self.fixed[:, 0], (*log_k.shape, len(self.fixed)))
+        return np.asarray(np.concatenate([self.spline(log_k), fixed], -1) / self.scale)
+
+
+@dataclass(frozen=True, eq=False)
 class ReducedSums(MeanSums):
     """Weights of sums, and the mean sums of a model's flares."""
 
@@ -552,10 +538,9 @@ class ReducedSums(MeanSums):
             row, precision = rows[-1], float(unknown.sd[-1]) ** -2.0
             own = float(row @ unknown.spectra[-1])
             scale = (own + np.sqrt(own**2 + 4.0 * precision)) / 2.0
-            light = LightFactor(
-                row, scale, 1.0 + float(unknown.mean[-1]), model.log_k, model.hot @ row, model.fixed @ row,
-                precision / scale**2, unknown.factor_prior,
-            )  # fmt: skip
+            means = (model.hot @ row)[:, None], (model.fixed @ row)[:, None], model.log_k
+            expected, share = 1.0 + float(unknown.mean[-1]), precision / scale**2
+            light = LightFactor(*means, row, scale, expected, share, unknown.factor_prior)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
 
     def quiescent_chi2(self, excess_dn: Float) -> Float:

@@ -16,8 +16,8 @@ on the temperature, so each face has constant matrices.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -106,10 +106,12 @@ class Profile:
                 alone, share = (_product(inverse, each[some]) for each in (of_fixed, cross))
                 gain = np.sum(of_fixed[some] * alone, axis=0)
                 power = whole - np.sum(cross[some] * share, axis=0)
-                yield Face(some, False, self.bounded, inverse, alone, gain, np.zeros_like(power), power, share)
+                cold = Face(some, self.bounded, inverse, power, share, hot=False, others=alone, gain=gain,
+                            amplitude=np.zeros_like(power))  # fmt: skip
+                yield cold
                 amplitude = (along - np.sum(cross[some] * alone, axis=0)) / power
                 others, gain = alone - amplitude * share, gain + amplitude**2 * power
-                yield Face(some, True, self.bounded, inverse, others, gain, amplitude, power, share)
+                yield replace(cold, hot=True, others=others, gain=gain, amplitude=amplitude)
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
@@ -287,7 +289,10 @@ def intervals(
                 known[alike] = [end / size for end in ends_of_sum(spline)]
             ends = size * known[alike][0], size * known[alike][1]
         else:
-            lowest, highest = _ratio_ends(faces, spline(x), least)
+            # The first fixed component over the blackbody.
+            factors, falls = np.zeros((2, len(model.linear), *x.shape))
+            factors[1], falls[0] = spline(x), -1.0
+            lowest, highest = _linear_ends(faces, factors, least, FactorAt(np.zeros(()), falls, 0.0))
             ends = derived.offset + lowest, derived.offset + highest
         # Light that contradicts every factor above zero limits nothing.
         none = ends[0] > ends[1]
@@ -300,7 +305,7 @@ def intervals(
 def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:
     """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
 
-    It is divided by the factor on all light if that is unknown.
+    It is divided by the factor on all light, or by another linear function of the amplitudes, if there is one.
     """
     lows, highs = np.full(factors.shape[1:], np.inf), np.full(factors.shape[1:], -np.inf)
     for face in faces:
@@ -309,35 +314,10 @@ def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: Fac
         if not inside.any():
             continue
         ratio = face.ratio(factors, factor_at)
-        for sign, bounds, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
+        for sign, bounds, which in ((-1.0, lows, np.fmin), (1.0, highs, np.fmax)):
             end = ratio.end(left, sign)
             there = inside & face.positive(*face.reached(ratio, end, factors, factor_at)) if face.bounded else inside
             which(bounds, end, out=bounds, where=there)
-    return extreme(lows, -1.0), extreme(highs, 1.0)
-
-
-def _ratio_ends(faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
-    """Return the ends of per x (fixed component 0) / (blackbody): Fieller's at each temperature, then the hull."""
-    lows, highs = np.full(per.shape, np.inf), np.full(per.shape, -np.inf)
-    factors, falls = np.zeros((2, 1 + max(len(face.some) for face in faces), *per.shape))
-    factors[1], falls[0] = per, -1.0
-    body = FactorAt(np.zeros(()), falls, 0.0)
-    for face in faces:
-        left = face.gain - least
-        allowed = (left >= 0.0) & face.positive(face.amplitude, face.others)
-        if 0 not in face.some:
-            np.copyto(lows, 0.0, where=allowed)
-            np.maximum(highs, 0.0, out=highs, where=allowed)
-        if not face.hot:
-            # Without a blackbody the light is recombination, or there is none, which every ratio allows.
-            np.copyto(highs, np.inf, where=allowed)
-        elif 0 in face.some:
-            ratio = face.ratio(factors, body)
-            for sign in (-1.0, 1.0):
-                end = ratio.root(left, sign)
-                there = (left >= 0.0) & face.positive(*face.reached(ratio, end, factors, body))
-                np.minimum(lows, end, out=lows, where=there)
-                np.maximum(highs, end, out=highs, where=there)
     return extreme(lows, -1.0), extreme(highs, 1.0)
 
 
@@ -404,7 +384,9 @@ def _simulated_thresholds(
     held = _held_direction(profile.reduction, spline, nodes)
     length = np.linalg.norm(held, axis=1)[:, None]
     sums, value = _sums_at_end(profile, spline, rows, x, moved)
-    noise, z = _noise(sums.shape[1] - 2), np.sqrt(allowed)
+    # A cubature of normal noise, exact for polynomials of third degree.
+    n, z = sums.shape[1] - 2, np.sqrt(allowed)
+    noise = np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)])
     distances = ALONG * np.arange(0.5, (z + BEYOND) / ALONG)
     distances = np.concatenate([-distances, distances])
     out = np.repeat(distances, len(noise))
@@ -454,14 +436,9 @@ def _sums_at_end(
     normal = there + np.divide(steeper, power, out=np.zeros_like(power), where=power > 0.0)[:, None] * change
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
-    changes = np.linalg.qr(np.dstack([slope, hot, *fixed, reduction.spline(x, 2)]))[0]
-    # The directions orthogonal to the gradient: its largest component comes first, so that rounding does not decide on
-    # the sign of the reflection.
-    along = normal[:, None] @ changes
-    order = (np.abs(along).argmax(axis=2)[:, :, None] + np.arange(along.shape[2])) % along.shape[2]
-    along, changes = (np.take_along_axis(values, order, axis=2) for values in (along, changes))
-    changes = changes @ np.linalg.qr(along.transpose(0, 2, 1), mode="complete")[0][:, :, 1:]
-    return np.concatenate([mean[:, None], normal[:, None], changes.transpose(0, 2, 1)], axis=1), np.vecdot(mean, there)
+    changes = np.linalg.qr(np.dstack([slope, hot, *fixed]))[0].transpose(0, 2, 1)
+    across = changes - (changes @ normal[:, :, None]) * normal[:, None]
+    return np.concatenate([mean[:, None], normal[:, None], across], axis=1), np.vecdot(mean, there)
 
 
 def _as_probable(root: Float, out: Float, z: float) -> Float:
@@ -516,13 +493,6 @@ def _held_direction(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> F
     return np.asarray((slope / np.vecdot(body, body))[:, None] * body + others @ basis)
 
 
-@cache
-def _noise(n: int) -> Float:
-    """Return a cubature of normal noise in n dimensions, shape (2 n, n), exact for polynomials of third degree."""
-    half = np.sqrt(n) * scipy.stats.ortho_group.rvs(n, random_state=28)
-    return np.concatenate([half, -half])
-
-
 #: Derivatives of n fits with respect to a parameter: of the sums, (n, n_sum), of the quantities as they are recorded,
 #: (n, n_derived), and of the sum of the factor on light, (n,).
 Slopes = tuple[Float, Float, Float]
@@ -560,7 +530,7 @@ def covariance(
     gradient[:, which] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
     by_factor = np.where(which, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
-    slopes = [linear[:, 0] * light.spline(log_k, 1)] + ([] if other is None else [other[2]])
+    slopes = [linear[:, 0] * light.spline(log_k, 1)[:, 0]] + ([] if other is None else [other[2]])
     follows = -np.column_stack([light.weights_of(log_k), *(slope / light.scale for slope in slopes)])
     gradient += by_factor[:, :, None] * follows[:, None, :]
     own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
@@ -620,14 +590,14 @@ class Face:
     """Unbounded fit of a subset of the components."""
 
     some: list[int]  # fixed components
-    hot: bool  # whether the blackbody is fitted as well
     bounded: bool  # whether amplitudes of fixed components are at least zero
     inverse: Float  # of their information, shape (n_some, n_some)
-    others: Float  # their amplitudes, shape (n_some, n, ...)
+    power: Float  # inverse of the variance of the blackbody's amplitude, shape (n or 1, ...)
+    share: Float  # decrease of the others per unit of the blackbody's, shape (n_some, n or 1, ...)
+    hot: bool  # whether the blackbody is fitted as well
+    others: Float  # amplitudes of the fixed components, shape (n_some, n, ...)
     gain: Float  # decrease of chi-squared by the components, shape (n, ...)
     amplitude: Float  # of the blackbody, shape (n, ...)
-    power: Float  # inverse of its variance, shape (n or 1, ...)
-    share: Float  # decrease of the others per unit of the blackbody's, shape (n_some, n or 1, ...)
 
     @cached_property
     def rounding(self) -> Float:

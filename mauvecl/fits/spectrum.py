@@ -349,9 +349,8 @@ class _Problem:
             if (quiet.n_frames * quiet.mean_raw_dn + NEAR_GROUP * highest > ceiling).any():
                 each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in some)
                 highest = undimmed * np.max(list(each), axis=0) if some.size <= BATCH else NEAR_GROUP * highest
-            own, clipped = rows[some], None
-            if near and (raw[own].max(axis=0) > ceiling).any():
-                clipped = clipped_pixels(raw[own], quiet)
+            own = rows[some]
+            clipped = clipped_pixels(raw[own], quiet) if near else None
             reduction = self.reduction(mean, highest_dn=highest, clipped=clipped)
             yield from ((batch, reduction) for batch in _batches(own))
 
@@ -569,7 +568,7 @@ class TwoTemperatures:
         quantities[:, -2] = np.exp(log_k)
         areas = derived_values(model, lower, linear, np.ones(1))[:, -1]
         quantities[:, -1] = areas * (self._bolometric(log_k, 1)[0] / self._bolometric(log_k)[0] - 4.0)
-        light = np.zeros(1) if reduction.light is None else reduction.light.spline(log_k, 1)
+        light = np.zeros(1) if reduction.light is None else reduction.light.spline(log_k, 1)[0]
         return amplitude[:, None] * reduction.spline(log_k, 1), quantities, amplitude * light
 
 

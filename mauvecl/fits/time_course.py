@@ -246,7 +246,7 @@ def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> 
     return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
 
 
-#: Whitens sums, (n, n_frame, n_sum), to the shape (n, n_frame n_sum).
+#: Whitens sums, (n, n_frame, n_sum), to the shape (n, n_frame n_sum), or to more columns if levels are unknown.
 Whiten = Callable[[Float], Float]
 
 #: Parameters, all but the first as logarithms; the temperature at the end is relative to that at the peak.
@@ -322,7 +322,7 @@ class _Data:
     def whitening(self, theta: Float | None, *, none: bool = False) -> Whiten:
         """Return the whitening of residuals for the covariances of a flare, or of frames without one.
 
-        Unknown levels shrink the values along their directions; with `none`, those of frames without a flare.
+        The best unknown levels are subtracted; with `none`, those of frames without a flare.
         """
         covariance, flare = self.quiet_covariance, None
         if theta is not None:
@@ -338,20 +338,15 @@ class _Data:
 
         if not self.unknown:
             return plain
-        changes = np.array([unknown.around(None if none else flare) for unknown in self.unknown])
-        spectra = np.einsum("tij,utj->tiu", inverse, changes).reshape(self.sums.size, -1)
-        # The prior acts as one more datum, which is not among the residuals because its mean is zero.
-        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([unknown.sd**-2.0 for unknown in self.unknown]))
-        basis = np.linalg.solve(scale, spectra.T)
-        # I - B^T B = (I - B^T K B)^2, with K from the eigenvalues of B B^T.
-        values, vectors = np.linalg.eigh(basis @ basis.T)
-        nonzero = values > 1e-12
-        directions = vectors[:, nonzero].T @ basis / np.sqrt(values[nonzero])[:, None]
-        shrink = 1.0 - np.sqrt(np.maximum(1.0 - values[nonzero], 0.0))
+        spectra = plain(np.array([unknown.around(None if none else flare) for unknown in self.unknown]))
+        roots = np.array([1.0 / unknown.sd for unknown in self.unknown])
+        best = np.linalg.solve(spectra @ spectra.T + np.diag(roots**2), spectra)
 
         def marginalised(values: Float) -> Float:
             sums = plain(values)
-            return np.asarray(sums - (shrink * (sums @ directions.T)) @ directions)
+            levels = sums @ best.T
+            # The prior acts as one more datum of each level.
+            return np.hstack([sums - levels @ spectra, levels * roots])
 
         return marginalised
 
@@ -547,7 +542,10 @@ def _data(
     each_frame = tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0)
     added = np.einsum("ip,jp,tp->tij", weights, weights, model.hot * quiet.gain_dn_per_electron, optimize=True)
     spread = scipy.interpolate.CubicSpline(model.log_k, added)
-    return _Data(sums, edges, light, covariance, tuple(unknown), each_frame, reduction, model, shape, spread)
+    return _Data(
+        sums=sums, edges=edges, light=light, quiet_covariance=covariance, unknown=tuple(unknown), jitters=each_frame,
+        reduction=reduction, model=model, shape=shape, spread=spread,
+    )  # fmt: skip
 
 
 def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cooling: bool) -> Float:

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 AVERAGED = ("davenport2014", "tovarmendoza2022")
 #: Logarithm of the weight of a part of a mixture that is neglected.
 LEAST_LOG_WEIGHT = -18.5
-#: Size of the cells in which parts of a mixture are joined, in standard deviations and in the logarithm of these.
-CELL = 0.05
 #: Least standard deviation of a part, as a share of the largest mean.
 LEAST_ERROR = 1e-9
 #: Nodes along peak and half-width for a shape and for many; fall of the log posterior beyond which they are neglected.
@@ -61,42 +59,28 @@ class NormalMixture:
         return float(scipy.special.logsumexp(self.log_weight))
 
     @cached_property
-    def _cells(self) -> tuple[Float, Float, Float]:
-        """Logarithm of the weight, mean and standard deviation of cells of parts that hardly differ, shape (n_cell,).
-
-        A cell has the weight, mean and variance of its parts.
-        """
+    def _parts(self) -> tuple[Float, Float, Float]:
+        """Weight, mean and standard deviation of the parts that are not negligible, shape (n_part,)."""
         log = self.log_weight - self.log_total
         kept = log > LEAST_LOG_WEIGHT
-        weight, mean = np.exp(log[kept]), self.mean[kept]
-        sd = np.maximum(self.sd[kept], max(LEAST_ERROR * float(np.abs(mean).max()), 1e-300))
-        row = np.rint(np.log(sd) / CELL)
-        place = np.rint(mean / (CELL * np.exp(CELL * row)))
-        _, first, cell = np.unique(row * (2 * np.abs(place).max() + 1) + place, return_index=True, return_inverse=True)
-        total = np.bincount(cell, weight)
-        # About a mean of the cell, so that no digits are lost.
-        middle = mean[first]
-        apart = mean - middle[cell]
-        shift = np.bincount(cell, weight * apart) / total
-        variance = np.bincount(cell, weight * (sd**2 + apart**2)) / total - shift**2
-        return np.log(total), middle + shift, np.sqrt(variance)
+        mean = self.mean[kept]
+        return np.exp(log[kept]), mean, np.maximum(self.sd[kept], max(LEAST_ERROR * float(np.abs(mean).max()), 1e-300))
 
     def quantile(self, probability: float) -> float:
         """Return a quantile of the part above zero."""
-        held = self._cells
-        _, mean, sd = held
-        goal = _log_above(0.0, *held, 0.0) + float(np.log1p(-probability))
+        weight, mean, sd = self._parts
+        goal = _above(0.0, weight, mean, sd, 0.0) * (1.0 - probability)
         high = max(float((mean + 10 * sd).max()), float(sd.max()))
         if np.isinf(high):
             # Frames without weight do not limit it.
             return high
         # `brentq` keeps its function until the next collection of garbage, but not the arrays.
-        return float(scipy.optimize.brentq(_log_above, 0.0, high, args=(*held, goal), xtol=1e-9 * high))
+        return float(scipy.optimize.brentq(_above, 0.0, high, args=(weight, mean, sd, goal), xtol=1e-9 * high))
 
 
-def _log_above(x: float, log_weight: Float, mean: Float, sd: Float, goal: float) -> float:
-    """Return the logarithm of the probability of a mixture above x, less a goal."""
-    return float(scipy.special.logsumexp(log_weight + scipy.special.log_ndtr((mean - x) / sd))) - goal
+def _above(x: float, weight: Float, mean: Float, sd: Float, goal: float) -> float:
+    """Return the probability of a mixture above x, less a goal."""
+    return float(weight @ scipy.special.ndtr((mean - x) / sd)) - goal
 
 
 def joined(parts: Sequence[NormalMixture]) -> NormalMixture:

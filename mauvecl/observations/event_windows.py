@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -269,18 +268,10 @@ def _bins(numbers: NDArray[np.int64], size: Float, inside: Bool) -> NDArray[np.i
     """Return the first frame of each bin of consecutive frames, which are added up to their own size."""
     breaks = np.diff(numbers, prepend=numbers[:1] - 2) != 1
     breaks |= np.diff(inside, prepend=inside[:1])
-    sizes = size.astype(np.int64).tolist()
-    firsts = []
-    for begin, end in pairwise([*np.flatnonzero(breaks).tolist(), len(sizes)]):
-        first = begin
-        while first < end:
-            held = min(sizes[first], end - first)
-            while held > 1 and sizes[first + held - 1] < held:
-                held -= 1
-            while first + held < end and sizes[first + held] > held:
-                held += 1
-            firsts.append(first)
-            first += held
+    firsts = list[int]()
+    for frame, (begins, most) in enumerate(zip(breaks.tolist(), size.tolist(), strict=True)):
+        if begins or frame - firsts[-1] >= most:
+            firsts.append(frame)
     return np.array(firsts, np.int64)
 
 

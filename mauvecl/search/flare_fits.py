@@ -530,23 +530,15 @@ class SingleFlareFit:
         self, start_s: Float, peak: Float, width: Float, variance: Float, curves: Float | None
     ) -> tuple[Float, Float]:
         """Return weights of frames, zero outside the windows, (n, n_frame), and baseline terms, (n, n_frame, p)."""
-        n, frame_s = peak.size, self.bank.frame_s
-        weight = np.zeros((n, start_s.size))
-        terms = np.zeros((n, start_s.size, len(self.bank.baseline.powers) + (0 if curves is None else len(curves))))
-        for k in range(n):
-            lead, tail = self.bank.window(float(width[k]))
-            since = (start_s - peak[k]) / frame_s
-            inside = (since >= -lead - 1) & (since <= tail)
-            weight[k, inside] = 1.0 / variance[inside]
-            time = since / (lead + tail)
-            rows = [time**power for power in self.bank.baseline.powers] + list([] if curves is None else curves)
-            terms[k] = np.reshape(rows, terms.shape[:0:-1]).T
-        if terms.shape[2]:
-            # Orthonormal in each window, so that a projection is a sum of products.
-            root = np.sqrt(weight)[:, :, None]
-            basis = np.linalg.qr(root * terms)[0]
-            terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
-        return weight, terms
+        lead, tail = np.transpose([self.bank.window(float(one)) for one in width])[:, :, None]
+        since = (start_s - peak[:, None]) / self.bank.frame_s
+        weight = np.where((since >= -lead - 1) & (since <= tail), 1.0 / variance, 0.0)
+        rows = [(since / (lead + tail)) ** power for power in self.bank.baseline.powers]
+        rows += [np.broadcast_to(curve, since.shape) for curve in ([] if curves is None else curves)]
+        # Orthonormal in each window, so that a projection is a sum of products.
+        root = np.sqrt(weight)[:, :, None]
+        basis = np.linalg.qr(root * np.reshape(rows, (len(rows), *since.shape)).transpose(1, 2, 0))[0]
+        return weight, np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
 
     def _normal(self, products: Float, amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
         """Return information and gradient for log amplitude, peak in half-widths, log half-width, log temperature."""
@@ -568,7 +560,5 @@ class SingleFlareFit:
 
 def _remove_baseline(values: Float, weight: Float, level: Float) -> Float:
     """Subtract from values (n, n_frame, k) their weighted projection on orthonormal terms (n, n_frame, p)."""
-    if not level.shape[2]:
-        return values
     amounts = np.einsum("ntp,ntk->npk", level * weight[:, :, None], values, optimize=True)
     return np.asarray(values - np.einsum("ntp,npk->ntk", level, amounts, optimize=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -134,24 +135,25 @@ class PlanTarget(Section):
         check_one(self, self.name, *RATES)
 
     def target(self, simbad: bool) -> Target:
-        """Look up the target; given coordinates replace those of its name."""
+        """Look up the target; what is given replaces what is known by its name."""
         from mauvecl.host.orbit.orbit import Target
 
         if self.coordinates is None:
             try:
-                return Target.of(self.name, name=self.name, simbad=simbad)
+                found = Target.of(self.name, name=self.name, simbad=simbad)
             except InputError as error:
                 if simbad or not self.unused:
                     raise
                 fault = f"target {shortened(self.name)} is not in the embedded list, and its table has no coordinates"
                 remedy = f"give columns ra and dec, or coordinates, besides {shown(', '.join(self.unused), 200)}"
                 raise InputError(f"{fault}; {remedy}", key="coordinates") from error
-        place = Target.of(self.coordinates, name=self.name)
-        try:
-            target = Target.of(self.name)
-        except InputError:
-            return place
-        return replace(target, name=self.name, ra_deg=place.ra_deg, dec_deg=place.dec_deg, source="given")
+        else:
+            found = Target.of(self.coordinates, name=self.name)
+            with contextlib.suppress(InputError):
+                found = replace(Target.of(self.name), name=self.name, ra_deg=found.ra_deg, dec_deg=found.dec_deg,
+                                source="given")  # fmt: skip
+        given = {name: getattr(self, name) for name in ("spectral_type", "magnitude", "distance_pc")}
+        return replace(found, **{name: value for name, value in given.items() if value not in (None, "")})
 
     def distribution(self, spectral_type: str) -> Rates:
         """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""

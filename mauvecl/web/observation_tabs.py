@@ -252,8 +252,8 @@ PERIODS = Tab(
 )
 
 
-#: Ends of the axes, erg, the same for all questions.
-ENERGIES = (1e28, 1e37)
+#: Ends of the axes, erg, the same for all questions; what is shown of `Planned.by_energy`.
+ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 
 
 def _energy(value: Any) -> str:
@@ -263,12 +263,12 @@ def _energy(value: Any) -> str:
 
 def _columns(answer: PlanAnswer) -> list[tuple[str, Any, Any, Any]]:
     """Return name, energies, recovered fraction at each, and flares above each in the campaign, of seen targets."""
-    columns, table = [], answer.by_energy
+    columns = []
     for star in answer.planned:
         # Beyond the pictures' ends there is nothing to see.
-        rows = table[(np.asarray(table["target"]) == star.name) & (table["energy"].to_value("erg") <= ENERGIES[1])]
-        above = np.asarray(rows["rate_above"].to_value("1 / h") * star.hours, float)
-        columns.append((star.name, rows["energy"].to_value("erg"), np.asarray(rows["recovered"], float), above))
+        rows = star.by_energy
+        energies, recovered, above = (rows[name][rows["energy"] <= ENERGIES[1]] for name in BY_ENERGY)
+        columns.append((star.name, energies, recovered, above * star.hours / 24))
     return columns
 
 
