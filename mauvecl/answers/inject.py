@@ -30,7 +30,7 @@ from mauvecl.search.search import Survey
 from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.star import FlareLight
-from mauvecl.study.stares import energy_scale, orbit_lines, threshold_line
+from mauvecl.study.stare import orbit_lines, threshold_line
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Sizes:
         """Return the measure that a case's study chooses; raises InputError for energies of a star of unknown size."""
         asked, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
         kind: Kind = "band" if asked == "band_energy" else "bolometric"
-        scale = energy_scale(case.study, case.source, kind, case.study.flare.temperature_k)
+        scale = case.energy_scale(kind)
         if asked == "amplitude" or (asked is None and scale is None):
             return cls("amplitude", 0, 1.0)
         if asked == "duration":

@@ -36,7 +36,7 @@ from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.false_alarms import sampled_rate
 from mauvecl.study.cases import Case, cases, collect_messages, place_columns
 from mauvecl.study.questions import check_sweep
-from mauvecl.study.stares import energy_of, orbit_lines, threshold_line, unused_lines
+from mauvecl.study.stare import orbit_lines, threshold_line, unused_lines
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -429,7 +429,7 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     lost = staring.stare.pointing_losses(numbers, seed)[0] if drifting else None
     kelvin, flares = temperatures_of(case.events), list[StareFlare]()
     for event in case.events:
-        band, bolometric = (energy_of(case.study, case.source, event, kind, kelvin) for kind in ("band", "bolometric"))
+        band, bolometric = (case.energy(event, kind, kelvin) for kind in ("band", "bolometric"))
         own = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
         flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
     return StarStare(case.label, case.at, staring, flares, light, lost, **searched)
@@ -495,4 +495,4 @@ def _found_energy(case: Case, event: Event) -> float:
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
         return float("nan")
-    return energy_of(case.study, case.source, event, "bolometric")
+    return case.energy(event, "bolometric")

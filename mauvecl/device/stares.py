@@ -124,13 +124,13 @@ class Stares:
     def reduced(self, request: stare_scene.StaresRequest, shard: Shard | None = None) -> Arrays:
         """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
 
-        Return the joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
+        Return the joined results of the request's reduction, and of a shard with its ``start``.
         """
         there = shard or Shard(0, request.start, request.realisations)
         if there.start + there.count > 2**64:
             raise InputError.of("first", there.start, f"at most {2**64 - there.count} for {there.count} stares")
         components, stare = request.components, request.stare
-        reduction = request.reduction or stare_scene.KeepStatistics()
+        reduction = request.reducing
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()
         shape = (components.n_statistics, stare_scene.padded_frames(stare.n_frames))
@@ -159,7 +159,7 @@ class Stares:
                 parts.extend(reduced)
 
             self._tiles.for_each(there.start, there.count, each, work)
-        arrays = stare_scene.joined(parts, adds=reduction.adds)
+        arrays = request.joined(parts)
         return arrays | {"start": np.array(there.start)} if shard else arrays
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, Self
@@ -372,6 +372,16 @@ class StaresRequest(Countable):
         )
         return self.stare.n_frames * (drawn + len(self.flares.amplitudes) * (REDUCED if self.reduction else 0))
 
+    @property
+    def reducing(self) -> Reduction:
+        """The reduction, or what returns statistics as they are."""
+        return self.reduction or KeepStatistics()
+
+    def joined(self, parts: Sequence[Arrays]) -> Arrays:
+        """Join the results of parts or shards of the request, which are in the order of stares."""
+        together = (lambda arrays: np.sum(arrays, axis=0)) if self.reducing.adds else np.concatenate
+        return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0] if name != "start"}
+
 
 @dataclass(frozen=True)
 class KeepStatistics:
@@ -383,29 +393,6 @@ class KeepStatistics:
         """Return one row per stare, with scenarios on the second axis."""
         kept = {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
         return kept if glow is None else kept | {"glow": glow.copy()}
-
-
-class StareSums:
-    """Shards of a request that are finished."""
-
-    def __init__(self, request: StaresRequest) -> None:
-        self._adds = (request.reduction or KeepStatistics()).adds
-        self._found: dict[int, Arrays] = {}
-
-    def add(self, part: int, shard: Arrays) -> None:
-        """Add a shard."""
-        rest = dict(shard)
-        self._found[int(rest.pop("start"))] = rest
-
-    def answer(self) -> Arrays:
-        """Return the result of all shards, in the order of stares."""
-        return joined([self._found[start] for start in sorted(self._found)], adds=self._adds)
-
-
-def joined(parts: list[Arrays], *, adds: bool) -> Arrays:
-    """Join the parts of a request, which are in order."""
-    together = (lambda arrays: np.sum(arrays, axis=0)) if adds else np.concatenate
-    return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0]}
 
 
 #: Number of frames after which Pearson's test would notice the neglected cumulants at five sigma: sixteen thousand
