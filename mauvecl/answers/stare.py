@@ -450,7 +450,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
     except InputError as error:
         return {"unsearched": Message(f"{case.label} is not searched: {error}.", "not searched")}
     threshold = float(tail["threshold"])
-    scale = _log_energy(case, survey.templates.temperatures_k)
+    scale = log_energy(case, survey.templates.temperatures_k)
     raised = alarms(survey, draw(survey.components), threshold, scale)
     found = [_found_flare(case, alarm) for alarm in raised]
     return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": found}
@@ -471,7 +471,7 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest if near else 0)
 
 
-def _log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
+def log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
     """Return the logarithm of the energy per second of equivalent duration as a function of log temperature.
 
     It is a spline through the energies at temperatures, K; None if the star's size is unknown, or a template's

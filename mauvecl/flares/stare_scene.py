@@ -178,12 +178,6 @@ class StareScene:
         """Return the share of all light that padded frames of stares lose, shape (n_stare, n_padded_frame)."""
         return np.asarray(_padded(self.stare.pointing_losses(numbers, seed), np.float32))
 
-    def job(self, seed: int) -> NDArray[np.void]:
-        """Return the job of a frame with a seed, shape (1,)."""
-        job = self.scene.job.copy()
-        job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
-        return job.reshape(1)
-
     def conditions(self, flares: Flares) -> Conditions:
         """Return the conditions of the frames, in steps of at most a factor of 2."""
         low, high = self._ends
