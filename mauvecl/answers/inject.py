@@ -36,6 +36,7 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.flares.energies import Kind
     from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.stare import Size
@@ -74,7 +75,8 @@ def measure_of_size(case: Case) -> tuple[Size, float]:
     the star.
     """
     asked, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
-    scale = case.energy_scale("band" if asked == "band_energy" else "bolometric")
+    kind: Kind = "band" if asked == "band_energy" else "bolometric"
+    scale = case.study.flare.energy_scale(case.star, case.source, kind)
     if asked == "amplitude" or (asked is None and scale is None):
         return "amplitude", 1.0
     if asked == "duration":
@@ -343,7 +345,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     refit = Refit(fit, amplitudes, case.study.flare.temperature_k, fitted)
 
     def at_one_peak(position: int) -> Arrays:
-        return reduced(injections.request(position, refit if refit.count else None))
+        return reduced(injections.request(position, refit))
 
     peaks = map_in_order(engine, at_one_peak, range(positions))
     parts = list(reported(peaks, positions, lambda done, total: report(done / total)))

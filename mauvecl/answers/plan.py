@@ -99,7 +99,7 @@ class TargetObservation:
     @cached_property
     def scale(self) -> EnergyScale:
         """Bolometric energy of flares."""
-        scale = self.case.energy_scale("bolometric")
+        scale = self.case.study.flare.energy_scale(self.case.star, self.case.source, "bolometric")
         assert scale is not None
         return scale
 

@@ -24,6 +24,7 @@ from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.flares.stare import Event, Stare, coefficients, temperatures_of
+from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import Arrays, Float
 from mauvecl.host.exposure.background import parse_position, parse_time
@@ -418,10 +419,9 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     staring = case.stare_expectation
 
     def draw(components: Any) -> Any:
-        what = components, staring.stare, staring.flare
-        frames = partial(stares.frames, *what, first=q.number, count=1, seed=seed, processes=processes)
-        depends_on = ("frames", *what, q.number, seed, processes)
-        return kept(checkpoint, depends_on, lambda: {"frames": frames()[0]})["frames"]
+        what = components, staring.stare, 1, seed, staring.flare
+        request = StaresRequest(*what, start=q.number, method="pixels", processes=processes)
+        return kept(checkpoint, ("frames", request), lambda: stares.reduced(request))["values"][0]
 
     light = draw_light_curves(staring, q.bands_nm, draw)
     searched = _search(case, draw, checkpoint) if q.search else {}

@@ -415,7 +415,7 @@ class Stare:
             if name not in STARE_CHANGES["jitters"]:
                 raise InputError.of("jitters", name, f"one of {', '.join(STARE_CHANGES['jitters'])}")
         warmth = over_frames(Sinusoid(thermal) if isinstance(thermal, int | float) else thermal)
-        star, light, glow = (1.0 + over_frames(curve) for curve in (variability, throughput, sky))
+        changed = {"star": variability, "light": throughput, "sky": sky}
         hours = (start + frame_s / 2 - (start[0] + start[-1] + frame_s) / 2) / HOUR_S
         sine, cosine = (over_frames(Sinusoid(1.0, orbit_s, phase)) for phase in (0.0, np.pi / 2))
         unknowns = [StareUnknown(f"{of} offset", of, sd, np.ones(start.size)) for of, sd in (offsets or {}).items()]
@@ -423,9 +423,10 @@ class Stare:
         for of, sd in (cycles or {}).items():
             unknowns += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
         return cls(
-            start, float(frame_s), star, light, glow, temperature_c + warmth,
-            spread.get("light", 0.0), spread.get("sky", 0.0), spread.get("temperature", 0.0),
-            tuple(unknowns), pointing,
+            start, float(frame_s), temperature_c=temperature_c + warmth, unknowns=tuple(unknowns), pointing=pointing,
+            light_jitter=spread.get("light", 0.0), sky_jitter=spread.get("sky", 0.0),
+            temperature_jitter_c=spread.get("temperature", 0.0),
+            **{name: 1.0 + over_frames(curve) for name, curve in changed.items()},
         )  # fmt: skip
 
     @property

@@ -413,30 +413,12 @@ class Case:
                 events[n] = replace(event, amplitude=choice.energy_erg / energy)
         return events
 
-    def energy_scale(self, kind: Kind, flare_k: float | None = None) -> EnergyScale | None:
-        """Return the energy of flares, by default of the study's temperature, per second of equivalent duration.
-
-        It follows from the star's distance or else from its radius and temperature; None if neither is known.
-        """
-        from mauvecl.flares.energies import EnergyScale
-
-        flare, star = self.study.flare, self.star
-        how: dict[str, Any] = {
-            "band": flare.band, "flare": flare.light(flare_k), "kind": kind, "geometry": flare.geometry,
-            "photosphere_k": flare.photosphere_temperature_k,
-        }  # fmt: skip
-        if star.distance_pc is not None:
-            return EnergyScale.of_star(self.source, star.distance_pc, **how)
-        if star.radius_rsun is not None and star.effective_temperature_k is not None:
-            return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **how)
-        return None
-
     def energy(self, event: Event, kind: Kind, temperatures_k: NDArray[np.float64] | None = None) -> float:
         """Return the energy of a flare, erg, as `Event.total_energy`; NaN if the star's size is unknown."""
-        if self.energy_scale(kind, event.hottest_k) is None:
+        scale_of = partial(self.study.flare.energy_scale, self.star, self.source, kind)
+        if scale_of(event.hottest_k) is None:
             return float("nan")
-        scale_of = cast("Callable[[float], EnergyScale]", partial(self.energy_scale, kind))
-        return event.total_energy(scale_of, temperatures_k)
+        return event.total_energy(cast("Callable[[float], EnergyScale]", scale_of), temperatures_k)
 
 
 def cases(study: Study, *, swept: bool = True) -> list[Case]:
