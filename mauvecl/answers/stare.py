@@ -23,7 +23,7 @@ from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
-from mauvecl.flares.stare import Event, Stare, coefficients, temperatures_of
+from mauvecl.flares.stare import Event, Stare, check_contributions, coefficients, temperatures_of
 from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import Arrays, Float
@@ -37,7 +37,7 @@ from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.false_alarms import sampled_rate
 from mauvecl.study.cases import Case, cases, collect_messages, place_columns
 from mauvecl.study.questions import check_sweep
-from mauvecl.study.stare import orbit_lines, threshold_line, unused_lines
+from mauvecl.study.stare import orbit_lines, threshold_line
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -392,9 +392,7 @@ def stare(
     engine = engine or Stares()
     drawn = [_draw(case, engine, checkpoint) for case in reported(prepared, len(prepared), progress)]
     messages = collect_messages(quiet) + orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
-    messages += dict.fromkeys(
-        line for case in prepared for line in unused_lines(case.study.observation.exposure_s, case.stare, case.events)
-    )
+    messages += dict.fromkeys(chain.from_iterable(map(_unused_lines, prepared)))
     messages += [star.unsearched for star in drawn if star.unsearched]
     messages += [threshold_line(star.title, star.threshold) for star in drawn if star.shifted]
     for star in drawn:
@@ -411,6 +409,14 @@ def stare(
             text = f"SATURATED: {saturated} frames of the stare at {star.title}; their quality is 1."
             messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)
+
+
+def _unused_lines(case: Case) -> list[str]:
+    """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
+    exposure_s, frame_s = case.study.observation.exposure_s, case.stare.frame_s
+    frames = f"A stare consists of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used."
+    unused = [] if exposure_s == frame_s else [Message(frames, "not used")]
+    return [*unused, *check_contributions(case.events, case.stare.start_s, frame_s)]
 
 
 def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStare:

@@ -407,7 +407,7 @@ class SumTable:
         if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
             raise InputError(f"the {n} spectral weights must be independent, but one is a sum of others", key="weights")
         lower = np.linalg.cholesky(covariance)
-        white = replace(components, weights=np.linalg.solve(lower, components.weights))
+        white = replace(components, weights=np.asarray(np.linalg.solve(lower, components.weights), np.float64))
         fourths = _fourths_are_needed(components) or _fourths_are_needed(white)
         columns = []
         for order in range(1, 5 if fourths else 4):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -106,7 +105,7 @@ class EventChoice(Section):
     """A flare of a study, with one of several measures of size; other values are the study's by default.
 
     At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given. An energy needs the star's
-    size: see `events_of`.
+    size: see `Case.events`.
     """
 
     peak_s: Annotated[float, Unit("s"), Help("Time of the peak after the start of the stare")]
@@ -357,17 +356,6 @@ def _along_orbit(q: StareQuestion, orbit: OrbitQuestion, plan: PlanQuestion, cha
         fault = f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}"
         raise InputError(fault, key="stare.along_orbit")
     return stare_along(orbit.orbit(), targets[0], orbit.start, q.duration_s, limits=orbit.limits, **changes).stare
-
-
-def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> list[str]:
-    """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
-    from mauvecl.flares.stare import check_contributions
-
-    lines = check_contributions(events, stare.start_s, stare.frame_s)
-    if exposure_s == stare.frame_s:
-        return lines
-    frames = f"A stare consists of frames of {stare.frame_s:g} s"
-    return [Message(f"{frames}: observation.exposure_s = {exposure_s:g} s is not used.", "not used"), *lines]
 
 
 def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
