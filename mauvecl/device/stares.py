@@ -148,7 +148,7 @@ class Stares:
                 parts.extend(reduced)
 
             self._tiles.for_each(there.start, there.count, each, work)
-        arrays = request.joined(parts)
+        arrays = stare_scene.joined(request, parts)
         return arrays | {"start": np.array(there.start)} if shard else arrays
 
 

@@ -352,11 +352,6 @@ class StaresRequest(Countable):
         """The reduction, or what returns statistics as they are."""
         return self.reduction or KeepStatistics()
 
-    def joined(self, parts: Sequence[Arrays]) -> Arrays:
-        """Join the results of parts or shards of the request, which are in the order of stares."""
-        together = (lambda arrays: np.sum(arrays, axis=0)) if self.reducing.adds else np.concatenate
-        return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0] if name != "start"}
-
 
 @dataclass(frozen=True)
 class KeepStatistics:
@@ -368,6 +363,12 @@ class KeepStatistics:
         """Return one row per stare, with scenarios on the second axis."""
         kept = {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
         return kept if glow is None else kept | {"glow": glow.copy()}
+
+
+def joined(request: StaresRequest, parts: Sequence[Arrays]) -> Arrays:
+    """Join the results of parts or shards of a request, which are in the order of stares."""
+    together = (lambda arrays: np.sum(arrays, axis=0)) if request.reducing.adds else np.concatenate
+    return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0] if name != "start"}
 
 
 #: Number of frames after which Pearson's test would notice the neglected cumulants at five sigma: sixteen thousand
