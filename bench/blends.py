@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from mauvecl.answers.inject import survey_star
-from mauvecl.answers.stare import _log_energy
+from mauvecl.answers.stare import log_energy
 from mauvecl.flares.stare import Event, coefficients
 from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.flare_fits import Factor
@@ -42,7 +42,7 @@ class Known:
     @cached_property
     def log_energy(self) -> Factor | None:
         """As `stare` has it."""
-        return _log_energy(self.case, self.survey.templates.temperatures_k)
+        return log_energy(self.case, self.survey.templates.temperatures_k)
 
 
 def found(known: Known, events: list[Event], seed: int) -> list[Alarm]:

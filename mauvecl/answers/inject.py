@@ -30,7 +30,7 @@ from mauvecl.search.search import Survey
 from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.star import FlareLight
-from mauvecl.study.stares import energy_scale, orbit_lines, threshold_line
+from mauvecl.study.stare import orbit_lines, threshold_line
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -68,45 +68,36 @@ def survey_star(case: Case) -> Survey:
     return survey
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Measure of flare size for a star: amplitude x half-width^power x per_unit."""
+def measure_of_size(case: Case) -> tuple[Size, float]:
+    """Return the measure of flare size that a study chooses, and the size of a flare of unit amplitude and 1 s.
 
-    of: Size
-    power: int
-    per_unit: float  # size of a flare of unit amplitude and a half-width of 1 s
-
-    @classmethod
-    def chosen(cls, case: Case) -> Sizes:
-        """Return the measure that a case's study chooses; raises InputError for energies of a star of unknown size."""
-        asked, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
-        kind: Kind = "band" if asked == "band_energy" else "bolometric"
-        scale = energy_scale(case.study, case.source, kind, case.study.flare.temperature_k)
-        if asked == "amplitude" or (asked is None and scale is None):
-            return cls("amplitude", 0, 1.0)
-        if asked == "duration":
-            return cls("duration", 1, area)
-        if scale is None:
-            raise InputError(
-                f"injections.of = {asked!r}, but the size of {case.source.name} is unknown; give the star's "
-                "distance_pc, or radius_rsun and effective_temperature_k",
-                key="injections.of",
-            )
-        return cls(asked or "energy", 1, area * scale.erg_per_s)
-
-    def per_amplitude(self, half_width_s: Float) -> Float:
-        """Return the sizes of flares of unit amplitude."""
-        return half_width_s**self.power * self.per_unit
+    All but amplitudes are proportional to the half-width, too. Raises InputError for energies at an unknown size of
+    the star.
+    """
+    asked, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
+    kind: Kind = "band" if asked == "band_energy" else "bolometric"
+    scale = case.study.flare.energy_scale(case.star, case.source, kind)
+    if asked == "amplitude" or (asked is None and scale is None):
+        return "amplitude", 1.0
+    if asked == "duration":
+        return "duration", area
+    if scale is None:
+        raise InputError(
+            f"injections.of = {asked!r}, but the size of {case.source.name} is unknown; give the star's "
+            "distance_pc, or radius_rsun and effective_temperature_k",
+            key="injections.of",
+        )
+    return asked or "energy", area * scale.erg_per_s
 
 
-def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> Float:
+def injected_sizes(case: Case, per_amplitude: Callable[[Float], Float], unit_snr: float, threshold: float) -> Float:
     """Return the sizes of injected flares, ascending; by default around a completeness of one half in the survey."""
     asked = case.study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
     frames = widths / case.instrument.frame_s
     # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
     amplitude = threshold / unit_snr / np.sqrt(shape_of(case.study.search.shape).square_integral * frames)
-    half = amplitude * sizes.per_amplitude(widths)
+    half = amplitude * per_amplitude(widths)
     low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
     high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high
     if not low < high:
@@ -154,7 +145,7 @@ class StarCompleteness(InCell):
     """Completeness at one star in one cell of the sweep."""
 
     survey: Survey
-    sizes: Sizes
+    size: Size  # its measure, see `measure_of_size`
     threshold: Interval
     # False alarms per star-day of drawn stares at `checked`, with 4 standard errors; NaN if none are drawn.
     simulated: Interval
@@ -174,7 +165,7 @@ class StarCompleteness(InCell):
     @property
     def limit_columns(self) -> tuple[Column, ...]:
         """Columns of `limits`; the ideal one unless everything but the noise is known."""
-        of, unit, columns = self.sizes.of, SIZE_UNITS[self.sizes.of], list[Column]()
+        of, unit, columns = self.size, SIZE_UNITS[self.size], list[Column]()
         size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
         for name, power in POWERS.items():
             limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
@@ -206,7 +197,7 @@ class StarCompleteness(InCell):
         """Completeness at each half-width and size, and how well the flares are recovered."""
         own = (
             Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of injected flares"),
-            Column("size", "sizes", SIZE_UNITS[self.sizes.of], f"{self.sizes.of} of the injected flares"),
+            Column("size", "sizes", SIZE_UNITS[self.size], f"{self.size} of the injected flares"),
             Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
             Column("completeness", "", "", "share of injected flares that the search finds"),
             *interval_columns("completeness_{}"),
@@ -273,9 +264,9 @@ class InjectAnswer(Answer):
     def headline(self) -> str:
         """The size of which half of the flares of the first star are found."""
         star = self.stars[0]
-        unit, half = SIZE_UNITS[star.sizes.of], star.injected.limit(POWERS["e50"], None)
-        scale, unit = (100, "%") if star.sizes.of == "amplitude" else (1, unit)
-        of = star.sizes.of.replace("_", " ")
+        unit, half = SIZE_UNITS[star.size], star.injected.limit(POWERS["e50"], None)
+        scale, unit = (100, "%") if star.size == "amplitude" else (1, unit)
+        of = star.size.replace("_", " ")
         ideal = "" if np.isnan(star.ideal_share) else f"; {scale * half.value * star.ideal_share:.3g} {IF_KNOWN}"
         least = first_of(len(self.stars), "cases")
         if not np.isfinite(half.value):
@@ -290,8 +281,8 @@ class InjectAnswer(Answer):
     def views(self) -> list[View]:
         views = [InjectAnswer.search.view(self, f"The search: {self.study.search.rate_text} of frames")]
         for star in self.stars:
-            unit = f" ({SIZE_UNITS[star.sizes.of]})" if SIZE_UNITS[star.sizes.of] else ""
-            title = f"{star.title}: {star.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found"
+            unit = f" ({SIZE_UNITS[star.size]})" if SIZE_UNITS[star.size] else ""
+            title = f"{star.title}: {star.size}{unit} of which a half (E50) and nine tenths (E90) are found"
             views.append(View(title, star.limit_columns, star.limits))
         return views
 
@@ -309,7 +300,7 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
     engine = engine or Stares()
     prepared = cases(study)
     # Raise InputError for energies of stars of unknown size before the first search.
-    chosen = {Sizes.chosen(case).of: case.source.name for case in prepared}
+    chosen = {measure_of_size(case)[0]: case.source.name for case in prepared}
     if len(chosen) > 1:
         raise InputError(
             "injections.of must be 'amplitude' for stars of which some have no known size, such as "
@@ -337,21 +328,24 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     choice, asked, survey = case.study.search, case.study.injections, survey_star(case)
     reduced: Reduced = engine.stares if isinstance(engine, Pool) else engine.reduced
     found = _false_alarms(case, survey, reduced)
-    sizes, threshold = Sizes.chosen(case), found["threshold"].value
-    values = injected_sizes(case, sizes, survey.unit_snr, threshold)
+    (size, unit), threshold = measure_of_size(case), found["threshold"].value
+
+    def size_of_unit(half_width_s: Float) -> Float:
+        return unit * (np.ones_like(half_width_s) if size == "amplitude" else half_width_s)
+
+    values = injected_sizes(case, size_of_unit, survey.unit_snr, threshold)
     positions = min(asked.positions, asked.count)
     injections = Injections(
         survey, asked.half_widths_s, threshold, case.study.run.seed, positions, -(-asked.count // positions),
         case.study.processes.additive_only,
     )  # fmt: skip
-    widths = np.array(injections.half_widths_s)
-    per_amplitude = sizes.per_amplitude(widths)[:, None]
+    per_amplitude = size_of_unit(np.array(injections.half_widths_s))[:, None]
     amplitudes = values / per_amplitude
     fit, fitted = SingleFlareFit(survey.bank, survey.templates), -(-asked.fitted // positions)
     refit = Refit(fit, amplitudes, case.study.flare.temperature_k, fitted)
 
     def at_one_peak(position: int) -> Arrays:
-        return reduced(injections.request(position, refit if refit.count else None))
+        return reduced(injections.request(position, refit))
 
     peaks = map_in_order(engine, at_one_peak, range(positions))
     parts = list(reported(peaks, positions, lambda done, total: report(done / total)))
@@ -361,7 +355,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
         known = frame_signal(survey.components.quiet, flare, SMALL)
     critical = np.stack([part["critical"].T for part in parts], axis=1) * per_amplitude[:, None]
     return StarCompleteness(
-        case.label, case.at, survey, sizes, **found, saturates=injections.saturates,
+        case.label, case.at, survey, size, **found, saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
         fitted=fit_accuracy(parts) if refit.count else None,

@@ -37,7 +37,6 @@ from mauvecl.study.observation import SkyLight
 from mauvecl.study.plan import RATES, PlanTarget
 from mauvecl.study.star import Star
 from mauvecl.study.stare import InjectionQuestion
-from mauvecl.study.stares import energy_scale
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ class TargetObservation:
     @cached_property
     def scale(self) -> EnergyScale:
         """Bolometric energy of flares."""
-        scale = energy_scale(self.case.study, self.case.source, "bolometric", self.case.study.flare.temperature_k)
+        scale = self.case.study.flare.energy_scale(self.case.star, self.case.source, "bolometric")
         assert scale is not None
         return scale
 

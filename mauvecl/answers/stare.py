@@ -23,7 +23,8 @@ from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
 from mauvecl.flares.frames import Draw, LightCurves, StareExpectation, draw_light_curves
-from mauvecl.flares.stare import Event, Stare, coefficients, temperatures_of
+from mauvecl.flares.stare import Event, Stare, check_contributions, coefficients, temperatures_of
+from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import Arrays, Float
 from mauvecl.host.exposure.background import parse_position, parse_time
@@ -36,7 +37,7 @@ from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.search.false_alarms import sampled_rate
 from mauvecl.study.cases import Case, cases, collect_messages, place_columns
 from mauvecl.study.questions import check_sweep
-from mauvecl.study.stares import energy_of, orbit_lines, threshold_line, unused_lines
+from mauvecl.study.stare import orbit_lines, threshold_line
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -391,9 +392,7 @@ def stare(
     engine = engine or Stares()
     drawn = [_draw(case, engine, checkpoint) for case in reported(prepared, len(prepared), progress)]
     messages = collect_messages(quiet) + orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
-    messages += dict.fromkeys(
-        line for case in prepared for line in unused_lines(case.study.observation.exposure_s, case.stare, case.events)
-    )
+    messages += dict.fromkeys(chain.from_iterable(map(_unused_lines, prepared)))
     messages += [star.unsearched for star in drawn if star.unsearched]
     messages += [threshold_line(star.title, star.threshold) for star in drawn if star.shifted]
     for star in drawn:
@@ -412,16 +411,23 @@ def stare(
     return StareAnswer(study, drawn, messages)
 
 
+def _unused_lines(case: Case) -> list[str]:
+    """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
+    exposure_s, frame_s = case.study.observation.exposure_s, case.stare.frame_s
+    frames = f"A stare consists of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used."
+    unused = [] if exposure_s == frame_s else [Message(frames, "not used")]
+    return [*unused, *check_contributions(case.events, case.stare.start_s, frame_s)]
+
+
 def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStare:
     """Draw and search the stare of a case."""
     q, seed, processes = case.study.stare, case.study.run.seed, case.study.processes.additive_only
     staring = case.stare_expectation
 
     def draw(components: Any) -> Any:
-        what = components, staring.stare, staring.flare
-        frames = partial(stares.frames, *what, first=q.number, count=1, seed=seed, processes=processes)
-        depends_on = ("frames", *what, q.number, seed, processes)
-        return kept(checkpoint, depends_on, lambda: {"frames": frames()[0]})["frames"]
+        what = components, staring.stare, 1, seed, staring.flare
+        request = StaresRequest(*what, start=q.number, method="pixels", processes=processes)
+        return kept(checkpoint, ("frames", request), lambda: stares.reduced(request))["values"][0]
 
     light = draw_light_curves(staring, q.bands_nm, draw)
     searched = _search(case, draw, checkpoint) if q.search else {}
@@ -429,7 +435,7 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     lost = staring.stare.pointing_losses(numbers, seed)[0] if drifting else None
     kelvin, flares = temperatures_of(case.events), list[StareFlare]()
     for event in case.events:
-        band, bolometric = (energy_of(case.study, case.source, event, kind, kelvin) for kind in ("band", "bolometric"))
+        band, bolometric = (case.energy(event, kind, kelvin) for kind in ("band", "bolometric"))
         own = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
         flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
     return StarStare(case.label, case.at, staring, flares, light, lost, **searched)
@@ -450,7 +456,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
     except InputError as error:
         return {"unsearched": Message(f"{case.label} is not searched: {error}.", "not searched")}
     threshold = float(tail["threshold"])
-    scale = _log_energy(case, survey.templates.temperatures_k)
+    scale = log_energy(case, survey.templates.temperatures_k)
     raised = alarms(survey, draw(survey.components), threshold, scale)
     found = [_found_flare(case, alarm) for alarm in raised]
     return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": found}
@@ -471,7 +477,7 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest if near else 0)
 
 
-def _log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
+def log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
     """Return the logarithm of the energy per second of equivalent duration as a function of log temperature.
 
     It is a spline through the energies at temperatures, K; None if the star's size is unknown, or a template's
@@ -495,4 +501,4 @@ def _found_energy(case: Case, event: Event) -> float:
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
         return float("nan")
-    return energy_of(case.study, case.source, event, "bolometric")
+    return case.energy(event, "bolometric")

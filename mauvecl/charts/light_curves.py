@@ -53,7 +53,7 @@ def maps(answer: InjectAnswer) -> Picture:
     """Plot completeness over half-width and size, one panel per star."""
 
     def panel(star: Any) -> Panel:
-        f, size = star.injected, Axis(SIZES[star.sizes.of], log=True)
+        f, size = star.injected, Axis(SIZES[star.size], log=True)
         x, y, z = np.array(f.half_widths_s), f.sizes, f.completeness.T
         if x.size < 2:
             # A single half-width defines no cell width.
@@ -80,7 +80,7 @@ def curves(answer: InjectAnswer) -> Picture:
             ]
         series.append(Rule("50 % and 90 %", "text", along="y", at=(0.5, 0.9)))
         y = Axis("completeness", limits=(-0.02, 1.02))
-        return Panel(Axis(SIZES[star.sizes.of], log=True), y, series, star.title)
+        return Panel(Axis(SIZES[star.size], log=True), y, series, star.title)
 
     widths = len(answer.stars[0].injected.half_widths_s)
     notes = "shaded: 95 % intervals", part_note(min(MOST_CURVES, widths), widths, "half-widths")
@@ -97,7 +97,7 @@ def energies(answer: InjectAnswer) -> Picture:
             at = _edges(x), _edges(y), np.log10(star.fitted["energy_ratio"].T)
             label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
-        return Panel(HALF_WIDTH, Axis(SIZES[star.sizes.of], log=True), meshes, star.title)
+        return Panel(HALF_WIDTH, Axis(SIZES[star.size], log=True), meshes, star.title)
 
     return _stars(answer, panel, "medians; grey: none found")
 

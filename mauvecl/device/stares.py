@@ -33,17 +33,10 @@ class Stares:
 
     Parameters
     ----------
-    device : str or Device, optional
-        Number or name, as for `Engine`, or an open device.
-    progress, tile, width : optional
-        As for `Engine`, in stares instead of realisations.
+    device, progress, tile, width : optional
+        As for `Engine`, in stares instead of realisations; the device may also be an open one.
     tiles : Tiles, optional
         Division of the work, instead of `progress` and `tile`.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such device, or its driver does not work.
 
     Examples
     --------
@@ -96,14 +89,10 @@ class Stares:
 
         Parameters
         ----------
-        components : Components
-        stare : Stare
         flare : ndarray, shape (n_frame, n_flare) or (count, n_frame, n_flare), optional
             Amplitude of each flare spectrum in each frame, common to all stares or per stare.
         first, count : int
             Range of stares; each stare depends only on the seed and its number.
-        seed : int
-            0 to 2**64 - 1.
         method : {"pixels", "cumulants"}
             Draw every pixel, or the sums directly from their cumulants. The conditions of frames are equal for both.
         amplitudes : ndarray, shape (n_scenario, count) or (n_scenario, 1), optional
@@ -124,13 +113,13 @@ class Stares:
     def reduced(self, request: stare_scene.StaresRequest, shard: Shard | None = None) -> Arrays:
         """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
 
-        Return the joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
+        Return the joined results of the request's reduction, and of a shard with its ``start``.
         """
         there = shard or Shard(0, request.start, request.realisations)
         if there.start + there.count > 2**64:
             raise InputError.of("first", there.start, f"at most {2**64 - there.count} for {there.count} stares")
         components, stare = request.components, request.stare
-        reduction = request.reduction or stare_scene.KeepStatistics()
+        reduction = request.reducing
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()
         shape = (components.n_statistics, stare_scene.padded_frames(stare.n_frames))
@@ -159,7 +148,7 @@ class Stares:
                 parts.extend(reduced)
 
             self._tiles.for_each(there.start, there.count, each, work)
-        arrays = stare_scene.joined(parts, adds=reduction.adds)
+        arrays = stare_scene.joined(request, parts)
         return arrays | {"start": np.array(there.start)} if shard else arrays
 
 

@@ -323,4 +323,7 @@ def draw_light_curves(
     low, high = quiet.wavelength_nm[[0, -1]]
     names = (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm))
     element_nm = quiet.element_wavelength_nm[filled]
-    return LightCurves(names, flux, sd, mean, spectrum, spectrum_sd, spectrum_mean, element_nm)
+    return LightCurves(
+        names, flux=flux, sd=sd, mean=mean, spectrum=spectrum, spectrum_sd=spectrum_sd, spectrum_mean=spectrum_mean,
+        element_nm=element_nm,
+    )  # fmt: skip

@@ -50,7 +50,6 @@ class Event:
         Factor on the shape: relative rise of the photons in the flare's band.
     temperature : float or Cooling
         K.
-    shape : Shape or str
 
     Examples
     --------
@@ -296,7 +295,6 @@ class Stare:
     ----------
     start_s : ndarray, shape (n_frame,)
         Start of each frame from the start of the stare: ascending multiples of `frame_s`, without frames in gaps.
-    frame_s : float
     star, light, sky : ndarray, shape (n_frame,)
         Known factors on the light of the star, on all light, and on the sky.
     temperature_c : ndarray, shape (n_frame,)
@@ -387,7 +385,6 @@ class Stare:
         ----------
         duration_s : float
             From the first frame to the end of the last, rounded up to whole frames.
-        frame_s : float
         gaps : sequence of (float, float)
             Start and end of gaps, s; frames that overlap a gap are lost.
         temperature_c : float
@@ -407,11 +404,6 @@ class Stare:
             middle, and of the sine and cosine of an unknown orbital cycle.
         pointing : PointingDrifts, optional
             Drifts out of the fibre with re-acquisitions.
-
-        Raises
-        ------
-        InputError
-            If the gaps leave no frame, or for an invalid value.
         """
         start = _starts(duration_s, float(frame_s), gaps)
 
@@ -423,7 +415,7 @@ class Stare:
             if name not in STARE_CHANGES["jitters"]:
                 raise InputError.of("jitters", name, f"one of {', '.join(STARE_CHANGES['jitters'])}")
         warmth = over_frames(Sinusoid(thermal) if isinstance(thermal, int | float) else thermal)
-        star, light, glow = (1.0 + over_frames(curve) for curve in (variability, throughput, sky))
+        changed = {"star": variability, "light": throughput, "sky": sky}
         hours = (start + frame_s / 2 - (start[0] + start[-1] + frame_s) / 2) / HOUR_S
         sine, cosine = (over_frames(Sinusoid(1.0, orbit_s, phase)) for phase in (0.0, np.pi / 2))
         unknowns = [StareUnknown(f"{of} offset", of, sd, np.ones(start.size)) for of, sd in (offsets or {}).items()]
@@ -431,9 +423,10 @@ class Stare:
         for of, sd in (cycles or {}).items():
             unknowns += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
         return cls(
-            start, float(frame_s), star, light, glow, temperature_c + warmth,
-            spread.get("light", 0.0), spread.get("sky", 0.0), spread.get("temperature", 0.0),
-            tuple(unknowns), pointing,
+            start, float(frame_s), temperature_c=temperature_c + warmth, unknowns=tuple(unknowns), pointing=pointing,
+            light_jitter=spread.get("light", 0.0), sky_jitter=spread.get("sky", 0.0),
+            temperature_jitter_c=spread.get("temperature", 0.0),
+            **{name: 1.0 + over_frames(curve) for name, curve in changed.items()},
         )  # fmt: skip
 
     @property
@@ -555,30 +548,20 @@ def stare_along(
     particles: Particles | None = None,
     **unknowns: Any,
 ) -> OrbitStare:
-    """Compute the stare at a target along an orbit.
+    """Compute the stare at a target along an orbit; raises InputError if the target is never visible.
 
     Parameters
     ----------
-    orbit : Orbit
     target : Target or str
         A name of the embedded list, or coordinates.
     start : str
         ISO 8601, UTC.
     duration_s : float
         From the first frame, including times at which the target is not visible.
-    frame_s : float
-    limits : Limits, optional
-        Conditions for the target to be visible.
     thermal : Thermal, optional
         Response of the detector temperature to sunlight and shadow; assumed by default.
-    particles : Particles, optional
     **unknowns
         Arguments of `Stare.of`: variability, throughput, sky, jitters, offsets, drifts, cycles.
-
-    Raises
-    ------
-    InputError
-        If the target is never visible.
     """
     for name in ("gaps", "temperature_c"):
         if name in unknowns:

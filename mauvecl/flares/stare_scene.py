@@ -11,10 +11,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, Self
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +32,6 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Realisations, Seed
 
-if TYPE_CHECKING:
-    from mauvecl.host.exposure.expectation import Expectation
-
 Floats = NDArray[np.float32]
 
 #: Deviation of conditions from their known values up to which frames are checked, in standard deviations.
@@ -45,10 +42,6 @@ MOST_UNKNOWNS, MOST_SCENARIOS = 32, 16
 LARGEST = 1e12
 #: Distance of a count from its base up to which the device rounds to whole DN.
 REACH_DN = 2.0**22
-
-
-#: Photons in DN of each pixel, float64, and factors on the dark; hashable, so that what holds for all is computed once.
-Conditions = tuple[tuple[bytes, float], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +72,11 @@ class Flares:
                 f"not {factors.shape}",
                 key="amplitudes",
             )
-        # The minimum of values that include NaN is NaN.
-        ends = [("flare coefficients", given.min(initial=0.0)), ("amplitudes", factors.min(initial=0.0))]
-        ends += [("flare coefficients", most) for most in _largest(given)] + [("amplitudes", factors.max())]
-        for what, end in ends:
-            if not 0 <= end <= LARGEST:
-                raise InputError.of(what, end, f"between 0 and {LARGEST:g}")
+        for what, values in (("flare coefficients", given), ("amplitudes", factors)):
+            # The ends of values that include NaN are NaN.
+            for end in (values.min(initial=0.0), values.max(initial=0.0)):
+                if not 0 <= end <= LARGEST:
+                    raise InputError.of(what, end, f"between 0 and {LARGEST:g}")
         return cls(given, factors.astype(np.float32))
 
     @cached_property
@@ -104,7 +96,7 @@ class Flares:
     @cached_property
     def most(self) -> Float:
         """Largest coefficient of each spectrum, shape (n_flare,)."""
-        return np.array(_largest(self.given), np.float64) * float(self.amplitudes.max())
+        return np.asarray(self.given.max(axis=(0, 1)) * np.float64(self.amplitudes.max()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +143,11 @@ class StareScene:
         curves = np.reshape([u.sd * u.curve for u in stare.unknowns], (len(stare.unknowns), stare.n_frames))
         factors = [part for row in components.coefficients(stare).T[: len(STEADY)] for part in (row, row - 1.0)]
         return cls(
-            components, stare, scene, _padded(stare.numbers, np.uint32),
-            _padded(np.stack([*factors, stare.light]), np.float32), _padded(curves, np.float32),
-            np.array([CHANGING.index(u.of) for u in stare.unknowns], np.uint32),
-            _mixtures(components, scene.base_dn[0]), spectra, weights, constants.astype(np.float32),
+            components, stare, scene, numbers=_padded(stare.numbers, np.uint32),
+            known=_padded(np.stack([*factors, stare.light]), np.float32), curves=_padded(curves, np.float32),
+            kinds=np.array([CHANGING.index(u.of) for u in stare.unknowns], np.uint32),
+            mixtures=_mixtures(components, scene.base_dn[0]), spectra=spectra, weights=weights,
+            constants=constants.astype(np.float32),
         )  # fmt: skip
 
     @property
@@ -178,23 +171,21 @@ class StareScene:
         """Return the share of all light that padded frames of stares lose, shape (n_stare, n_padded_frame)."""
         return np.asarray(_padded(self.stare.pointing_losses(numbers, seed), np.float32))
 
-    def job(self, seed: int) -> NDArray[np.void]:
-        """Return the job of a frame with a seed, shape (1,)."""
-        job = self.scene.job.copy()
-        job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
-        return job.reshape(1)
+    def conditions(self, flares: Flares) -> tuple[Float, Float]:
+        """Return conditions that the frames may have, in steps of at most a factor of 2.
 
-    def conditions(self, flares: Flares) -> Conditions:
-        """Return the conditions of the frames, in steps of at most a factor of 2."""
+        These are the photons of each pixel in DN, (n_condition, n_pixel), and factors on the dark, (n_condition, 1).
+        """
         low, high = self._ends
         mean = self.components.mean_dn
         darkest = np.maximum(low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3], 1e-30)
         lit = mean[3] + flares.most @ mean[len(STEADY) :]
         brightest = np.maximum(high[0] * mean[0] + high[1] * mean[1] + high[3] * lit, 1e-30)
         span = float(np.max(brightest / darkest, initial=1.0, where=brightest > 1e-9))
-        parts = np.linspace(0.0, 1.0, 2 + int(np.ceil(np.log2(min(span, 2.0**20)))))
-        dark = np.geomspace(low[2], high[2], 2 + int(np.log2(high[2] / low[2]))).tolist()
-        return tuple(itertools.product([(darkest ** (1 - part) * brightest**part).tobytes() for part in parts], dark))
+        part = np.linspace(0.0, 1.0, 2 + int(np.ceil(np.log2(min(span, 2.0**20)))))[:, None]
+        dark = np.geomspace(low[2], high[2], 2 + int(np.log2(high[2] / low[2])))
+        photons_dn = np.repeat(darkest ** (1 - part) * brightest**part, dark.size, axis=0)
+        return photons_dn, np.tile(dark, part.size)[:, None]
 
     @property
     def _ends(self) -> tuple[Float, Float]:
@@ -240,23 +231,12 @@ class StareScene:
                 f"{REACH_DN:g} DN",
                 key="flare",
             )
-        if not _joint_throughout(x, self.conditions(flares)):
+        photons_dn, dark = self.conditions(flares)
+        other = x.read_noise_dn**2 + (0.0 if self.counts else x.gain_dn_per_electron * photons_dn)
+        cumulants, photons = Cumulants.of(x, 1), photons_dn / x.gain_dn_per_electron
+        moved = replace(cumulants, gaussian=other, photons=photons, dark_dn=dark * cumulants.dark_dn)
+        if not joint_is_exact(moved).all():
             raise _not_joint_error(x.name)
-
-
-# The pixels of a stare are drawn in many parts.
-@lru_cache(maxsize=4)
-def _joint_throughout(x: Expectation, conditions: Conditions) -> bool:
-    cumulants, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
-    for photons_dn, dark in conditions:
-        light = np.frombuffer(photons_dn)
-        photons = light / x.gain_dn_per_electron
-        other = x.read_noise_dn**2 + (0.0 if counts else x.gain_dn_per_electron * light)
-        if not joint_is_exact(
-            replace(cumulants, gaussian=other, photons=photons, dark_dn=dark * cumulants.dark_dn)
-        ).all():
-            return False
-    return True
 
 
 def padded_frames(n_frames: int) -> int:
@@ -267,11 +247,6 @@ def padded_frames(n_frames: int) -> int:
 def unique(n: int, order: int) -> list[tuple[int, ...]]:
     """Return the unique indices of a symmetric tensor in the order of the kernels: (0, 0), (1, 0), (1, 1), ..."""
     return sorted(tuple(sorted(key, reverse=True)) for key in itertools.combinations_with_replacement(range(n), order))
-
-
-def _largest(given: NDArray[Any]) -> list[float]:
-    """Return the maximum of each spectrum, one by one since NumPy is slow over the other axes."""
-    return [float(given[..., j].max()) for j in range(given.shape[-1])]
 
 
 def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
@@ -372,6 +347,11 @@ class StaresRequest(Countable):
         )
         return self.stare.n_frames * (drawn + len(self.flares.amplitudes) * (REDUCED if self.reduction else 0))
 
+    @property
+    def reducing(self) -> Reduction:
+        """The reduction, or what returns statistics as they are."""
+        return self.reduction or KeepStatistics()
+
 
 @dataclass(frozen=True)
 class KeepStatistics:
@@ -385,27 +365,10 @@ class KeepStatistics:
         return kept if glow is None else kept | {"glow": glow.copy()}
 
 
-class StareSums:
-    """Shards of a request that are finished."""
-
-    def __init__(self, request: StaresRequest) -> None:
-        self._adds = (request.reduction or KeepStatistics()).adds
-        self._found: dict[int, Arrays] = {}
-
-    def add(self, part: int, shard: Arrays) -> None:
-        """Add a shard."""
-        rest = dict(shard)
-        self._found[int(rest.pop("start"))] = rest
-
-    def answer(self) -> Arrays:
-        """Return the result of all shards, in the order of stares."""
-        return joined([self._found[start] for start in sorted(self._found)], adds=self._adds)
-
-
-def joined(parts: list[Arrays], *, adds: bool) -> Arrays:
-    """Join the parts of a request, which are in order."""
-    together = (lambda arrays: np.sum(arrays, axis=0)) if adds else np.concatenate
-    return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0]}
+def joined(request: StaresRequest, parts: Sequence[Arrays]) -> Arrays:
+    """Join the results of parts or shards of a request, which are in the order of stares."""
+    together = (lambda arrays: np.sum(arrays, axis=0)) if request.reducing.adds else np.concatenate
+    return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0] if name != "start"}
 
 
 #: Number of frames after which Pearson's test would notice the neglected cumulants at five sigma: sixteen thousand
@@ -445,11 +408,7 @@ class SumTable:
         if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
             raise InputError(f"the {n} spectral weights must be independent, but one is a sum of others", key="weights")
         lower = np.linalg.cholesky(covariance)
-        white = Components(
-            components.quiet,
-            components.flare_electrons,
-            np.asarray(np.linalg.solve(lower, components.weights), np.float64),
-        )
+        white = replace(components, weights=np.asarray(np.linalg.solve(lower, components.weights), np.float64))
         fourths = _fourths_are_needed(components) or _fourths_are_needed(white)
         columns = []
         for order in range(1, 5 if fourths else 4):
@@ -474,21 +433,20 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
         raise InputError(f"{ADDITIVE[name].label} must be drawn with method 'pixels', not 'cumulants'", key="method")
     x = scene.components.quiet
     used = (scene.components.weights != 0).any(axis=0)
-    for photons_dn, dark in scene.conditions(flares):
-        light = np.frombuffer(photons_dn)
-        mean = x.bias_dn + light + dark * x.dark_dn
-        variance = x.read_noise_dn**2 + x.gain_dn_per_electron * light + dark * x.dark_variance_dn2
-        sd = np.sqrt(variance)
-        near = used & ((mean - RAIL_SIGMA * sd < 0.0) | (mean + RAIL_SIGMA * sd > x.highest_dn))
-        for wrong, fault in (
-            (near, f"comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight; use method 'pixels', "
-                   "which clips, or give the pixel the weight 0"),
-            (used & (variance < LEAST_VARIANCE), "scatters by {:.2g} DN, too little for its rounding to be noise; use "
-                                                 "method 'pixels'"),
-        ):  # fmt: skip
-            if wrong.any():
-                pixel = int(np.argmax(wrong))
-                raise InputError(f"pixel {pixel} of {x.name} {fault.format(sd[pixel])}", key="method")
+    photons_dn, dark = scene.conditions(flares)
+    mean = x.bias_dn + photons_dn + dark * x.dark_dn
+    variance = x.read_noise_dn**2 + x.gain_dn_per_electron * photons_dn + dark * x.dark_variance_dn2
+    sd = np.sqrt(variance)
+    near = used & ((mean - RAIL_SIGMA * sd < 0.0) | (mean + RAIL_SIGMA * sd > x.highest_dn))
+    for wrong, fault in (
+        (near, f"comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight; use method 'pixels', "
+               "which clips, or give the pixel the weight 0"),
+        (used & (variance < LEAST_VARIANCE), "scatters by {:.2g} DN, too little for its rounding to be noise; use "
+                                             "method 'pixels'"),
+    ):  # fmt: skip
+        if wrong.any():
+            condition, pixel = np.argwhere(wrong)[0]
+            raise InputError(f"pixel {pixel} of {x.name} {fault.format(sd[condition, pixel])}", key="method")
 
 
 def method_for(components: Components, stare: Stare, processes: Processes = NONE) -> Method:

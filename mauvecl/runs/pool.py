@@ -207,11 +207,11 @@ class Pool:
 
     def stares(self, request: StaresRequest) -> Arrays:
         """Reduce all stares of a request; see `Stares.reduced`."""
-        from mauvecl.flares.stare_scene import StareSums
+        from mauvecl.flares.stare_scene import joined
 
-        sums = StareSums(request)
-        self._add_up(request, sums.add)
-        return sums.answer()
+        found: dict[int, Arrays] = {}
+        self._add_up(request, lambda _, shard: found.update({int(shard["start"]): shard}))
+        return joined(request, [found[start] for start in sorted(found)])
 
     def realise(
         self, expectation: Expectation, *, count: Realisations, out: NDArray[Any] | None = None, **how: Any

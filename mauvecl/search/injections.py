@@ -240,21 +240,18 @@ class Injections:
     @cached_property
     def photons(self) -> Float:
         """Root of the covariance that a flare of unit amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
-        with_it, without = np.zeros((2, len(STEADY) + 1))
-        with_it[len(STEADY)] = 1.0
-        covariance = self.survey.components.covariance(with_it) - self.survey.components.covariance(without)
-        values, vectors = np.linalg.eigh(covariance)
+        values, vectors = np.linalg.eigh(self.survey.components.sum_cumulants(2)[1][len(STEADY)])
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
     @cached_property
     def quiescent(self) -> tuple[Components, Method]:
         """Components of the frames without flares, and the method of drawing them."""
-        components = self.survey.components
-        quiescent = Components(components.quiet, components.flare_electrons[:0], components.weights)
+        every = self.survey.components
+        quiescent = replace(every, flare_electrons=every.flare_electrons[:0])
         return quiescent, method_for(quiescent, self.survey.stare, self.processes)
 
-    def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
-        """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
+    def request(self, position: int, refit: Refit) -> StaresRequest:
+        """Return the request for the critical amplitudes at a peak time and fits of detected flares."""
         survey = self.survey
         sites = sites_of(survey, self.half_widths_s, float(self.peaks_s[position]))
         # Without templates, one frame is drawn, since requests cannot be empty.
@@ -263,10 +260,11 @@ class Injections:
         frames = survey.frames.part(slice(first, max(part.stop for part in reached)))
         start, (quiescent, method) = (1 + position) * NUMBERS, self.quiescent
         single = replace(frames, known=frames.known.astype(np.float32))
-        sites = tuple(replace(site, first=site.first - first) for site in sites)
         injecting = CriticalAmplitudes(
-            sites, self.threshold, survey.bank.directions, survey.response, self.photons, single, start, refit
-        )
+            sites=tuple(replace(site, first=site.first - first) for site in sites), threshold=self.threshold,
+            directions=survey.bank.directions, response=survey.response, photons=self.photons, frames=single,
+            start=start, refit=refit,
+        )  # fmt: skip
         return StaresRequest(
             quiescent, frames.stare, self.draws, self.seed, start=start, method=method,
             processes=self.processes, reduction=injecting, glow=True,
@@ -292,10 +290,10 @@ class CriticalAmplitudes:
     photons: Float  # see `Injections.photons`
     frames: SearchedFrames
     start: int  # number of the first stare
-    refit: Refit | None = None  # flares to fit
+    refit: Refit
 
     def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
-        """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and fits if requested.
+        """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and the fits of some stares.
 
         It is infinite if no template covers the flare, and zero if there is an alarm without it.
         """
@@ -306,14 +304,12 @@ class CriticalAmplitudes:
             for column, site in zip(critical[part].T, self.sites, strict=True):
                 if len(site.filters):
                     column[:] = self._critical(site, self.values(site, drawn))
-        if self.refit is None:
-            return {"critical": critical}
         # Stares are processed one at a time, so that fits do not depend on the batch.
         fitted = max(0, min(len(values), self.start + self.refit.count - first))
         fits = {name: np.full((fitted, *self.refit.amplitudes.shape), np.nan, np.float32) for name in FIT_QUANTITIES}
         for k in range(fitted):
             estimates = {name: fit[k] for name, fit in fits.items()}
-            self._fit(self.frame_noise(values[k : k + 1], glow[k : k + 1]), self.refit, estimates)
+            self._fit(self.frame_noise(values[k : k + 1], glow[k : k + 1]), estimates)
         return {"critical": critical, **fits}
 
     def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
@@ -350,9 +346,9 @@ class CriticalAmplitudes:
         np.copyto(root, 0, where=(left <= 0) & site.counts[:, None])
         return np.asarray(root.min(axis=(0, 2)) ** 2)
 
-    def _fit(self, drawn: FrameNoise, refit: Refit, estimates: Mapping[str, Single]) -> None:
+    def _fit(self, drawn: FrameNoise, estimates: Mapping[str, Single]) -> None:
         """Fit the detected flares of one stare, and set their estimates, shape (n_half_width, n_amplitude) each."""
-        noise, normals, light = (array[..., 0, :] for array in drawn)
+        (noise, normals, light), refit = (array[..., 0, :] for array in drawn), self.refit
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue

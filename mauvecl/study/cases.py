@@ -5,24 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Literal, Self
+from functools import cached_property, lru_cache, partial
+from typing import TYPE_CHECKING, Any, Literal, Self, cast
 
 import numpy as np
 
 from mauvecl.noise.drawing import Cumulants, stack_is_exact
 from mauvecl.noise.unknowns import COURSES, PROCESSES, Processes, default_processes
 from mauvecl.schema.columns import Column, percent, short
-from mauvecl.schema.errors import Message, of_kind
+from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.questions import QUANTITIES, Sweep
 from mauvecl.study.star import Star
-from mauvecl.study.stare import KNOWN_CHANGES
+from mauvecl.study.stare import KNOWN_CHANGES, EventChoice, stare_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.detection.statistics import Setting
+    from mauvecl.flares.energies import EnergyScale, Kind
     from mauvecl.flares.frames import StareExpectation
     from mauvecl.flares.stare import Event, Stare
     from mauvecl.host.exposure.background import Neighbours, Sky
@@ -370,9 +371,8 @@ class Case:
     @cached_property
     def stare(self) -> Stare:
         """The study's stare."""
-        from mauvecl.study.stares import stare_of
-
-        return stare_of(self.study, self.instrument)
+        s = self.study
+        return stare_of(s.stare, self.instrument, s.processes, orbit=s.orbit, plan=s.plan, usual=s.nuisances.usual)
 
     @cached_property
     def stare_expectation(self) -> StareExpectation:
@@ -388,10 +388,37 @@ class Case:
 
     @cached_property
     def events(self) -> list[Event]:
-        """Flares in the stare."""
-        from mauvecl.study.stares import events_of
+        """Flares in the stare: the study's, or one per energy or amplitude, evenly spaced."""
+        from mauvecl.flares.stare import temperatures_of
 
-        return events_of(self.study, self.source)
+        choices, q, flare = self.study.events, self.study.stare, self.study.flare
+        if not choices:
+            sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in flare.amplitudes]
+            # The time before the first flare equals the spacing.
+            step = q.duration_s / (len(sizes) + 1)
+            choices = tuple(EventChoice(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes))
+        events = [choice.event(flare, q) for choice in choices]
+        # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
+        kelvin = temperatures_of(events)
+        for n, (choice, event) in enumerate(zip(choices, events, strict=True)):
+            if choice.energy_erg is not None:
+                energy = self.energy(event, choice.energy, kelvin)
+                if math.isnan(energy):
+                    raise InputError(
+                        f"the amplitude of a flare of {choice.energy_erg:g} erg on {self.source.name} needs the star's "
+                        "distance_pc, or radius_rsun and effective_temperature_k",
+                        key="events.energy_erg",
+                    )
+                # The energy is linear in the amplitude.
+                events[n] = replace(event, amplitude=choice.energy_erg / energy)
+        return events
+
+    def energy(self, event: Event, kind: Kind, temperatures_k: NDArray[np.float64] | None = None) -> float:
+        """Return the energy of a flare, erg, as `Event.total_energy`; NaN if the star's size is unknown."""
+        scale_of = partial(self.study.flare.energy_scale, self.star, self.source, kind)
+        if scale_of(event.hottest_k) is None:
+            return float("nan")
+        return event.total_energy(cast("Callable[[float], EnergyScale]", scale_of), temperatures_k)
 
 
 def cases(study: Study, *, swept: bool = True) -> list[Case]:

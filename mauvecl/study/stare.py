@@ -1,24 +1,30 @@
-"""Study sections of stares and of searches for flares in them."""
+"""Study sections of stares and of searches for flares in them, and the frames and flares of a stare at a star."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mauvecl.flares import settings
-from mauvecl.flares.settings import HALF_WIDTHS_S, SHAPE_NAMES, WINDOW_S, CoolingLaw, Curve, Per, ShapeName
-from mauvecl.noise.disturbances import PointingDrifts
-from mauvecl.noise.unknowns import Changing, NuisanceName
+from mauvecl.flares.settings import HALF_WIDTHS_S, SHAPE_NAMES, WINDOW_S, Cooling, CoolingLaw, Curve, Per, ShapeName
+from mauvecl.noise.disturbances import Normal, PointingDrifts, Prior
+from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, Changing, Course, NuisanceName
 from mauvecl.schema import fields
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range, Unit
+from mauvecl.schema.errors import InputError, Message, shortened
+from mauvecl.schema.fields import DAY_S, Flag, Help, Range, Unit
 from mauvecl.schema.section import Section, check_one, read_ranges, setting
 from mauvecl.study.observation import Spread, sd_of
 
 if TYPE_CHECKING:
-    from mauvecl.flares.stare import Stare
+    from mauvecl.flares.stare import Event, Stare
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.noise.unknowns import Processes
     from mauvecl.search.templates import Bank, Baseline
+    from mauvecl.study.plan import OrbitQuestion, PlanQuestion
+    from mauvecl.study.star import Flare
 
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
@@ -98,8 +104,8 @@ SIZES = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
 class EventChoice(Section):
     """A flare of a study, with one of several measures of size; other values are the study's by default.
 
-    At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given. The flare that follows, an
-    `Event`, depends on the case: an energy needs the star's size, and sweeps change the study's values.
+    At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given. An energy needs the star's
+    size: see `Case.events`.
     """
 
     peak_s: Annotated[float, Unit("s"), Help("Time of the peak after the start of the stare")]
@@ -117,6 +123,34 @@ class EventChoice(Section):
     def _check_values(self) -> None:
         check_one(self, "an event", *SIZES)
         check_one(self, "an event", "shape", "shape_file")
+
+    def event(self, flare: Flare, stare: StareQuestion) -> Event:
+        """Return the flare, with amplitude 1 if its energy is given."""
+        from mauvecl.flares.shapes import TableShape, shape_of
+        from mauvecl.flares.stare import Event
+        from mauvecl.host.tables.text_tables import read_columns
+
+        file, cooling = self.shape_file, self.cooling
+        shape = shape_of(self.shape or stare.shape)
+        if file is not None:
+            columns = read_columns("flare shape", "values", file)
+            shape = TableShape(columns[:, 0], columns[:, 1], file.stem, shortened(file.name))
+        if cooling is not None and flare.spectrum.file is not None:
+            fault = "events.cooling needs a flare that has a temperature, but its spectrum is from a file"
+            raise InputError(fault, key="events.cooling")
+        kelvin = flare.temperature_k if self.temperature_k is None else self.temperature_k
+        how: dict[str, Any] = {
+            "peak_s": self.peak_s,
+            "half_width_s": stare.half_width_s if self.half_width_s is None else self.half_width_s,
+            "temperature": kelvin if cooling is None else Cooling(kelvin, cooling.end_k, cooling.fold_s),
+            "shape": shape,
+        }
+        if self.peak is not None:
+            return Event.of_peak(self.peak, **how)
+        if self.equivalent_duration_s is not None:
+            return Event.of_equivalent_duration(self.equivalent_duration_s, **how)
+        usual = flare.amplitudes[0] if self.energy_erg is None else 1.0
+        return Event(amplitude=usual if self.amplitude is None else self.amplitude, **how)
 
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
@@ -240,3 +274,106 @@ class InjectionQuestion(Section):
         import numpy as np
 
         return tuple(float(w) for w in np.geomspace(self.half_width_low_s, self.half_width_high_s, self.widths))
+
+
+#: Smallest distance of a prior's cuts from its mean, in standard deviations, for a normal distribution to replace it:
+#: 6e-7 of the values lie beyond.
+NEGLIGIBLE_CUT_SD = 5.0
+
+
+def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Course, Changing, float, float]:
+    """Return the course of a process of exposures in a stare, what it changes, and its standard deviation and mean.
+
+    The stare's quiescent level is measured in the stare itself, so the mean is a known factor on light or sky, or shift
+    of the temperature in deg C; the standard deviation is relative to it, or in deg C.
+    """
+    import numpy as np
+
+    if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
+        raise InputError(
+            f"processes.{name} is drawn from a normal distribution in a stare; give a normal prior whose cuts are "
+            f"{NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, drifts or cycles in [stare]",
+            key=f"processes.{name}",
+        )
+    process = PROCESSES[name]
+    course: Course = "jitters" if process.when == "frame" else "offsets"
+    if process.of == "dark":
+        return course, "temperature", prior.sd, prior.mean - instrument.temperature_c
+    at = {"light_loss": instrument.light_loss, "pointing_loss": instrument.pointing_loss}
+    # The factors on light and sky are linear in their values.
+    mean, upper = (1.0 + float(process.change(at, np.array(x))) for x in (prior.mean, prior.mean + prior.sd))
+    return course, process.of, abs(upper - mean) / mean, mean
+
+
+def stare_of(
+    q: StareQuestion,
+    instrument: Instrument,
+    processes: Processes,
+    *,
+    orbit: OrbitQuestion,
+    plan: PlanQuestion,
+    usual: bool,
+) -> Stare:
+    """Return the stare of a study's sections; `usual` adds the documented set of unknowns."""
+    from mauvecl.flares.stare import Stare
+
+    priors = [_stare_prior(name, getattr(processes, name), instrument) for name, _ in processes.modulations]
+    spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
+    for course, changed, sd, _ in priors:
+        # Independent normal amplitudes of one change add up to one.
+        spreads[course][changed] = math.hypot(spreads[course].get(changed, 0.0), sd)
+    spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
+    if usual:
+        spreads = {how: documented | spreads[how] for how, documented in DEFAULT_SPREADS.items()}
+
+    names = (*KNOWN_CHANGES, "pointing", "orbit_s")
+    changes: dict[str, Any] = {name: getattr(q, name) for name in names} | spreads
+    changes["frame_s"] = instrument.frame_s
+    if q.along_orbit:
+        stare = _along_orbit(q, orbit, plan, changes)
+    else:
+        n_orbits = math.ceil(q.duration_s / q.orbit_s) if q.orbit_gap_s else 0
+        ends = [(n + 1) * q.orbit_s for n in range(n_orbits)]
+        gaps = [*q.gaps, *((end - q.orbit_gap_s, end) for end in ends)]
+        stare = Stare.of(q.duration_s, temperature_c=instrument.temperature_c, gaps=gaps, **changes)
+    for _, changed, _, mean in priors:
+        name = "temperature_c" if changed == "temperature" else changed
+        value: Any = getattr(stare, name)
+        stare = replace(stare, **{name: value + mean if changed == "temperature" else value * mean})
+    return stare
+
+
+def _along_orbit(q: StareQuestion, orbit: OrbitQuestion, plan: PlanQuestion, changes: dict[str, Any]) -> Stare:
+    """Return the stare at the target of the study's ``orbit``, with gaps and temperatures along the orbit."""
+    from mauvecl.flares.stare import stare_along
+    from mauvecl.study.plan import targets_of
+
+    if q.gaps or q.orbit_gap_s or q.thermal is not None:
+        fault = "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit"
+        raise InputError(fault, key="stare.along_orbit")
+    targets = targets_of(orbit, plan)
+    if len(targets) != 1:
+        fault = f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}"
+        raise InputError(fault, key="stare.along_orbit")
+    return stare_along(orbit.orbit(), targets[0], orbit.start, q.duration_s, limits=orbit.limits, **changes).stare
+
+
+def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
+    """Return messages about the orbit of a stare with `along_orbit`."""
+    from mauvecl.host.orbit.orbit import TimeGrid
+
+    if not stare.along_orbit:
+        return []
+    times = TimeGrid(orbit.start, stare.duration_s / DAY_S, frame_s)
+    assumed = "Limits, temperatures and windows of a stare along the orbit are assumptions"
+    return [*orbit.orbit().messages(times), f"{assumed}; stray light is not modelled."]
+
+
+def threshold_line(title: str, threshold: float) -> str:
+    """Return the message for a threshold that is raised because of trends that the search does not remove."""
+    return Message(
+        f"FALSE ALARMS of {title} come from what is unknown of the stare, too: the search does not marginalise over "
+        "all of it (see search.cycle, slope, offset and window_s). The threshold of "
+        f"{threshold:.2f} allows for it, so that alarms are as often as asked for to a factor of 1.5.",
+        "false alarms",
+    )
