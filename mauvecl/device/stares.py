@@ -33,10 +33,17 @@ class Stares:
 
     Parameters
     ----------
-    device, progress, tile, width : optional
-        As for `Engine`, in stares instead of realisations; the device may also be an open one.
+    device : str or Device, optional
+        Number or name, as for `Engine`, or an open device.
+    progress, tile, width : optional
+        As for `Engine`, in stares instead of realisations.
     tiles : Tiles, optional
         Division of the work, instead of `progress` and `tile`.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such device, or its driver does not work.
 
     Examples
     --------
@@ -89,10 +96,14 @@ class Stares:
 
         Parameters
         ----------
+        components : Components
+        stare : Stare
         flare : ndarray, shape (n_frame, n_flare) or (count, n_frame, n_flare), optional
             Amplitude of each flare spectrum in each frame, common to all stares or per stare.
         first, count : int
             Range of stares; each stare depends only on the seed and its number.
+        seed : int
+            0 to 2**64 - 1.
         method : {"pixels", "cumulants"}
             Draw every pixel, or the sums directly from their cumulants. The conditions of frames are equal for both.
         amplitudes : ndarray, shape (n_scenario, count) or (n_scenario, 1), optional

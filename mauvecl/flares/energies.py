@@ -88,14 +88,22 @@ class EnergyScale:
         ----------
         source : Source
             Spectrum at the magnitude of the star.
+        distance_pc : float
+        band : str
         flare_k : float
             Temperature of the flare's blackbody.
         flare : FlareSpectrum, optional
             Spectrum of the flare, instead of a blackbody.
+        kind : {"band", "bolometric"}
         geometry : {"added", "replaces"}
             As for `Source.flaring`. The replaced photosphere is subtracted; for bolometric energies it is a blackbody.
         photosphere_k : float, optional
             For ``replaces``; the source's `temperature_k` by default.
+
+        Raises
+        ------
+        InputError
+            For an impossible value, a spectrum without a scale, or a band that it does not cover.
         """
         if source.unscaled:
             raise InputError(
@@ -300,6 +308,8 @@ class PowerLaw(Rates):
 
     Attributes
     ----------
+    alpha : float
+        Above 1.
     log10_beta : float
         Logarithm of beta in flares per day and erg^(alpha - 1).
     largest_erg : float
@@ -418,8 +428,15 @@ def davenport2019(
 ) -> PowerLaw:
     """Return the rates for a mass and an age of Davenport et al. 2019 (arXiv 1901.00890), in the Kepler band.
 
-    log10 nu = a log10 E + b, a = -.07 log10 t + .79 m - 1.06, b = 2.01 log10 t - 25.15 m + 33.99. The relation was
-    fitted to stars of about 0.4 to 1.1 solar masses, and overestimates the rate of the Sun.
+    log10 nu = a log10 E + b, a = -.07 log10 t + .79 m - 1.06, b = 2.01 log10 t - 25.15 m + 33.99. The relation
+    overestimates the rate of the Sun.
+
+    Parameters
+    ----------
+    mass_msun : float
+        0.1 to 1.5; the relation was fitted to stars of about 0.4 to 1.1.
+    age_myr : float
+        1 to 13 800.
     """
     t = float(np.log10(age_myr))
     slope, offset = -0.07 * t + 0.79 * mass_msun - 1.06, 2.01 * t - 25.15 * mass_msun + 33.99

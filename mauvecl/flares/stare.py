@@ -50,6 +50,7 @@ class Event:
         Factor on the shape: relative rise of the photons in the flare's band.
     temperature : float or Cooling
         K.
+    shape : Shape or str
 
     Examples
     --------
@@ -295,6 +296,7 @@ class Stare:
     ----------
     start_s : ndarray, shape (n_frame,)
         Start of each frame from the start of the stare: ascending multiples of `frame_s`, without frames in gaps.
+    frame_s : float
     star, light, sky : ndarray, shape (n_frame,)
         Known factors on the light of the star, on all light, and on the sky.
     temperature_c : ndarray, shape (n_frame,)
@@ -385,6 +387,7 @@ class Stare:
         ----------
         duration_s : float
             From the first frame to the end of the last, rounded up to whole frames.
+        frame_s : float
         gaps : sequence of (float, float)
             Start and end of gaps, s; frames that overlap a gap are lost.
         temperature_c : float
@@ -404,6 +407,11 @@ class Stare:
             middle, and of the sine and cosine of an unknown orbital cycle.
         pointing : PointingDrifts, optional
             Drifts out of the fibre with re-acquisitions.
+
+        Raises
+        ------
+        InputError
+            If the gaps leave no frame, or for an invalid value.
         """
         start = _starts(duration_s, float(frame_s), gaps)
 
@@ -548,20 +556,30 @@ def stare_along(
     particles: Particles | None = None,
     **unknowns: Any,
 ) -> OrbitStare:
-    """Compute the stare at a target along an orbit; raises InputError if the target is never visible.
+    """Compute the stare at a target along an orbit.
 
     Parameters
     ----------
+    orbit : Orbit
     target : Target or str
         A name of the embedded list, or coordinates.
     start : str
         ISO 8601, UTC.
     duration_s : float
         From the first frame, including times at which the target is not visible.
+    frame_s : float
+    limits : Limits, optional
+        Conditions for the target to be visible.
     thermal : Thermal, optional
         Response of the detector temperature to sunlight and shadow; assumed by default.
+    particles : Particles, optional
     **unknowns
         Arguments of `Stare.of`: variability, throughput, sky, jitters, offsets, drifts, cycles.
+
+    Raises
+    ------
+    InputError
+        If the target is never visible.
     """
     for name in ("gaps", "temperature_c"):
         if name in unknowns:

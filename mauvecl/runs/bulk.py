@@ -94,13 +94,18 @@ def realise(
     study : Study
         Its ``run.realisations`` is the number of rows of each array, and its ``bulk`` selects the stored data.
     path : str or Path
-        A new folder, or an unfinished store of the same study; without other files, and not being written.
+        A new folder, or an unfinished store of the same study.
     resume : bool
         Whether to complete an unfinished store; otherwise it raises InputError.
     restart : bool
         Whether to remove an existing store first, even one of another study.
     progress : callable, optional
         Called as ``progress(done, total)`` in spectra. It may raise to stop the work, which keeps written chunks.
+
+    Raises
+    ------
+    InputError
+        If the folder contains other files, is being written by another process, or cannot be written.
     """
     with _completed(Store(Path(path), study), engine, resume, restart, progress) as store:
         return store
@@ -248,13 +253,12 @@ def verify(
     rows: tuple[int, int] | None = None,
     progress: Progress | None = None,
 ) -> list[Fault]:
-    """Check every file of a store, and optionally repair it; `engine` is needed to repair or redraw.
-
-    Raises InputError if copies of the store's study contradict each other, if the study does not draw what was written,
-    or if more than `MAX_MISSING` chunks are missing.
+    """Check every file of a store, and optionally repair it.
 
     Parameters
     ----------
+    engine : Engine or Pool, optional
+        Required to repair or redraw.
     repair : bool
         Whether to write faulty files again.
     redraw : bool
@@ -263,6 +267,13 @@ def verify(
         Half-open range of realisations to which the check of chunks is restricted.
     progress : callable, optional
         Called as ``progress(done, total)`` in chunks.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a store, is being written, or cannot be written for a repair; if copies of its study
+        contradict each other, or the study does not draw what was written; or if more than `MAX_MISSING` chunks are
+        missing.
     """
     if engine is None and (repair or redraw):
         raise InputError("repairing and redrawing need an engine, but none is given", key="engine")
@@ -347,10 +358,14 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
 
 @validated
 def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
-    """Open an array of spectra by its path, as an xarray.DataArray that is read from disk on access.
+    """Open an array of spectra, which is read from disk on access.
 
-    It holds raw DN, with dimensions (realisation, pixel) or (realisation, frame, pixel) and the wavelengths, nm, as a
-    coordinate. ``.values`` is a NumPy array, also of a slice.
+    The array has a path such as ``"star-1/flare-2"``.
+
+    Returns
+    -------
+    xarray.DataArray, dimensions (realisation, pixel) or (realisation, frame, pixel)
+        Raw DN, with the wavelengths, nm, as a coordinate. ``.values`` is a NumPy array, also of a slice.
     """
     import xarray
 
@@ -378,9 +393,20 @@ class Selection:
 
     @classmethod
     def of(cls, store: Store, scenes: Sequence[str] | None = None, rows: tuple[int, int] | None = None) -> Selection:
-        """Select arrays of a store, such as ``"star-1/flare-2"``, and a half-open range of rows; all by default.
+        """Select arrays and rows of a store; the default is everything.
 
-        Raises InputError for a size above `MAX_BYTES` and for missing chunks.
+        Parameters
+        ----------
+        store : Store
+        scenes : sequence of str, optional
+            Paths such as ``"star-1/flare-2"``.
+        rows : (int, int), optional
+            Half-open range of realisations.
+
+        Raises
+        ------
+        InputError
+            For an unknown array, an invalid range, a size above `MAX_BYTES`, or missing chunks.
         """
         first, stop = store.range_of(rows)
         chosen = [store.scene(name) for name in scenes] if scenes else store.scenes
@@ -417,11 +443,21 @@ class Selection:
 
 @validated
 def export(selection: Selection, path: str | Path, *, replace: bool = False) -> Path:
-    """Write spectra, calibration and origin to a file whose name ends in .fits, .h5 or .hdf5, atomically.
+    """Write spectra, calibration and origin to a file, atomically.
 
-    A FITS file has an image per array, whose spectral axis refers to a table of wavelengths (-TAB, FITS standard,
-    section 8.3), and a table of the calibration per star. Raises InputError if the file exists, unless `replace` is
-    true.
+    Parameters
+    ----------
+    selection : Selection
+    path : str or Path
+        File name ending in .fits, .h5 or .hdf5. A FITS file has an image per array, whose spectral axis refers to a
+        table of wavelengths (-TAB, FITS standard, section 8.3), and a table of the calibration per star.
+    replace : bool
+        Whether to replace an existing file.
+
+    Raises
+    ------
+    InputError
+        For another ending, or if the file exists or cannot be written.
     """
     path = Path(path)
     if path.suffix not in ENDINGS:
