@@ -128,8 +128,8 @@ MUTATIONS: dict[str, Mutation] = {
     "half a failed shard kept": (
         "test_failed_launch_is_repeated",
         (
-            "        tally, samples = Tally(plan.grids), plan.tails()\n",
-            "        tally, samples = vars(request).setdefault('_kept', (Tally(plan.grids), plan.tails()))\n",
+            "        tally = plan.tally()\n",
+            "        tally = vars(request).setdefault('_kept', plan.tally())\n",
         ),
     ),
     "far values lost": (

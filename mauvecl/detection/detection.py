@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -323,10 +323,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             f"of {self.quiet.name!r}, {flares} flare{'s'[: flares != 1]} by {names}, {self.realisations} realisations"
         )
 
-    def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
-        """Add the distributions and tails of one batch."""
+    def collect(self, plan: ChannelPlan, tally: Tally, samples: Mapping[int, TailSamples]) -> None:
+        """Add the distributions and extremes of one batch."""
         self._distributions |= {key: tally.distribution(index) for index, key in enumerate(plan.keys)}
-        self._samples |= {key: kept for key, kept in zip(plan.keys, samples, strict=True) if kept is not None}
+        self._samples |= {plan.keys[index]: kept for index, kept in samples.items()}
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """Return the simulated distribution of a statistic.

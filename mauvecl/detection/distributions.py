@@ -137,13 +137,21 @@ GROWTH = 1.0
 NEGLIGIBLE = 40.0
 #: Points computed at once, and the largest value of t.
 BLOCK, MAX_T = 32, 80.0
-#: Largest number of Newton steps, and their tolerance in the logarithm of a quantile.
-MAX_STEPS, STEP_TOLERANCE = 200, 1e-10
 
 
-#: Limits of the precomputed transform: distance from the mean in standard deviations, least number of effective terms,
-#: least probability.
-NEAR, MANY, RARE = 40.0, 30.0, 1e-9
+def _falling_root(off: Callable[[float], float], start: float, step: float) -> float:
+    """Return the root of a falling function to 1e-8 of a step, searched outwards from `start` in growing steps."""
+    from scipy.optimize import brentq
+
+    off = cache(off)
+    low = high = start
+    width = step
+    while off(low) < 0:
+        low, high, width = low - width, low, 2 * width
+    width = step
+    while off(high) > 0:
+        low, high, width = high, high + width, 2 * width
+    return float(brentq(off, low, high, xtol=1e-8 * step)) if low < high else low
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,59 +179,28 @@ class QuadraticForm:
         """Number of equal terms with the same relative scatter: (sum of weights)^2 / sum of squared weights."""
         return float(self.weight.sum() ** 2 / np.sum(self.weight**2))
 
-    def sf(self, value: float, *, relative: bool = True) -> float:
-        """Return the probability of exceeding `value`; if not `relative`, an error of 1e-15 is enough.
-
-        For many terms and values near the mean, the characteristic function is inverted by a trapezoidal sum (Davies
-        1973, doi 10.1093/biomet/60.2.415), whose terms are computed once for all values. Its aliasing error is the
-        probability of a distance above 2 pi / spacing. The spacing makes this distance 40 standard deviations, for an
-        error below 1e-15 with ten terms or more, and the sum ends when its terms are below 1e-15. Otherwise the
-        contour integral is used, which is accurate far in the tail.
-        """
+    def sf(self, value: float) -> float:
+        """Return the probability of exceeding `value`."""
         if value <= 0.0:
             return 1.0
-        if self._chi_squared:
-            return float(special.chdtrc(self.weight.size, value))
-        if self.effective_terms >= MANY:
-            above = float(value < self.mean)
-            if abs(value - self.mean) <= NEAR * self.std:
-                u, size, phase = self._transform
-                above = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
-            if above >= RARE or not relative:
-                return min(max(above, 0.0), 1.0)
         upper = value > self.mean
-        tail = float(np.exp(self._tail(value / self._unit, upper=upper)[0]))
+        tail = float(np.exp(self._log_tail(value / self._unit, upper=upper)))
         return tail if upper else 1.0 - tail
 
     def isf(self, probability: float) -> float:
         """Return the value that is exceeded with a probability in (0, 1)."""
-        if self._chi_squared:
-            return float(special.chdtri(self.weight.size, probability))
-        if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
-            from scipy.optimize import brentq
-
-            low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
-            return float(brentq(lambda x: self.sf(x) - probability, low, high, xtol=1e-9 * self.std))
         upper = probability <= 0.5
         tail = probability if upper else 1.0 - probability
         # Start from a gamma distribution of the same mean and variance.
         mean, variance = self.mean / self._unit, (self.std / self._unit) ** 2
         start = (special.gammainccinv if upper else special.gammaincinv)(mean**2 / variance, tail)
         at = float(np.log(max(start * variance / mean, 1e-300)))
-        # The logarithm of the tail is concave in that of the value, so Newton steps converge.
-        for _ in range(MAX_STEPS):
-            mass, ratio = self._tail(float(np.exp(at)), upper=upper)
-            # The derivative of the logarithm of the tail with respect to that of the value is -+ ratio * value.
-            step = (mass - float(np.log(tail))) / (ratio * float(np.exp(at))) * (1.0 if upper else -1.0)
-            if abs(step) <= STEP_TOLERANCE:
-                return self._unit * float(np.exp(at + step))
-            at += float(np.clip(step, -3.0, 3.0))
-        raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
 
-    @cached_property
-    def _chi_squared(self) -> bool:
-        """True for a central chi-squared variable with as many degrees of freedom as terms."""
-        return bool(np.all(self.weight == 1.0)) and not self.shift.any()
+        def off(log_value: float) -> float:
+            above = self._log_tail(float(np.exp(log_value)), upper=upper) - float(np.log(tail))
+            return above if upper else -above
+
+        return self._unit * float(np.exp(_falling_root(off, at, 1e-2)))
 
     @cached_property
     def _unit(self) -> float:
@@ -237,29 +214,8 @@ class QuadraticForm:
         count, push = (np.bincount(member, of, values.size).astype(np.float64) for of in (None, self.shift**2))
         return values, count, push
 
-    @cached_property
-    def _transform(self) -> tuple[Float, Float, Float]:
-        """Frequencies, and modulus and phase of the characteristic function, for values near the mean."""
-        spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
-        weight, count, push = self._distinct
-        weight = self._unit * weight
-        pull = weight * push
-        parts = []
-        k = 0.5 + np.arange(256)
-        while True:
-            u = k * spacing
-            turn = 2.0 * np.outer(u, weight)
-            spread = 1.0 + turn**2
-            log_size = -0.25 * (np.log(spread) * count).sum(axis=1) - (u[:, None] * turn * pull / spread).sum(axis=1)
-            phase = 0.5 * (np.arctan(turn) * count).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)
-            parts.append((u, np.exp(log_size) / k, phase))
-            k = k + 256
-            if log_size[-1] < np.log(1e-15 * k[0]):
-                us, sizes, phases = zip(*parts, strict=True)
-                return np.concatenate(us), np.concatenate(sizes), np.concatenate(phases)
-
-    def _tail(self, value: float, *, upper: bool) -> tuple[float, float]:
-        """Return the natural logarithm of the probability above or below a positive value, and density / probability.
+    def _log_tail(self, value: float, *, upper: bool) -> float:
+        """Return the natural logarithm of the probability above or below a positive value.
 
         The result has full precision in the tail that does not contain the mean.
         """
@@ -268,35 +224,33 @@ class QuadraticForm:
         bend = self._derivative(left, 3) / (6.0 * self._derivative(left, 2))
         scale = 1.0 / np.sqrt(self._derivative(left, 2) + 1.0 / (0.5 - gap) ** 2)
         top = float(self._exponent(np.array([gap + 0j]), value, upper)[0].real)
-        while np.isnan(mass := self._integral(value, upper, (gap, bend, scale), top))[0]:
+        while np.isnan(mass := self._integral(value, upper, (gap, bend, scale), top)):
             bend = bend / 4 if bend * scale > 1e-6 else 0.0
-        probability, density = mass.tolist()
-        return top + float(np.log(probability / np.pi)), density / probability
+        return top + float(np.log(mass / np.pi))
 
-    def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> Float:
-        """Integrate probability and density divided by exp(top); NaN if the integrand grows on the contour."""
+    def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> float:
+        """Integrate the probability divided by exp(top); NaN if the integrand grows on the contour."""
         gap, bend, scale = path
 
-        def summed(first: float, step: float) -> Float:
-            """Sum both integrands over points first, first + step, ... until they are negligible."""
-            total = np.zeros(2)
+        def summed(first: float, step: float) -> float:
+            """Sum the integrand over points first, first + step, ... until it is negligible."""
+            total = 0.0
             while True:
                 t = first + step * np.arange(BLOCK)
                 y = scale * np.sinh(t)
-                s_gap = gap - bend * y**2 - 1j * y
-                exponent = self._exponent(s_gap, value, upper) - top
+                exponent = self._exponent(gap - bend * y**2 - 1j * y, value, upper) - top
                 if exponent.real.max() > GROWTH:
-                    return np.full(2, np.nan)
-                size = np.exp(exponent) * (1.0 - 2j * bend * y) * scale * np.cosh(t)
+                    return np.nan
+                size = (np.exp(exponent) * (1.0 - 2j * bend * y)).real * scale * np.cosh(t)
                 size[t == 0.0] /= 2
-                total += np.sum(size.real), np.sum((size * (0.5 - s_gap if upper else s_gap - 0.5)).real)
+                total += float(size.sum())
                 if exponent[-1].real + 2 * t[-1] < -NEGLIGIBLE or t[-1] > MAX_T:
                     return total
                 first = t[-1] + step
 
         step, total, before = STEP, summed(0.0, STEP), 0.0
         for _ in range(HALVINGS):
-            mass = float(total[0]) * step
+            mass = total * step
             if np.isnan(mass) or abs(mass - before) <= TOLERANCE * before:
                 break
             before, total, step = mass, total + summed(step / 2, step), step / 2
@@ -385,16 +339,7 @@ class Mixture:
         if self._normal is not None:
             mean, std = self._normal
             return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
-        # Parts that hardly contribute need no relative precision.
-        for relative in (False, True):
-            each = [
-                part.sf(value, relative=relative) if isinstance(part, QuadraticForm) else part.sf(value)
-                for part in self.parts
-            ]
-            above = float(self.weights @ each)
-            if above >= RARE:
-                break
-        return min(above, 1.0)
+        return min(float(self.weights @ [part.sf(value) for part in self.parts]), 1.0)
 
     @cached_property
     def _normal(self) -> Float | None:
@@ -404,22 +349,13 @@ class Mixture:
         return np.array([(part.mean, part.std) for part in self.parts]).T
 
     def isf(self, probability: float) -> float:
-        from scipy.optimize import brentq
-
-        @cache
         def off(value: float) -> float:
             return float(np.log(max(self.sf(value), 1e-300) / probability))
 
         # From the quantile of a normal distribution with the same skewness (Cornish & Fisher 1938), outwards.
         z = -float(special.ndtri(probability))
-        low = high = self.mean + self.std * z + (z**2 - 1.0) * self.third / (6.0 * self.std**2)
-        step = 0.01 * self.std
-        while off(low) < 0:
-            low, high, step = low - step, low, 4 * step
-        step = 0.01 * self.std
-        while off(high) > 0:
-            low, high, step = high, high + step, 4 * step
-        return float(brentq(off, low, high, xtol=1e-9 * self.std)) if low < high else low
+        start = self.mean + self.std * z + (z**2 - 1.0) * self.third / (6.0 * self.std**2)
+        return _falling_root(off, start, 0.02 * self.std)
 
 
 #: Closed form of a statistic's distribution.

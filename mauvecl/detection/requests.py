@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
-from mauvecl.detection.counts import TailSamples, grids_of
+from mauvecl.detection.counts import TailSamples, Tally, grids_of
 from mauvecl.detection.distributions import Form
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
@@ -203,11 +203,10 @@ class ChannelPlan:
     # Row of chi-squared, and first and one past the last row whose squares are subtracted from it, shape (3, n).
     subtractions: NDArray[np.uint32]
 
-    def tails(self) -> list[TailSamples | None]:
-        """Return accumulators of each grid's extremes: the largest values of a null, the smallest of a flare."""
-        return [
-            None if role == "flare_on_null_grid" else TailSamples(largest=role == "null") for _, role, _ in self.keys
-        ]
+    def tally(self) -> Tally:
+        """Return the empty tally of the grids, with the largest values of nulls and the smallest of flares."""
+        roles = {index: role for index, (_, role, _) in enumerate(self.keys) if role != "flare_on_null_grid"}
+        return Tally(self.grids, {index: TailSamples(largest=role == "null") for index, role in roles.items()})
 
     @property
     def n_rows(self) -> int:

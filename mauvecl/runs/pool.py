@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import Tally
 from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
-from mauvecl.detection.snr import add_detection, counts_of, detection_of, snr_of
+from mauvecl.detection.snr import counts_of, detection_of, snr_of
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import Arrays, map_in_threads
@@ -194,9 +193,9 @@ class Pool:
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
         request = DetectRequest.of(quiet, flares, **how)
-        sums = [(Tally(plan.grids), plan.tails()) for plan, _ in request.plans]
-        self._add_up(request, lambda part, shard: add_detection(*sums[part], shard))
-        return detection_of(request, sums)
+        tallies = [plan.tally() for plan, _ in request.plans]
+        self._add_up(request, lambda part, shard: tallies[part].merge(shard))
+        return detection_of(request, tallies)
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """Compute distributions of the S/N; parameters as for `Engine.snr`."""
