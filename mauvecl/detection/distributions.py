@@ -130,13 +130,13 @@ def _orthant(h: float, k: float, correlation: float) -> float:
 #: Relative change of the integral at which refinement stops.
 TOLERANCE = 1e-11
 #: First step and largest number of halvings; sinh(t) distributes the points over all scales of an uneven sum.
-STEP, HALVINGS = 0.25, 9
+STEP, HALVINGS = 0.125, 8
 #: Growth of the integrand's logarithm along the contour beyond which the contour is bent less.
 GROWTH = 1.0
 #: Decrease of the integrand's logarithm at which the sum ends.
 NEGLIGIBLE = 40.0
 #: Points computed at once, and the largest value of t.
-BLOCK, MAX_T = 32, 80.0
+BLOCK, MAX_T = 64, 80.0
 
 
 def _falling_root(off: Callable[[float], float], start: float, step: float) -> float:
@@ -296,7 +296,8 @@ class QuadraticForm:
             low *= 2
         while sign * slope(high) < 0:
             high *= 2
-        return gap(float(brentq(slope, low, high, rtol=1e-10)))
+        # The contour may pass near the minimum.
+        return gap(float(brentq(slope, low, high, xtol=0.01)))
 
 
 @dataclass(frozen=True)
