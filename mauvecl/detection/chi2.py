@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import orth, solve_triangular
 
 from mauvecl.detection.distributions import QuadraticForm
-from mauvecl.detection.statistics import Differences, Setting, Statistic, Tilt
+from mauvecl.detection.statistics import Differences, Setting, Statistic
 from mauvecl.host.arrays import Float
 
 if TYPE_CHECKING:
@@ -100,11 +100,11 @@ class Chi2(Statistic):
         model = self._grouped(setting, self.variance(setting) * setting.used)
         return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting)))
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float]:
         from scipy.sparse import eye_array
 
         directions = eye_array(setting.used.size, format="csr")[setting.used]
-        return Tilt(directions, np.ones(directions.shape[0]))
+        return directions, np.ones(directions.shape[0])
 
     def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         """Return the coefficient of each pixel's squared difference, per DN^2, shape (n_pixel,)."""
@@ -165,11 +165,11 @@ class Chi2Element(Chi2):
     def dof(self, setting: Setting) -> int:
         return int(np.unique(setting.quiet.element[setting.used]).size) - setting.n_free
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float]:
         element = setting.quiet.element
         member = element[None, :] == np.unique(element[setting.used])[:, None]
         directions = member * np.sqrt(self.variance(setting)) * setting.used
-        return Tilt(directions / np.linalg.norm(directions, axis=1)[:, None], np.ones(len(directions)))
+        return directions / np.linalg.norm(directions, axis=1)[:, None], np.ones(len(directions))
 
 
 class Chi2Pair(Chi2):
@@ -336,11 +336,11 @@ class Paper(Statistic):
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         return np.asarray((x @ self.smoothing(setting).rows.T) ** 2 @ self.scale(setting, flare))
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float]:
         sd, scale = np.sqrt(self.variance(setting)) * setting.used, self.scale(setting, flare)
         square, vectors = self.smoothing(setting).modes(scale, sd**2)
         modes = vectors.T @ (np.sqrt(scale)[:, None] * self.smoothing(setting).rows)
-        return Tilt(modes * sd / np.sqrt(square)[:, None], square)
+        return modes * sd / np.sqrt(square)[:, None], square
 
     def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         return np.asarray(self.scale(setting, flare) @ self.smoothing(setting).rows ** 2)

@@ -323,31 +323,30 @@ class Mixture:
     weights: Float  # probability of each part, shape (n,)
 
     @cached_property
+    def _moments(self) -> Float:
+        """Mean, standard deviation and third central moment of each part, shape (3, n)."""
+        return np.array([(part.mean, part.std, part.third) for part in self.parts]).T
+
+    @cached_property
     def mean(self) -> float:
-        return float(self.weights @ [part.mean for part in self.parts])
+        return float(self.weights @ self._moments[0])
 
     @cached_property
     def std(self) -> float:
-        return float(np.sqrt(self.weights @ [part.std**2 + (part.mean - self.mean) ** 2 for part in self.parts]))
+        mean, std, _ = self._moments
+        return float(np.sqrt(self.weights @ (std**2 + (mean - self.mean) ** 2)))
 
     @cached_property
     def third(self) -> float:
-        away = [part.mean - self.mean for part in self.parts]
-        each = [part.third + 3.0 * d * part.std**2 + d**3 for part, d in zip(self.parts, away, strict=True)]
-        return float(self.weights @ each)
+        mean, std, third = self._moments
+        away = mean - self.mean
+        return float(self.weights @ (third + 3.0 * away * std**2 + away**3))
 
     def sf(self, value: float) -> float:
-        if self._normal is not None:
-            mean, std = self._normal
-            return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
-        return min(float(self.weights @ [part.sf(value) for part in self.parts]), 1.0)
-
-    @cached_property
-    def _normal(self) -> Float | None:
-        """Means and standard deviations if all parts are normal, shape (2, n)."""
-        if not all(isinstance(part, Gaussian) for part in self.parts):
-            return None
-        return np.array([(part.mean, part.std) for part in self.parts]).T
+        mean, std, third = self._moments
+        # Normal parts, of which there may be thousands, have no skewness.
+        above = [part.sf(value) for part in self.parts] if third.any() else special.ndtr((mean - value) / std)
+        return min(float(self.weights @ above), 1.0)
 
     def isf(self, probability: float) -> float:
         def off(value: float) -> float:

@@ -59,17 +59,6 @@ class Setting:
         return cast("T", self._cache[name, id(flare)][1])
 
 
-@dataclass(frozen=True, eq=False)
-class Tilt:
-    """Directions along which importance sampling shifts or stretches the noise."""
-
-    # Orthonormal in standard deviations of each pixel's difference, dense or sparse, shape (n_direction, n_pixel).
-    directions: Any
-    # Coefficients of squared standard normals along the directions in a quadratic statistic, shape (n_direction,).
-    square: Float | None = None
-    per_sigma: float = 1.0  # change of a linear statistic for one standard deviation along its direction
-
-
 class DetectionForms(NamedTuple):
     """Distributions of a statistic without and with a flare for Gaussian noise, and its threshold."""
 
@@ -197,8 +186,12 @@ class Statistic(ABC):
         """Compute the statistic of differences, DN, divided by variances, DN^2, both (n, n_pixel), shape (n,)."""
 
     @abstractmethod
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
-        """Return the directions of importance sampling."""
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float | None]:
+        """Return the directions along which importance sampling shifts or stretches the noise, and their squares.
+
+        The directions, dense or sparse and of the shape (n_direction, n_pixel), are orthonormal in standard deviations
+        of each pixel's difference. A quadratic statistic has coefficients of squared standard normals along them.
+        """
 
 
 class LinearStatistic(Statistic):
@@ -269,10 +262,9 @@ class LinearStatistic(Statistic):
         total = x @ weights
         return np.asarray(total / np.sqrt(variance @ weights**2) if setting.comparison.estimated else total)
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, None]:
         along = self.weights_per_dn(setting, flare) * np.sqrt(self.variance(setting))
-        length = float(np.linalg.norm(along))
-        return Tilt((along / length)[None], per_sigma=1.0 if setting.comparison.estimated else length)
+        return (along / np.linalg.norm(along))[None], None
 
 
 #: Range of `uv_excess`, nm.
