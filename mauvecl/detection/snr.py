@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -181,9 +182,12 @@ class SnrResult(Drawable, ContentEquality):
 
     expectation: Expectation
     scene: Scene
-    observers: NDArray[np.void]  # layout.OBSERVER, shape (n_padded,)
-    elements: NDArray[np.void]  # layout.ELEMENT, shape (n_element,)
     counts: Counts
+
+    @cached_property
+    def observers(self) -> NDArray[np.void]:
+        """Structures of `observers`."""
+        return observers(self.expectation, self.scene)
 
     @property
     def pixel(self) -> QTable:
@@ -207,12 +211,11 @@ class SnrResult(Drawable, ContentEquality):
     @property
     def element(self) -> QTable:
         """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
-        x = self.expectation
-        per_unit = self.elements["bins_per_unit"]
-        step = np.divide(1.0, per_unit, out=np.zeros(len(per_unit)), where=per_unit > 0)
+        x, every = self.expectation, elements(self.expectation)
+        step = np.divide(1.0, every["bins_per_unit"], out=np.zeros(len(every)), where=every["bins_per_unit"] > 0)
 
         def snr(which: int, place: NDArray[np.number]) -> Float:
-            return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
+            return np.asarray(every["centre"][which] + step[which] * (place - 0.5))
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
@@ -242,12 +245,6 @@ class SnrResult(Drawable, ContentEquality):
 def counts_of(request: SnrRequest) -> Counts:
     """Return the empty histograms of a request."""
     return Counts(request.scene.n_pixel, request.expectation.element_wavelength_nm.size)
-
-
-def snr_of(request: SnrRequest, counts: Counts) -> SnrResult:
-    """Return the result of a request from its histograms."""
-    x, scene = request.expectation, request.scene
-    return SnrResult(x, scene, observers(x, scene), elements(x), counts)
 
 
 def detection_of(request: DetectRequest, tallies: Iterable[Tally]) -> Detection:

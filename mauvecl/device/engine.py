@@ -200,7 +200,8 @@ class Engine:
             See `Drawing`.
         """
         request = requests.SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
-        return snr.snr_of(request, self._snr(request, requests.Shard(0, request.start, request.realisations)))
+        counts = self._snr(request, requests.Shard(0, request.start, request.realisations))
+        return SnrResult(request.expectation, request.scene, counts)
 
     def _snr(self, request: requests.SnrRequest, shard: requests.Shard) -> Counts:
         x, scene, counts = request.expectation, request.scene, snr.counts_of(request)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from numpy.typing import NDArray
 
 from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
-from mauvecl.detection.snr import counts_of, detection_of, snr_of
+from mauvecl.detection.snr import SnrResult, counts_of, detection_of
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import Arrays, map_in_threads
@@ -26,7 +26,6 @@ from mauvecl.schema.fields import Range, Realisations
 
 if TYPE_CHECKING:
     from mauvecl.detection.detection import Detection
-    from mauvecl.detection.snr import SnrResult
     from mauvecl.device.stares import Stares
     from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation
@@ -202,7 +201,7 @@ class Pool:
         request = SnrRequest.of(expectation, **how)
         counts = counts_of(request)
         self._add_up(request, lambda _, shard: counts.merge(shard))
-        return snr_of(request, counts)
+        return SnrResult(request.expectation, request.scene, counts)
 
     def stares(self, request: StaresRequest) -> Arrays:
         """Reduce all stares of a request; see `Stares.reduced`."""
