@@ -240,11 +240,6 @@ class Smoothing:
         """Return the factors of squared smoothed DN in the sum of (F - Q)^2 / F in DN/s, shape (n_centre,)."""
         return np.asarray(self._inverse_flare(flare) @ self.between)
 
-    def form(self, scale: Float, delta: Float, variance: Float) -> QuadraticForm:
-        """Return the distribution of the sum for Gaussian noise with a mean and variance per pixel."""
-        weight, vectors = self.modes(scale, variance)
-        return QuadraticForm(weight, (np.sqrt(scale) * (self.weights @ delta)) @ vectors / np.sqrt(weight))
-
     def modes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
         """Return the variances of the sum's independent modes, and their weights per centre, (n_centre, n_mode)."""
         # The covariance of the smoothed values times the roots of their factors.
@@ -331,7 +326,9 @@ class Paper(Statistic):
         return int(setting.used.sum())
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
-        return self.smoothing(setting).form(self.scale(setting, flare), seen.mean, seen.variance)
+        smoothing, scale = self.smoothing(setting), self.scale(setting, flare)
+        weight, vectors = smoothing.modes(scale, seen.variance)
+        return QuadraticForm(weight, (np.sqrt(scale) * (smoothing.weights @ seen.mean)) @ vectors / np.sqrt(weight))
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         return np.asarray((x @ self.smoothing(setting).rows.T) ** 2 @ self.scale(setting, flare))
