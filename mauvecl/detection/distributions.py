@@ -137,6 +137,10 @@ GROWTH = 1.0
 NEGLIGIBLE = 40.0
 #: Points computed at once, and the largest value of t.
 BLOCK, MAX_T = 64, 80.0
+#: Bisections towards a contour's saddle point, near which it may pass.
+BISECTIONS = 18
+#: Distributions of a mixture that are integrated at once.
+TOGETHER = 64
 
 
 def _falling_root(off: Callable[[float], float], start: float, step: float) -> float:
@@ -181,123 +185,131 @@ class QuadraticForm:
 
     def sf(self, value: float) -> float:
         """Return the probability of exceeding `value`."""
-        if value <= 0.0:
-            return 1.0
-        upper = value > self.mean
-        tail = float(np.exp(self._log_tail(value / self._unit, upper=upper)))
-        return tail if upper else 1.0 - tail
+        return float(self._tails.above(value)[0])
 
     def isf(self, probability: float) -> float:
         """Return the value that is exceeded with a probability in (0, 1)."""
-        upper = probability <= 0.5
-        tail = probability if upper else 1.0 - probability
+        upper = np.array([probability <= 0.5])
+        tail = probability if upper[0] else 1.0 - probability
         # Start from a gamma distribution of the same mean and variance.
-        mean, variance = self.mean / self._unit, (self.std / self._unit) ** 2
-        start = (special.gammainccinv if upper else special.gammaincinv)(mean**2 / variance, tail)
-        at = float(np.log(max(start * variance / mean, 1e-300)))
+        shape, scale = (self.mean / self.std) ** 2, self.std**2 / self.mean
+        start = (special.gammainccinv if upper[0] else special.gammaincinv)(shape, tail)
 
         def off(log_value: float) -> float:
-            above = self._log_tail(float(np.exp(log_value)), upper=upper) - float(np.log(tail))
-            return above if upper else -above
+            more = float(self._tails.logarithms(float(np.exp(log_value)), upper)[0] - np.log(tail))
+            return more if upper[0] else -more
 
-        return self._unit * float(np.exp(_falling_root(off, at, 1e-2)))
-
-    @cached_property
-    def _unit(self) -> float:
-        """Largest weight, the unit of the distinct weights and of arguments of the contour integral."""
-        return float(self.weight.max())
+        return float(np.exp(_falling_root(off, float(np.log(max(start * scale, 1e-300))), 1e-2)))
 
     @cached_property
-    def _distinct(self) -> tuple[Float, Float, Float]:
-        """Distinct weights, the largest of which is 1, the number of squares of each, and the sum of their shifts^2."""
-        values, member = np.unique(self.weight / self._unit, return_inverse=True)
-        count, push = (np.bincount(member, of, values.size).astype(np.float64) for of in (None, self.shift**2))
-        return values, count, push
+    def _tails(self) -> _Tails:
+        return _Tails((self,))
 
-    def _log_tail(self, value: float, *, upper: bool) -> float:
-        """Return the natural logarithm of the probability above or below a positive value.
 
-        The result has full precision in the tail that does not contain the mean.
+class _Tails:
+    """Tails of several quadratic forms, by a contour integral of each.
+
+    Weights, which are in units of the largest of a form, are distinct, and have a number of squares and the sum of
+    their shifts^2; the shape of each array is (n_form, n_weight). Padding has a weight of zero.
+    """
+
+    def __init__(self, forms: Sequence[QuadraticForm]) -> None:
+        self.mean, self.unit = np.array([(form.mean, form.weight.max()) for form in forms]).T
+        distinct = []
+        for form, unit in zip(forms, self.unit, strict=True):
+            values, member = np.unique(form.weight / unit, return_inverse=True)
+            distinct.append((values, np.bincount(member), np.bincount(member, form.shift**2)))
+        size = max(values.size for values, *_ in distinct)
+        padded = np.array([[np.pad(part, (0, size - part.size)) for part in parts] for parts in distinct], np.float64)
+        self.weight, self.count, self.push = padded.transpose(1, 0, 2)
+
+    def above(self, value: float) -> Float:
+        """Return the probabilities of exceeding a value, shape (n_form,)."""
+        if value <= 0.0:
+            return np.ones(self.mean.size)
+        upper = value > self.mean
+        tail = np.exp(self.logarithms(value, upper))
+        return np.where(upper, tail, 1.0 - tail)
+
+    def logarithms(self, value: float, upper: NDArray[np.bool_]) -> Float:
+        """Return the natural logarithms of the probabilities above or below a positive value, shape (n_form,).
+
+        They have full precision in the tail that does not contain the mean.
         """
-        gap = self._saddle(value, upper)
-        left = self._factors(np.array(gap))
-        bend = self._derivative(left, 3) / (6.0 * self._derivative(left, 2))
-        scale = 1.0 / np.sqrt(self._derivative(left, 2) + 1.0 / (0.5 - gap) ** 2)
-        top = float(self._exponent(np.array([gap + 0j]), value, upper)[0].real)
-        while np.isnan(mass := self._integral(value, upper, (gap, bend, scale), top)):
-            bend = bend / 4 if bend * scale > 1e-6 else 0.0
-        return top + float(np.log(mass / np.pi))
+        x = value / self.unit
+        with np.errstate(all="ignore"):
+            gap = self._saddles(x, upper)
+            second, third = (self._derivative(gap, order) for order in (2, 3))
+            bend, scale = third / (6.0 * second), 1.0 / np.sqrt(second + 1.0 / (0.5 - gap) ** 2)
+            top = self._exponent(gap[:, None] + 0j, x, upper)[:, 0].real
+            while np.isnan(mass := self._integrals(x, upper, (gap, bend, scale), top)).any():
+                less = np.where(bend * scale > 1e-6, bend / 4, 0.0)
+                bend = np.where(np.isnan(mass), less, bend)
+            return np.asarray(top + np.log(mass / np.pi))
 
-    def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> float:
-        """Integrate the probability divided by exp(top); NaN if the integrand grows on the contour."""
-        gap, bend, scale = path
+    def _integrals(self, x: Float, upper: NDArray[np.bool_], path: tuple[Float, Float, Float], top: Float) -> Float:
+        """Integrate the probabilities divided by exp(top); NaN if the integrand grows on the contour."""
+        gap, bend, scale = (each[:, None] for each in path)
 
-        def summed(first: float, step: float) -> float:
-            """Sum the integrand over points first, first + step, ... until it is negligible."""
-            total = 0.0
+        def summed(first: float, step: float) -> Float:
+            """Sum the integrands over points first, first + step, ... until they are negligible."""
+            total, grown = np.zeros(x.size), np.zeros(x.size, bool)
             while True:
                 t = first + step * np.arange(BLOCK)
                 y = scale * np.sinh(t)
-                exponent = self._exponent(gap - bend * y**2 - 1j * y, value, upper) - top
-                if exponent.real.max() > GROWTH:
-                    return np.nan
+                exponent = self._exponent(gap - bend * y**2 - 1j * y, x, upper) - top[:, None]
                 size = (np.exp(exponent) * (1.0 - 2j * bend * y)).real * scale * np.cosh(t)
-                size[t == 0.0] /= 2
-                total += float(size.sum())
-                if exponent[-1].real + 2 * t[-1] < -NEGLIGIBLE or t[-1] > MAX_T:
-                    return total
+                size[:, t == 0.0] /= 2
+                total += size.sum(axis=1)
+                grown |= exponent.real.max(axis=1) > GROWTH
+                negligible = exponent[:, -1].real + 2 * t[-1] < -NEGLIGIBLE
+                if (negligible | grown).all() or t[-1] > MAX_T:
+                    return np.where(grown, np.nan, total)
                 first = t[-1] + step
 
-        step, total, before = STEP, summed(0.0, STEP), 0.0
+        step, total, before = STEP, summed(0.0, STEP), np.zeros(x.size)
         for _ in range(HALVINGS):
             mass = total * step
-            if np.isnan(mass) or abs(mass - before) <= TOLERANCE * before:
+            if (np.isnan(mass) | (np.abs(mass - before) <= TOLERANCE * before)).all():
                 break
             before, total, step = mass, total + summed(step / 2, step), step / 2
         return step * total
 
     def _factors(self, gap: NDArray[Any]) -> NDArray[Any]:
-        """Return 1 - 2 weight s for s = 1/2 - gap, without cancellation near the branch point."""
-        weight = self._distinct[0]
-        return np.asarray((1.0 - weight) + 2.0 * np.multiply.outer(gap, weight))
+        """Return 1 - 2 weight s for s = 1/2 - gap, of shape (n_form, n), without cancellation at the branch point."""
+        weight = self.weight[:, None]
+        return np.asarray((1.0 - weight) + 2.0 * gap[..., None] * weight)
 
-    def _exponent(self, gap: NDArray[np.complex128], value: float, upper: bool) -> NDArray[np.complex128]:
-        """Return K(s) - s x - log(+-s)."""
-        (_, count, push), left, s = self._distinct, self._factors(gap), 0.5 - gap
+    def _exponent(self, gap: NDArray[np.complex128], x: Float, upper: NDArray[np.bool_]) -> NDArray[np.complex128]:
+        """Return K(s) - s x - log(+-s), shape of the gap."""
+        left, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
         # Real logarithms and angles are several times faster than complex ones.
         square = left.real**2 + left.imag**2
         log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(left.imag, left.real) @ count)
-        turn = (left.real / square) @ push - push.sum() - 1j * ((left.imag / square) @ push)
-        return np.asarray(-0.5 * log + 0.5 * turn - s * value - np.log(s if upper else -s))
+        turn = (left.real / square) @ push - push.sum(axis=1, keepdims=True) - 1j * ((left.imag / square) @ push)
+        sign = np.where(upper, 1.0, -1.0)[:, None]
+        return np.asarray((0.5 * (turn - log))[..., 0] - s * x[:, None] - np.log(sign * s))
 
-    def _derivative(self, left: Float, order: int) -> float:
-        """Return a derivative of K of order 1 to 3."""
-        weight, count, push = self._distinct
-        return (0.0, 1.0, 2.0, 8.0)[order] * float(((weight / left) ** order * (count + order * push / left)).sum())
+    def _derivative(self, gap: Float, order: int) -> Float:
+        """Return a derivative of K of order 1 to 3, shape (n_form,)."""
+        left = self._factors(gap[:, None])[:, 0]
+        terms = (self.weight / left) ** order * (self.count + order * self.push / left)
+        return np.asarray((0.0, 1.0, 2.0, 8.0)[order] * terms.sum(axis=1))
 
-    def _saddle(self, value: float, upper: bool) -> float:
-        """Return 1/2 - s at the minimum of K(s) - s x - log(+-s) on the real axis.
+    def _saddles(self, x: Float, upper: NDArray[np.bool_]) -> Float:
+        """Return 1/2 - s near the minimum of K(s) - s x - log(+-s) on the real axis, shape (n_form,).
 
         The minimum lies between 0 and the branch point for the upper tail, and below 0 for the lower tail.
         """
-        from scipy.optimize import brentq
-
-        # The parameter v is logarithmic in the distance from 0 and in that from the branch point.
-        def gap(v: float) -> float:
-            return 0.5 * float(special.expit(-v)) if upper else 0.5 + float(np.exp(v))
-
-        def slope(v: float) -> float:
-            s = 0.5 * float(special.expit(v)) if upper else -float(np.exp(v))
-            return self._derivative(self._factors(np.array(gap(v))), 1) - value - 1.0 / s
-
-        sign = 1.0 if upper else -1.0
-        low, high = -1.0, 1.0
-        while sign * slope(low) > 0:
-            low *= 2
-        while sign * slope(high) < 0:
-            high *= 2
-        # The contour may pass near the minimum.
-        return gap(float(brentq(slope, low, high, xtol=0.01)))
+        # The parameter is logarithmic in the distance from 0 and in that from the branch point.
+        low, high = np.full(x.size, -700.0), np.full(x.size, 700.0)
+        for _ in range(BISECTIONS):
+            v = (low + high) / 2
+            s = np.where(upper, 0.5 * special.expit(v), -np.exp(v))
+            gap = np.where(upper, 0.5 * special.expit(-v), 0.5 + np.exp(v))
+            beyond = (self._derivative(gap, 1) - x - 1.0 / s > 0) == upper
+            low, high = np.where(beyond, low, v), np.where(beyond, v, high)
+        return gap
 
 
 @dataclass(frozen=True)
@@ -343,10 +355,18 @@ class Mixture:
         return float(self.weights @ (third + 3.0 * away * std**2 + away**3))
 
     def sf(self, value: float) -> float:
-        mean, std, third = self._moments
-        # Normal parts, of which there may be thousands, have no skewness.
-        above = [part.sf(value) for part in self.parts] if third.any() else special.ndtr((mean - value) / std)
+        mean, std, _ = self._moments
+        above = special.ndtr((mean - value) / std)
+        for places, tails in self._tails:
+            above[places] = tails.above(value)
         return min(float(self.weights @ above), 1.0)
+
+    @cached_property
+    def _tails(self) -> list[tuple[NDArray[np.intp], _Tails]]:
+        """Tails of the quadratic forms among the parts, and the places of these."""
+        forms = {place: part for place, part in enumerate(self.parts) if isinstance(part, QuadraticForm)}
+        chunks = [[*forms][k : k + TOGETHER] for k in range(0, len(forms), TOGETHER)]
+        return [(np.array(chunk), _Tails([forms[place] for place in chunk])) for chunk in chunks]
 
     def isf(self, probability: float) -> float:
         def off(value: float) -> float:
