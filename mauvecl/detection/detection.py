@@ -407,8 +407,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         """
         probabilities = [UNDEFINED] * len(self.flares)
         for flare in range(len(self.flares)):
-            cut = UNDEFINED if flare in self.blinding else self._threshold_if_any(fap, statistic, flare)
-            if cut is not UNDEFINED:
+            cut = None if flare in self.blinding else self._cut(fap, statistic, flare)
+            if isinstance(cut, Interval):
                 counted, shared = self._at((statistic, "flare_on_null_grid", flare)), 0.0
                 above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
                 if countable(fap, self.realisations) and counted.std > 0:
@@ -419,20 +419,16 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def without_threshold(self, fap: float) -> tuple[Message, ...]:
         """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
-        sentences = dict[Message, None]()
-        for statistic, template in self._nulls():
-            try:
-                self.threshold(fap, statistic, template=template)
-            except NoThresholdError as error:
-                sentences[Message(f"NO THRESHOLD: {error}.", "no threshold")] = None
-        return tuple(sentences)
+        cuts = (self._cut(fap, statistic, template) for statistic, template in self._nulls())
+        sentences = (f"NO THRESHOLD: {cut}." for cut in cuts if isinstance(cut, NoThresholdError))
+        return tuple(Message(sentence, "no threshold") for sentence in dict.fromkeys(sentences))
 
-    def _threshold_if_any(self, fap: float, statistic: str, template: int) -> Interval:
-        """Return `threshold`, or `UNDEFINED` if no threshold has the false-alarm probability."""
+    def _cut(self, fap: float, statistic: str, template: int) -> Interval | NoThresholdError:
+        """Return `threshold`, or the error if no threshold has the false-alarm probability."""
         try:
             return self.threshold(fap, statistic, template=template)
-        except NoThresholdError:
-            return UNDEFINED
+        except NoThresholdError as error:
+            return error
 
     def quantile(
         self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
@@ -478,8 +474,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     def _row(self, fap: float, statistic: str, flare: int, probability: Interval) -> dict[str, Any]:
         """Return the row of one flare and statistic, as `COLUMNS` have it."""
         d, dof = self.distribution(statistic, flare), self.dof(statistic)
-        cut, fap_error = self._threshold_if_any(fap, statistic, flare), np.nan
-        if cut is not UNDEFINED:
+        cut, fap_error = self._cut(fap, statistic, flare), np.nan
+        if isinstance(cut, NoThresholdError):
+            cut = UNDEFINED
+        else:
             tail = self.tail(fap, statistic, template=flare)
             fap_error = np.sqrt((1 - fap) / (fap * self.realisations)) if tail is None else tail.relative_error
         theory = self.closed_form(statistic, flare)

@@ -280,7 +280,7 @@ class _Tails:
         weight = self.weight[:, None]
         return np.asarray((1.0 - weight) + 2.0 * gap[..., None] * weight)
 
-    def _exponent(self, gap: NDArray[np.complex128], x: Float, upper: NDArray[np.bool_]) -> NDArray[np.complex128]:
+    def _exponent(self, gap: NDArray[Any], x: Float, upper: NDArray[np.bool_]) -> NDArray[np.complex128]:
         """Return K(s) - s x - log(+-s), shape of the gap."""
         left, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
         # Real logarithms and angles are several times faster than complex ones.
@@ -309,7 +309,7 @@ class _Tails:
             gap = np.where(upper, 0.5 * special.expit(-v), 0.5 + np.exp(v))
             beyond = (self._derivative(gap, 1) - x - 1.0 / s > 0) == upper
             low, high = np.where(beyond, low, v), np.where(beyond, v, high)
-        return gap
+        return np.asarray(gap)
 
 
 @dataclass(frozen=True)
