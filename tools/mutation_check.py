@@ -138,7 +138,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "far S/N lost": (
         "test_snr_equals_that_of_sorting[16-0-net]",
-        ("range(tile.start, tile.stop, RAW_BATCH) if outside.size else ()", "()"),
+        ("tile.pieces(RAW_BATCH) if outside.size else ()", "()"),
     ),
     "7 rounds": (
         "test_philox_gives_the_known_answers",

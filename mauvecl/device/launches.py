@@ -54,6 +54,14 @@ class Tile:
         skip = self.start - self.start % width
         return Tile(self.first + skip, -(-self.stop // width) * width - skip, self.start - skip, self.stop - skip)
 
+    def pieces(self, size: int) -> Iterator[Tile]:
+        """Yield tiles of at most `size` realisations, a multiple of those per work-item."""
+        for begin in range(0, self.size, size):
+            length = min(size, self.size - begin)
+            start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
+            if start < stop:
+                yield Tile(self.first + begin, length, start, stop)
+
 
 class Tiles:
     """Division of a device's work into tiles of at most `largest` realisations; progress as for `Engine`."""
@@ -225,9 +233,7 @@ class Launches:
         self._counted += tile.wanted
         outside = np.flatnonzero(self._take(self._histograms[-1], self._shapes[-1]))
         # The host counts values outside the device's bins, from the raw spectra of the same realisations.
-        for start in range(tile.start, tile.stop, RAW_BATCH) if outside.size else ():
-            stop = min(start + RAW_BATCH, tile.stop)
-            piece = replace(tile, start=start, stop=stop).narrow(self.variant.width)
+        for piece in tile.pieces(RAW_BATCH) if outside.size else ():
             raw = np.empty((piece.wanted, self._scene.n_pixel), np.int32)
             self.realise(piece, raw)
             base = self._scene.n_draws * self._scene.base_dn[0]
