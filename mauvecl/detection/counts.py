@@ -248,10 +248,8 @@ class Distribution:
         far = ~self.is_fine
         values, weights, squares = (lower + upper)[far] / 2, counts[far], 0.0
         if inside := self.n - self.n_far:
-            values, weights = (
-                np.append(values, self.centre + self.step * self.first / inside),
-                np.append(weights, inside),
-            )
+            values = np.append(values, self.centre + self.step * (self.first / inside))
+            weights = np.append(weights, inside)
             squares = self.step**2 * ((inside * self.second - self.first**2) / inside)
         mean = float(weights @ values) / self.n
         return mean, (squares + float(weights @ (values - mean) ** 2)) / self.n

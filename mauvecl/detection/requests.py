@@ -25,7 +25,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
-from mauvecl.noise.scene import BATCH, Scene, drawn_factors, prepare
+from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message
@@ -72,8 +72,8 @@ class Hypotheses:
         if not self._chosen:
             raise InputError(f"no statistic is named; give some of {', '.join(STATISTICS)}", key="statistics")
         self.statistics = tuple(self._chosen)
-        scene, drawn = self.scene, drawn_factors(self.scene.processes, self.quiet)
-        self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
+        scene = self.scene
+        self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, scene.processes)
         shaped = [name for name, kind in self._chosen.items() if kind.shaped]
         if shaped and not self.flares:
             raise InputError(f"the statistic {shaped[0]!r} needs at least one flare, but none is given", key="flares")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.host.arrays import ContentEquality, Float
-from mauvecl.noise.scene import FactorDistribution, changes_of, factor_nodes
-from mauvecl.noise.unknowns import NOISE_FREE, Comparison, SignalPart
+from mauvecl.noise.scene import FactorDistribution, changes_of, drawn_factors, factor_nodes
+from mauvecl.noise.unknowns import NOISE_FREE, NONE, Comparison, Processes, SignalPart
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 
@@ -33,8 +33,7 @@ class Setting:
     comparison: Comparison = NOISE_FREE  # the subtracted reference and the choice of variances
     flares: Sequence[Expectation] = ()  # possible templates
     nuisances: Nuisances | None = None  # parameters that statistics marginalise over
-    # Random factors over which closed forms of marginalised statistics integrate.
-    drawn: Mapping[SignalPart, FactorDistribution] = field(default_factory=dict)
+    processes: Processes = NONE  # drawn factors over which closed forms of marginalised statistics integrate
     _cache: dict[tuple[str, int], Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -45,6 +44,11 @@ class Setting:
     def n_free(self) -> int:
         """Number of projected-out parameters."""
         return self.nuisances.free if self.nuisances else 0
+
+    @property
+    def drawn(self) -> dict[SignalPart, FactorDistribution]:
+        """Distributions of the drawn factors on parts of the signal."""
+        return self.cached("drawn", lambda: drawn_factors(self.processes, self.quiet))
 
     @property
     def integrates(self) -> bool:
