@@ -242,10 +242,12 @@ class _Tails:
             second, third = (self._derivative(gap, order) for order in (2, 3))
             bend, scale = third / (6.0 * second), 1.0 / np.sqrt(second + 1.0 / (0.5 - gap) ** 2)
             top = self._exponent(gap[:, None] + 0j, x, upper)[:, 0].real
-            while np.isnan(mass := self._integrals(x, upper, (gap, bend, scale), top)).any():
-                less = np.where(bend * scale > 1e-6, bend / 4, 0.0)
-                bend = np.where(np.isnan(mass), less, bend)
-            return np.asarray(top + np.log(mass / np.pi))
+            while True:
+                mass = self._integrals(x, upper, (gap, bend, scale), top)
+                grown = np.isnan(mass) & (bend > 0)
+                if not grown.any():
+                    return np.asarray(top + np.log(mass / np.pi))
+                bend = np.where(grown, np.where(bend * scale > 1e-6, bend / 4, 0.0), bend)
 
     def _integrals(self, x: Float, upper: NDArray[np.bool_], path: tuple[Float, Float, Float], top: Float) -> Float:
         """Integrate the probabilities divided by exp(top); NaN if the integrand grows on the contour."""
