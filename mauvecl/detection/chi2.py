@@ -30,7 +30,6 @@ class Chi2(Statistic):
     name = "chi2"
     definition: ClassVar[str] = "sum over pixels of (observed - reference)^2 / variance"
     label: ClassVar[str] = "χ² over pixels"
-    kernel_sum: ClassVar[str | None] = "chi2"
 
     def dof(self, setting: Setting) -> int:
         return int(setting.used.sum()) - setting.n_free
@@ -159,7 +158,6 @@ class Chi2Element(Chi2):
     name = "chi2_element"
     definition: ClassVar[str] = "the same over sums of 10.5 nm resolution elements"
     label: ClassVar[str] = "χ² over 10.5 nm elements"
-    kernel_sum: ClassVar[str | None] = "chi2_element"
     by_element: ClassVar[bool] = True
 
     def dof(self, setting: Setting) -> int:
@@ -178,7 +176,6 @@ class Chi2Pair(Chi2):
     name = "chi2_pair"
     definition: ClassVar[str] = "against a noisy quiescent exposure: twice the variance"
     label: ClassVar[str] = "χ² against a noisy exposure"
-    kernel_sum: ClassVar[str | None] = "chi2_pair"
     paired: ClassVar[bool] = True
 
 

@@ -256,8 +256,8 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     channels = {key: fixed * n_scenario + number for number, key in enumerate([*weighted, *smoothed])}
 
     def channel_of(statistic: Statistic, scenario: int, flare: int) -> int:
-        if statistic.kernel_sum is not None:
-            return fixed * scenario + FIXED_STATISTICS.index(statistic.kernel_sum)
+        if statistic.name in FIXED_STATISTICS:
+            return fixed * scenario + FIXED_STATISTICS.index(statistic.name)
         return channels[statistic.name, scenario, flare if statistic.shaped else 0]
 
     subtractions: list[tuple[int, int, int]] = []

@@ -102,8 +102,6 @@ class Statistic(ABC):
     shaped: ClassVar[bool] = False
     #: Whether the reference is always one noisy quiescent exposure, which excludes marginalising over unknowns.
     paired: ClassVar[bool] = False
-    #: Name of the sum that kernels always compute (`layout.FIXED_STATISTICS`); None if the statistic has weights.
-    kernel_sum: ClassVar[str | None] = None
     #: Whether the statistic uses sums over resolution elements instead of pixels.
     by_element: ClassVar[bool] = False
 
