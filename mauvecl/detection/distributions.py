@@ -140,7 +140,7 @@ BLOCK, MAX_T = 64, 80.0
 #: Bisections towards a contour's saddle point, near which it may pass.
 BISECTIONS = 18
 #: Distributions of a mixture that are integrated at once.
-TOGETHER = 64
+TOGETHER = 16
 
 
 def _falling_root(off: Callable[[float], float], start: float, step: float) -> float:
