@@ -31,7 +31,7 @@ SWAPPED = (
     "w[${4 * i}] = c0[${i}]; w[${4 * i + 1}] = c1[${i}]",
     "w[${4 * i}] = c1[${i}]; w[${4 * i + 1}] = c0[${i}]",
 )
-SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
+SHAPE = "    g1, g2, g3, *_ = c.over_sd()\n    sd ="
 
 MUTATIONS: dict[str, Mutation] = {
     # Realistic and ideal answers, and files of version 1.
@@ -166,7 +166,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "rounded normal for the joint draw": (
         "test_pearson_of_raw_counts",
-        (SHAPE, SHAPE.replace("c.shape()", "(0.0 * g for g in c.shape())")),
+        (SHAPE, SHAPE.replace("c.over_sd()", "(0.0 * g for g in c.over_sd())")),
     ),
     "skew-only expansion of the dark": (
         "test_expansion_cannot_be_distinguished_from_exact_draws",
