@@ -61,6 +61,7 @@ class Departure:
     clipping: float  # due to the ends of its range
     others: tuple[str, ...]  # effects that the closed form does not include and that have no prediction
     realisations: int
+    amplitude: float = np.nan  # of the flare that a shaped statistic uses as template, in tables
 
     @property
     def ratio(self) -> float:
@@ -127,13 +128,11 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
 
     `amplitudes` are those of the detection's flares.
     """
-    rows = departures(detection, fap) if countable(fap, detection.realisations) else []
-
-    def amplitude(row: Departure) -> float:
-        return amplitudes[row.template] if detection.statistic(row.statistic).shaped else float("nan")
-
-    columns = [replace(column, get=amplitude) if column.name == "amplitude" else column for column in DEPARTURE_COLUMNS]
-    return table_of(columns, rows, fap=fap)
+    rows = []
+    for row in departures(detection, fap) if countable(fap, detection.realisations) else ():
+        shaped = detection.statistic(row.statistic).shaped
+        rows.append(replace(row, amplitude=amplitudes[row.template]) if shaped else row)
+    return table_of(DEPARTURE_COLUMNS, rows, fap=fap)
 
 
 #: Columns of the table of departures.
