@@ -57,7 +57,7 @@ class Chi2(Statistic):
         scale = np.sqrt(model)
 
         def projection() -> tuple[Float, Float]:
-            spectra = self._spectra(setting)[:, counts]
+            spectra = self._grouped(setting, nuisances.spectra * setting.used)[:, counts]
             return spectra, nuisances.rows(model, spectra) * scale
 
         # The nodes of an integral over drawn factors share the model's variances.
@@ -96,8 +96,9 @@ class Chi2(Statistic):
         """
         if not setting.nuisances:
             return np.zeros((0, setting.used.size))
-        model = self._grouped(setting, self.variance(setting) * setting.used)
-        return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting)))
+        of_pixels = self.variance(setting), setting.nuisances.spectra
+        model, spectra = (self._grouped(setting, values * setting.used) for values in of_pixels)
+        return self._per_pixel(setting, setting.nuisances.rows(model, spectra))
 
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float]:
         from scipy.sparse import eye_array
@@ -124,11 +125,6 @@ class Chi2(Statistic):
         if not self.by_element:
             return values
         return np.asarray(values[..., np.unique(setting.quiet.element, return_inverse=True)[1]])
-
-    def _spectra(self, setting: Setting) -> Float:
-        """Return the nuisance spectra per squared term."""
-        assert setting.nuisances is not None
-        return self._grouped(setting, setting.nuisances.spectra * setting.used)
 
 
 def _span(vectors: Float, ratio: Float) -> tuple[list[tuple[NDArray[np.intp], Float]], Float]:
