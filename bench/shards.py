@@ -23,9 +23,7 @@ import numpy as np
 from astropy.table import Table
 from tables import write
 
-from mauvecl.detection.counts import Tally
 from mauvecl.detection.requests import DetectRequest, Shard
-from mauvecl.detection.snr import add_detection
 from mauvecl.device.engine import Engine
 from mauvecl.runs.checkpoint import Checkpoint, fingerprint, shards
 from mauvecl.runs.cluster import DaskWorkers
@@ -91,8 +89,8 @@ def main() -> None:
         bare = timed(lambda: engine.detect(quiet, flares, realisations=size, seed=1))[0]
         packing, sent = timed(lambda: pickle.dumps(shard))
         plan = request.plans[0][0]
-        sums = Tally(plan.grids), plan.tails()
-        adding = timed(lambda: add_detection(*sums, pickle.loads(sent)))[0]
+        tally = plan.tally()
+        adding = timed(lambda: tally.merge(pickle.loads(sent)))[0]
         body = io.BytesIO()
         np.savez(body, **shard)
         key = fingerprint(request)

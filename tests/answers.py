@@ -44,9 +44,8 @@ def same(ours: Detection, theirs: Detection) -> None:
         other = theirs._distributions[key]
         np.testing.assert_array_equal(found.counts, other.counts)
         assert (found.first, found.second, found.n) == (other.first, other.second, other.n)
-        mine, theirs_far = found.far, other.far
-        assert (mine.first, mine.second, mine.undefined) == (theirs_far.first, theirs_far.second, theirs_far.undefined)
-        assert (mine.keys.tolist(), mine.counts.tolist()) == (theirs_far.keys.tolist(), theirs_far.counts.tolist())
+        assert (found.numbers.tolist(), found.filled.tolist()) == (other.numbers.tolist(), other.filled.tolist())
+        assert found.undefined == other.undefined
     for key, kept in ours._samples.items():
         np.testing.assert_array_equal(kept.values, theirs._samples[key].values)
         np.testing.assert_array_equal(kept.realisations, theirs._samples[key].realisations)

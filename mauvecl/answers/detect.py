@@ -15,7 +15,7 @@ from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap, countable
-from mauvecl.detection.chi2 import Smoothing
+from mauvecl.detection.chi2 import Paper
 from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, DEPARTURE_COLUMNS, ROC_COLUMNS, ROC_ROWS, departure_table
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.nuisances import read_at_pixels
@@ -350,9 +350,8 @@ def _paper(prepared: Sequence[Case]) -> list[str]:
         if amplitude not in PAPER_G2V:
             continue
         chi2, reduced = PAPER_G2V[amplitude]
-        smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool), (flare,))
-        delta, variance = flare.recorded_light_dn - quiet.recorded_light_dn, flare.variance_dn2 + quiet.variance_dn2
-        form = smoothing.form(smoothing.scale(flare), delta, variance)
+        setting = Setting(quiet, np.ones(quiet.wavelength_nm.size, bool), flares=(flare,))
+        form = Paper().closed_form(setting, flare, flare)
         middle, low, high = (form.isf(p) / quiet.wavelength_nm.size for p in (0.5, 0.975, 0.025))
         lines.append(
             f"G2V, {100 * amplitude:g} % flare: the paper has chi2 = {chi2:g}, reduced {reduced:g}; "

@@ -89,7 +89,7 @@ def coverage(result: SnrResult) -> Float:
     width = 2.0 ** seen["bin_shift"].astype(float)
     shares = np.empty(signal.size)
     for p in range(signal.size):
-        filled, counts = result.counts.filled("pixel", p)
+        filled, counts = result.counts.bins["pixel"].of(p)
         edges = width[p] * np.column_stack([filled, filled + 1]).ravel() - 0.5
         ends = np.interp([low[p], high[p]], edges + float(seen["net_offset"][p]), steps_of(counts) / result.counts.n)
         shares[p] = ends[1] - ends[0]

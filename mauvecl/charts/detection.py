@@ -130,10 +130,10 @@ def _asinh(axis: Any, ends: tuple[float, float]) -> None:
 
 def roc_columns(curve: Roc) -> tuple[Any, ...]:
     """Return false-alarm and detection probabilities with the ends of their intervals, where there are alarms."""
-    table = curve.table()
-    seen = np.asarray(table["fap"]) > 0
-    names = ("fap", "probability", "probability_low", "probability_high")
-    return tuple(np.asarray(table[name], float)[seen] for name in names)
+    points = curve.points()
+    return tuple(
+        points[name][points["fap"] > 0] for name in ("fap", "probability", "probability_low", "probability_high")
+    )
 
 
 @picture_of("Roc", "roc")

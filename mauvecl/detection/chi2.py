@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import orth, solve_triangular
 
 from mauvecl.detection.distributions import QuadraticForm
-from mauvecl.detection.statistics import Differences, Setting, Statistic, Tilt
+from mauvecl.detection.statistics import Differences, Setting, Statistic
 from mauvecl.host.arrays import Float
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ class Chi2(Statistic):
     name = "chi2"
     definition: ClassVar[str] = "sum over pixels of (observed - reference)^2 / variance"
     label: ClassVar[str] = "χ² over pixels"
-    kernel_sum: ClassVar[str | None] = "chi2"
 
     def dof(self, setting: Setting) -> int:
         return int(setting.used.sum()) - setting.n_free
@@ -58,7 +57,7 @@ class Chi2(Statistic):
         scale = np.sqrt(model)
 
         def projection() -> tuple[Float, Float]:
-            spectra = self._spectra(setting)[:, counts]
+            spectra = self._grouped(setting, nuisances.spectra * setting.used)[:, counts]
             return spectra, nuisances.rows(model, spectra) * scale
 
         # The nodes of an integral over drawn factors share the model's variances.
@@ -97,14 +96,15 @@ class Chi2(Statistic):
         """
         if not setting.nuisances:
             return np.zeros((0, setting.used.size))
-        model = self._grouped(setting, self.variance(setting) * setting.used)
-        return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting)))
+        of_pixels = self.variance(setting), setting.nuisances.spectra
+        model, spectra = (self._grouped(setting, values * setting.used) for values in of_pixels)
+        return self._per_pixel(setting, setting.nuisances.rows(model, spectra))
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float]:
         from scipy.sparse import eye_array
 
         directions = eye_array(setting.used.size, format="csr")[setting.used]
-        return Tilt(directions, np.ones(directions.shape[0]))
+        return directions, np.ones(directions.shape[0])
 
     def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         """Return the coefficient of each pixel's squared difference, per DN^2, shape (n_pixel,)."""
@@ -125,11 +125,6 @@ class Chi2(Statistic):
         if not self.by_element:
             return values
         return np.asarray(values[..., np.unique(setting.quiet.element, return_inverse=True)[1]])
-
-    def _spectra(self, setting: Setting) -> Float:
-        """Return the nuisance spectra per squared term."""
-        assert setting.nuisances is not None
-        return self._grouped(setting, setting.nuisances.spectra * setting.used)
 
 
 def _span(vectors: Float, ratio: Float) -> tuple[list[tuple[NDArray[np.intp], Float]], Float]:
@@ -159,17 +154,16 @@ class Chi2Element(Chi2):
     name = "chi2_element"
     definition: ClassVar[str] = "the same over sums of 10.5 nm resolution elements"
     label: ClassVar[str] = "χ² over 10.5 nm elements"
-    kernel_sum: ClassVar[str | None] = "chi2_element"
     by_element: ClassVar[bool] = True
 
     def dof(self, setting: Setting) -> int:
         return int(np.unique(setting.quiet.element[setting.used]).size) - setting.n_free
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float]:
         element = setting.quiet.element
         member = element[None, :] == np.unique(element[setting.used])[:, None]
         directions = member * np.sqrt(self.variance(setting)) * setting.used
-        return Tilt(directions / np.linalg.norm(directions, axis=1)[:, None], np.ones(len(directions)))
+        return directions / np.linalg.norm(directions, axis=1)[:, None], np.ones(len(directions))
 
 
 class Chi2Pair(Chi2):
@@ -178,7 +172,6 @@ class Chi2Pair(Chi2):
     name = "chi2_pair"
     definition: ClassVar[str] = "against a noisy quiescent exposure: twice the variance"
     label: ClassVar[str] = "χ² against a noisy exposure"
-    kernel_sum: ClassVar[str | None] = "chi2_pair"
     paired: ClassVar[bool] = True
 
 
@@ -239,11 +232,6 @@ class Smoothing:
     def scale(self, flare: Expectation) -> Float:
         """Return the factors of squared smoothed DN in the sum of (F - Q)^2 / F in DN/s, shape (n_centre,)."""
         return np.asarray(self._inverse_flare(flare) @ self.between)
-
-    def form(self, scale: Float, delta: Float, variance: Float) -> QuadraticForm:
-        """Return the distribution of the sum for Gaussian noise with a mean and variance per pixel."""
-        weight, vectors = self.modes(scale, variance)
-        return QuadraticForm(weight, (np.sqrt(scale) * (self.weights @ delta)) @ vectors / np.sqrt(weight))
 
     def modes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
         """Return the variances of the sum's independent modes, and their weights per centre, (n_centre, n_mode)."""
@@ -331,16 +319,18 @@ class Paper(Statistic):
         return int(setting.used.sum())
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
-        return self.smoothing(setting).form(self.scale(setting, flare), seen.mean, seen.variance)
+        smoothing, scale = self.smoothing(setting), self.scale(setting, flare)
+        weight, vectors = smoothing.modes(scale, seen.variance)
+        return QuadraticForm(weight, (np.sqrt(scale) * (smoothing.weights @ seen.mean)) @ vectors / np.sqrt(weight))
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         return np.asarray((x @ self.smoothing(setting).rows.T) ** 2 @ self.scale(setting, flare))
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float]:
         sd, scale = np.sqrt(self.variance(setting)) * setting.used, self.scale(setting, flare)
         square, vectors = self.smoothing(setting).modes(scale, sd**2)
         modes = vectors.T @ (np.sqrt(scale)[:, None] * self.smoothing(setting).rows)
-        return Tilt(modes * sd / np.sqrt(square)[:, None], square)
+        return modes * sd / np.sqrt(square)[:, None], square
 
     def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         return np.asarray(self.scale(setting, flare) @ self.smoothing(setting).rows ** 2)

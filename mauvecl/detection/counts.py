@@ -1,16 +1,15 @@
-"""Exact histograms and moments of statistics, independent of order and tiling.
+"""Histograms and moments of statistics, independent of order and tiling.
 
-Values outside the fine bins are counted in a sparse histogram with bins of equal relative width over all of float32. A
-bin is a range of the float's ordered integer representation (sign, exponent, leading bits of the mantissa), so no value
-lies beyond the last bin. Sums are exact integers, independent of order and tiling.
+Values outside the fine bins are counted in bins of equal relative width over all of float32. Such a bin is a range of
+the float's ordered integer representation (sign, exponent, leading bits of the mantissa), so no value lies beyond the
+last bin. Sums over the fine bins are exact integers.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
@@ -24,20 +23,22 @@ from mauvecl.schema.errors import InputError
 
 #: Low bits of the integer representation that a bin ignores, which makes bins 2**-13 of the value wide, or less.
 DROPPED_BITS = 10
-#: Offset of the keys of bins above the fine ones, since a single bin may reach from below them to above.
-ABOVE = 1 << (32 - DROPPED_BITS)
-#: Sums are integer multiples of 2**-UNIT_BITS, the smallest float32, and of its square.
-UNIT_BITS = 149
-#: Number of squares below 2**48 whose sum has no more than 63 bits.
-CHUNK = 2**14
-#: Range of keys up to which an array counts them; wider ranges are sorted.
-MAX_DENSE_KEYS = 2**16
+#: Distance of the numbers of far bins, below and above, from those of 32-bit integers without the dropped bits.
+FAR = 1 << (32 - DROPPED_BITS)
+#: Number in place of a bin's for infinite values and NaN; all numbers have `NUMBER_BITS`.
+UNDEFINED, NUMBER_BITS = -2 * FAR, 34 - DROPPED_BITS
+#: Range of numbers up to which an array counts them; wider ranges are sorted.
+MAX_DENSE = 2**16
 
 
-class SparseCounts:
-    """Counts by integer key, merged from time to time."""
+class RowCounts:
+    """Counts of whole numbers in several rows, merged from time to time.
 
-    def __init__(self) -> None:
+    Numbers have `bits` bits; keys combine row and number.
+    """
+
+    def __init__(self, bits: int = 32) -> None:
+        self._span, self._half = 1 << bits, 1 << (bits - 1)
         self._keys = np.zeros(0, np.int64)
         self._counts = np.zeros(0, np.int64)
         self._waiting: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
@@ -55,25 +56,40 @@ class SparseCounts:
         self._merge()
         return self._counts
 
-    def add(self, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
-        """Add counts of ascending keys."""
+    @property
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Row and number of each key."""
+        rows, numbers = np.divmod(self.keys, self._span)
+        return rows, numbers - self._half
+
+    def of(self, row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the numbers of a row, ascending, and their counts."""
+        first = row * self._span
+        mine = slice(*np.searchsorted(self.keys, (first, first + self._span)))
+        return self._keys[mine] - first - self._half, self._counts[mine].copy()
+
+    def add(self, rows: NDArray[np.int64] | int, numbers: NDArray[np.int64], counts: NDArray[np.integer]) -> None:
+        """Add counts of different numbers."""
+        self._add(rows * self._span + self._half + numbers, counts.astype(np.int64))
+
+    def count(self, row: int, numbers: NDArray[np.int64]) -> None:
+        """Add one for each number of a row."""
+        if not numbers.size:
+            return
+        low = int(numbers.min())
+        if int(numbers.max()) - low < MAX_DENSE:
+            counts = np.bincount(numbers - low)
+            where = np.flatnonzero(counts)
+            self.add(row, where + low, counts[where])
+        else:
+            self.add(row, *np.unique_counts(numbers))
+
+    def _add(self, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
         if keys.size:
             self._waiting.append((keys, counts))
             self._waits += keys.size
-            if self._waits > max(MAX_DENSE_KEYS, self._keys.size):
+            if self._waits > max(MAX_DENSE, self._keys.size):
                 self._merge()
-
-    def count(self, keys: NDArray[np.int64]) -> None:
-        """Add one for each key, in any order."""
-        if not keys.size:
-            return
-        low = int(keys.min())
-        if int(keys.max()) - low < MAX_DENSE_KEYS:
-            counts = np.bincount(keys - low)
-            where = np.flatnonzero(counts)
-            self.add(where + low, counts[where])
-        else:
-            self.add(*np.unique_counts(keys))
 
     def _merge(self) -> None:
         if not self._waiting:
@@ -90,19 +106,18 @@ class SparseCounts:
         packed = {key: each.astype(np.min_scalar_type(int(each.max(initial=0)))) for key, each in parts.items()}
         return {f"{name}-first": self.keys[:1], **packed}
 
+    def merge(self, name: str, arrays: Arrays) -> None:
+        """Add packed counts."""
+        steps = np.concatenate([arrays[f"{name}-first"], arrays[f"{name}-steps"].astype(np.int64)])
+        self._add(np.cumsum(steps, dtype=np.int64), arrays[name].astype(np.int64))
 
-def unpacked(name: str, arrays: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return keys and counts that `SparseCounts.pack` has packed."""
-    steps = np.concatenate([arrays[f"{name}-first"], arrays[f"{name}-steps"].astype(np.int64)])
-    return np.cumsum(steps, dtype=np.int64), arrays[name].astype(np.int64)
 
-
-def keys_of(values: NDArray[np.float32], *, above: bool) -> NDArray[np.int64]:
-    """Return the key of each finite value's bin; keys are ordered as values, with those above the fine bins last."""
+def far_numbers(values: NDArray[np.float32], above: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the number of each value's far bin above or below the fine ones, ordered as values; or `UNDEFINED`."""
     # Adding zero turns negative zero into positive zero.
     image = (values + np.float32(0.0)).view(np.int32)
-    keys = (_ordered(image) >> DROPPED_BITS).astype(np.int64)
-    return keys + ABOVE if above else keys
+    numbers = (_ordered(image) >> DROPPED_BITS) + np.where(above, FAR, -FAR)
+    return np.where(np.isfinite(values), numbers, UNDEFINED)
 
 
 def _ordered(image: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -110,58 +125,11 @@ def _ordered(image: NDArray[np.int32]) -> NDArray[np.int32]:
     return image ^ ((image >> 31) & np.int32(0x7FFFFFFF))
 
 
-def edges_of(keys: NDArray[np.int64]) -> Float:
-    """Return the lower edges of bins: the smallest value in each."""
-    ordered = ((keys - np.where(is_above(keys), ABOVE, 0)) << DROPPED_BITS).astype(np.int32)
-    edges = _ordered(ordered).view(np.float32).astype(np.float64)
+def _far_edges(numbers: NDArray[np.int64]) -> Float:
+    """Return the lower edges of far bins, the smallest value in each, from their numbers without `FAR`."""
+    edges = _ordered((numbers << DROPPED_BITS).astype(np.int32)).view(np.float32).astype(np.float64)
     # The value after the largest float32.
     return np.where(np.isinf(edges), 2.0**128, edges)
-
-
-def is_above(keys: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return whether bins lie above the fine ones."""
-    return np.asarray(keys >= ABOVE // 2)
-
-
-def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
-    """Return the exact sums of finite values and of their squares, in units of 2**-149 and 2**-298."""
-    # Values are whole multiples of 2**(power - 149), below 2**24 of them; subnormal numbers have the smallest power.
-    powers = np.maximum(np.frexp(values)[1] + (UNIT_BITS - 24), 0)
-    first = second = 0
-    for power in np.flatnonzero(np.bincount(powers)).tolist():
-        whole = np.ldexp(values[powers == power].astype(np.float64), UNIT_BITS - power).astype(np.int64)
-        first += int(whole.sum()) << power
-        for part in np.split(whole, range(CHUNK, whole.size, CHUNK)):
-            second += int(part @ part) << 2 * power
-    return first, second
-
-
-class FarCounts(SparseCounts):
-    """Values of a distribution outside its fine bins, counted by the keys of their bins."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        # Sums of values and of their squares, in units of 2**-149 and 2**-298, and number of infinite values and NaN.
-        self.first = self.second = self.undefined = 0
-
-    def add_sums(self, first: int, second: int, undefined: int = 0) -> None:
-        """Add sums of other realisations."""
-        self.first += first
-        self.second += second
-        self.undefined += undefined
-
-    @property
-    def n(self) -> int:
-        """Number of finite values."""
-        return int(self.counts.sum())
-
-    def edges(self, low: float, high: float) -> tuple[Float, Float]:
-        """Return the lower and upper edges of the bins, limited by the range `low` to `high` of the fine bins."""
-        above = is_above(self.keys)
-        lower = np.where(above, np.maximum(edges_of(self.keys), high), edges_of(self.keys))
-        upper = np.where(above, edges_of(self.keys + 1), np.minimum(edges_of(self.keys + 1), low))
-        # The grid rounds in float32, so a value at its end may lie inside the float64 edges.
-        return np.where(above, lower, np.minimum(lower, upper)), np.where(above, np.maximum(lower, upper), upper)
 
 
 def grids_of(channel: Sequence[int], centre: Sequence[float], sigma: Sequence[float]) -> NDArray[np.void]:
@@ -183,26 +151,23 @@ LOW_STEP, HIGH_STEP = ((n - layout.BINS // 2) * 2**layout.FINE_BITS for n in (FI
 
 
 class Tally:
-    """Accumulator of the histograms and sums of many channels, on grids as `grids_of` returns them."""
+    """Accumulator of the histograms and sums of many channels, on grids as `grids_of` returns them.
 
-    def __init__(self, grids: NDArray[np.void]) -> None:
-        self.grids = grids
-        # Fine bins, by grid times BINS plus bin: few are filled. The first and the last of each grid stay empty.
-        self.fine = SparseCounts()
+    `tails` holds accumulators of the extremes of some of them, by the index of the grid.
+    """
+
+    def __init__(self, grids: NDArray[np.void], tails: Mapping[int, TailSamples] | None = None) -> None:
+        self.grids, self.tails = grids, tails or {}
+        # Bins of each grid, of which few are filled.
+        self.counts = RowCounts(NUMBER_BITS)
         # Sums of steps in fine bins and of their squares; Python integers, since squares may exceed 64 bits.
         self.sums = np.zeros((len(grids), 2), object)
-        self.far = [FarCounts() for _ in grids]
         self.n = 0
 
-    def add(self, histogram: NDArray[np.integer], sums: NDArray[np.generic], n: int) -> None:
+    def add(self, histogram: NDArray[np.integer], sums: NDArray[np.integer], n: int) -> None:
         """Add the counts of n realisations in fine bins, (n_grid, BINS), and sums of their steps, and squares."""
         grid, inner = np.nonzero(histogram[:, FIRST_BIN : LAST_BIN + 1])
-        counts = histogram[grid, FIRST_BIN + inner].astype(np.int64)
-        self.merge(grid * layout.BINS + FIRST_BIN + inner, counts, sums, n)
-
-    def merge(self, keys: NDArray[np.int64], counts: NDArray[np.int64], sums: NDArray[np.generic], n: int) -> None:
-        """Add counts of fine bins by their keys, as in `fine`; other parameters as for `add`."""
-        self.fine.add(keys, counts)
+        self.counts.add(grid, FIRST_BIN + inner, histogram[grid, FIRST_BIN + inner])
         self.sums += sums.astype(object)
         self.n += n
 
@@ -213,80 +178,101 @@ class Tally:
             steps = np.rint((values - grid["centre"]) * grid["steps_per_unit"])
         above = steps >= HIGH_STEP
         # The complement counts NaN as below.
-        below = ~(steps >= LOW_STEP)
-        far, finite = self.far[index], np.isfinite(values)
-        for there, side in ((above, True), (below, False)):
-            found = values[there & finite]
-            far.count(keys_of(found, above=side))
-            far.add_sums(*sums_of(found), int(np.count_nonzero(there & ~finite)))
-        return int(above.sum() + below.sum())
+        outside = above | ~(steps >= LOW_STEP)
+        self.counts.count(index, far_numbers(values[outside], above[outside]))
+        return int(outside.sum())
+
+    def pack(self) -> Arrays:
+        """Return the counts, sums and extremes of a shard as arrays."""
+        packed = self.counts.pack("counts") | {"sums": self.sums.astype(np.int64), "n": np.array(self.n)}
+        for index, tail in self.tails.items():
+            packed[f"values-{index}"], packed[f"realisations-{index}"] = tail.values, tail.realisations
+        return packed
+
+    def merge(self, packed: Arrays) -> None:
+        """Add a packed shard of other realisations."""
+        self.counts.merge("counts", packed)
+        self.sums += packed["sums"].astype(object)
+        self.n += int(packed["n"])
+        for index, tail in self.tails.items():
+            tail.merge(packed[f"values-{index}"], packed[f"realisations-{index}"])
 
     def distribution(self, index: int) -> Distribution:
         """Return the distribution of a grid."""
-        grid, start = self.grids[index], index * layout.BINS
-        mine, (first, second) = slice(*np.searchsorted(self.fine.keys, (start, start + layout.BINS))), self.sums[index]
+        grid, (first, second), (numbers, counts) = self.grids[index], self.sums[index], self.counts.of(index)
+        defined = numbers != UNDEFINED
         return Distribution(
-            float(grid["centre"]), 1.0 / float(grid["steps_per_unit"]), self.fine.keys[mine] - start,
-            self.fine.counts[mine].copy(), int(first), int(second), self.n, self.far[index],
+            float(grid["centre"]), 1.0 / float(grid["steps_per_unit"]), numbers[defined], counts[defined],
+            int(first), int(second), self.n, int(counts[~defined].sum()),
         )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """A histogram of unlimited range with exact integer moments.
+    """A histogram of unlimited range, with moments that are exact within its fine bins.
 
-    Bins are 1/512 of a standard deviation wide within 32 standard deviations of the centre, and 2**-13 of the value
-    beyond.
+    Fine bins are 1/512 of a standard deviation wide within 32 standard deviations of the centre; far bins are 2**-13 of
+    the value wide beyond.
     """
 
     centre: float  # value of the statistic at step 0
     step: float  # size of a fine step
-    filled: NDArray[np.int64]  # fine bins with counts, ascending, shape (m,)
-    filled_counts: NDArray[np.int64]  # shape (m,)
+    numbers: NDArray[np.int64]  # of bins with counts, ascending; negative or above BINS for far ones, shape (m,)
+    filled: NDArray[np.int64]  # counts in these bins, shape (m,)
     first: int  # sum of the fine steps
     second: int  # sum of their squares
     n: int  # number of realisations
-    far: FarCounts  # values outside the fine bins
+    undefined: int  # number of infinite values and NaN
+
+    @property
+    def is_fine(self) -> NDArray[np.bool_]:
+        """Whether each filled bin is a fine one."""
+        return (self.numbers >= 0) & (self.numbers < layout.BINS)
 
     @property
     def counts(self) -> NDArray[np.int64]:
         """Counts of all fine bins, shape (BINS,)."""
         counts = np.zeros(layout.BINS, np.int64)
-        counts[self.filled] = self.filled_counts
+        counts[self.numbers[self.is_fine]] = self.filled[self.is_fine]
         return counts
 
+    @property
+    def n_far(self) -> int:
+        """Number of values in far bins."""
+        return int(self.filled[~self.is_fine].sum())
+
     @cached_property
-    def _moments(self) -> tuple[Fraction, Fraction]:
-        """Exact mean and variance of all values."""
-        self.refuse_undefined()
-        total, squares = Fraction(self.far.first, 2**UNIT_BITS), Fraction(self.far.second, 2 ** (2 * UNIT_BITS))
-        inside = self.n - self.far.n
-        if inside:
-            centre, step = Fraction(self.centre), Fraction(self.step)
-            total += inside * centre + step * self.first
-            squares += inside * centre**2 + 2 * centre * step * self.first + step**2 * self.second
-        mean = total / self.n
-        return mean, squares / self.n - mean**2
+    def _moments(self) -> tuple[float, float]:
+        """Mean and variance of all values, those in far bins taken as in their middle."""
+        lower, upper, counts = self.bins
+        far = ~self.is_fine
+        values, weights, squares = (lower + upper)[far] / 2, counts[far], 0.0
+        if inside := self.n - self.n_far:
+            values = np.append(values, self.centre + self.step * (self.first / inside))
+            weights = np.append(weights, inside)
+            squares = self.step**2 * ((inside * self.second - self.first**2) / inside)
+        mean = float(weights @ values) / self.n
+        return mean, (squares + float(weights @ (values - mean) ** 2)) / self.n
 
     def refuse_undefined(self, what: str = "the statistic") -> None:
         """Raise InputError if values are not finite."""
-        if self.far.undefined:
+        if self.undefined:
             raise InputError(
-                f"{what} must be finite, but is infinite or no number in {self.far.undefined} of {self.n} realisations",
+                f"{what} must be finite, but is infinite or no number in {self.undefined} of {self.n} realisations",
                 key="statistic",
             )
 
     @property
     def mean(self) -> float:
-        return float(self._moments[0])
+        return self._moments[0]
 
     @property
     def std(self) -> float:
         return math.sqrt(self._moments[1])
 
-    def edge(self, index: NDArray[np.intp]) -> Float:
+    def edge(self, number: NDArray[np.integer]) -> Float:
         """Return the lower edges of fine bins."""
-        steps = (index - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
+        steps = (number - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
         return np.asarray(self.centre + self.step * steps)
 
     # Computed when needed: a detection of hundreds of flares has thousands of distributions.
@@ -294,14 +280,13 @@ class Distribution:
     def bins(self) -> tuple[Float, Float, NDArray[np.int64]]:
         """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
         self.refuse_undefined()
-        ends = self.edge(np.array([FIRST_BIN, LAST_BIN + 1])) if math.isfinite(self.step) else np.full(2, np.inf)
-        far_lower, far_upper = self.far.edges(*ends)
-        place = int(np.count_nonzero(~is_above(self.far.keys)))
-        return (
-            np.insert(far_lower, place, self.edge(self.filled)),
-            np.insert(far_upper, place, self.edge(self.filled + 1)),
-            np.insert(self.far.counts, place, self.filled_counts),
-        )
+        numbers = np.array([self.numbers, self.numbers + 1])
+        edges, below, above = self.edge(numbers), self.numbers < 0, self.numbers >= layout.BINS
+        # Far bins end where fine ones begin; these have no ends if all values count as far.
+        low, high = self.edge(np.array([FIRST_BIN, LAST_BIN + 1]))
+        edges[:, below] = np.fmin(_far_edges(numbers[:, below] + FAR), low)
+        edges[:, above] = np.fmax(_far_edges(numbers[:, above] - FAR), high)
+        return edges[0], edges[1], self.filled
 
     def above(self, value: float) -> float:
         """Return the number of realisations at or above a value: exact at edges of bins, interpolated between."""
@@ -344,12 +329,12 @@ class Distribution:
     def histogram(self, bins: int = 200) -> tuple[Float, NDArray[np.int64]]:
         """Return edges, shape (m + 1,), and counts, shape (m,), in at most `bins` equal bins, for plots."""
         lower, upper, _ = self.bins
-        if self.far.n:
+        if self.n_far:
             # No bin is narrower than the widest bin of the counts.
             span = upper[-1] - lower[0]
             edges = np.linspace(lower[0], upper[-1], max(min(bins, int(span / (upper - lower).max())), 1) + 1)
         else:
-            low, high = int(self.filled[0]), int(self.filled[-1]) + 1
+            low, high = int(self.numbers[0]), int(self.numbers[-1]) + 1
             group = -(-(high - low) // bins)
             edges = self.edge(np.arange(low, high + group, group))
         above = [self.above(edge) for edge in edges]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -61,6 +61,7 @@ class Departure:
     clipping: float  # due to the ends of its range
     others: tuple[str, ...]  # effects that the closed form does not include and that have no prediction
     realisations: int
+    amplitude: float = np.nan  # of the flare that a shaped statistic uses as template, in tables
 
     @property
     def ratio(self) -> float:
@@ -127,13 +128,11 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
 
     `amplitudes` are those of the detection's flares.
     """
-    rows = departures(detection, fap) if countable(fap, detection.realisations) else []
-
-    def amplitude(row: Departure) -> float:
-        return amplitudes[row.template] if detection.statistic(row.statistic).shaped else float("nan")
-
-    columns = [replace(column, get=amplitude) if column.name == "amplitude" else column for column in DEPARTURE_COLUMNS]
-    return table_of(columns, rows, fap=fap)
+    rows = []
+    for row in departures(detection, fap) if countable(fap, detection.realisations) else ():
+        shaped = detection.statistic(row.statistic).shaped
+        rows.append(replace(row, amplitude=amplitudes[row.template]) if shaped else row)
+    return table_of(DEPARTURE_COLUMNS, rows, fap=fap)
 
 
 #: Columns of the table of departures.
@@ -323,10 +322,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             f"of {self.quiet.name!r}, {flares} flare{'s'[: flares != 1]} by {names}, {self.realisations} realisations"
         )
 
-    def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
-        """Add the distributions and tails of one batch."""
+    def collect(self, plan: ChannelPlan, tally: Tally, samples: Mapping[int, TailSamples]) -> None:
+        """Add the distributions and extremes of one batch."""
         self._distributions |= {key: tally.distribution(index) for index, key in enumerate(plan.keys)}
-        self._samples |= {key: kept for key, kept in zip(plan.keys, samples, strict=True) if kept is not None}
+        self._samples |= {plan.keys[index]: kept for index, kept in samples.items()}
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """Return the simulated distribution of a statistic.
@@ -407,8 +406,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         """
         probabilities = [UNDEFINED] * len(self.flares)
         for flare in range(len(self.flares)):
-            cut = UNDEFINED if flare in self.blinding else self._threshold_if_any(fap, statistic, flare)
-            if cut is not UNDEFINED:
+            cut = None if flare in self.blinding else self._cut(fap, statistic, flare)
+            if isinstance(cut, Interval):
                 counted, shared = self._at((statistic, "flare_on_null_grid", flare)), 0.0
                 above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
                 if countable(fap, self.realisations) and counted.std > 0:
@@ -419,20 +418,16 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def without_threshold(self, fap: float) -> tuple[Message, ...]:
         """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
-        sentences = dict[Message, None]()
-        for statistic, template in self._nulls():
-            try:
-                self.threshold(fap, statistic, template=template)
-            except NoThresholdError as error:
-                sentences[Message(f"NO THRESHOLD: {error}.", "no threshold")] = None
-        return tuple(sentences)
+        cuts = (self._cut(fap, statistic, template) for statistic, template in self._nulls())
+        sentences = (f"NO THRESHOLD: {cut}." for cut in cuts if isinstance(cut, NoThresholdError))
+        return tuple(Message(sentence, "no threshold") for sentence in dict.fromkeys(sentences))
 
-    def _threshold_if_any(self, fap: float, statistic: str, template: int) -> Interval:
-        """Return `threshold`, or `UNDEFINED` if no threshold has the false-alarm probability."""
+    def _cut(self, fap: float, statistic: str, template: int) -> Interval | NoThresholdError:
+        """Return `threshold`, or the error if no threshold has the false-alarm probability."""
         try:
             return self.threshold(fap, statistic, template=template)
-        except NoThresholdError:
-            return UNDEFINED
+        except NoThresholdError as error:
+            return error
 
     def quantile(
         self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
@@ -478,8 +473,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     def _row(self, fap: float, statistic: str, flare: int, probability: Interval) -> dict[str, Any]:
         """Return the row of one flare and statistic, as `COLUMNS` have it."""
         d, dof = self.distribution(statistic, flare), self.dof(statistic)
-        cut, fap_error = self._threshold_if_any(fap, statistic, flare), np.nan
-        if cut is not UNDEFINED:
+        cut, fap_error = self._cut(fap, statistic, flare), np.nan
+        if isinstance(cut, NoThresholdError):
+            cut = UNDEFINED
+        else:
             tail = self.tail(fap, statistic, template=flare)
             fap_error = np.sqrt((1 - fap) / (fap * self.realisations)) if tail is None else tail.relative_error
         theory = self.closed_form(statistic, flare)

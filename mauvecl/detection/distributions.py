@@ -130,20 +130,32 @@ def _orthant(h: float, k: float, correlation: float) -> float:
 #: Relative change of the integral at which refinement stops.
 TOLERANCE = 1e-11
 #: First step and largest number of halvings; sinh(t) distributes the points over all scales of an uneven sum.
-STEP, HALVINGS = 0.25, 9
+STEP, HALVINGS = 0.125, 8
 #: Growth of the integrand's logarithm along the contour beyond which the contour is bent less.
 GROWTH = 1.0
 #: Decrease of the integrand's logarithm at which the sum ends.
 NEGLIGIBLE = 40.0
 #: Points computed at once, and the largest value of t.
-BLOCK, MAX_T = 32, 80.0
-#: Largest number of Newton steps, and their tolerance in the logarithm of a quantile.
-MAX_STEPS, STEP_TOLERANCE = 200, 1e-10
+BLOCK, MAX_T = 64, 80.0
+#: Bisections towards a contour's saddle point, near which it may pass.
+BISECTIONS = 18
+#: Distributions of a mixture that are integrated at once.
+TOGETHER = 16
 
 
-#: Limits of the precomputed transform: distance from the mean in standard deviations, least number of effective terms,
-#: least probability.
-NEAR, MANY, RARE = 40.0, 30.0, 1e-9
+def _falling_root(off: Callable[[float], float], start: float, step: float) -> float:
+    """Return the root of a falling function to 1e-8 of a step, searched outwards from `start` in growing steps."""
+    from scipy.optimize import brentq
+
+    off = cache(off)
+    low = high = start
+    width = step
+    while off(low) < 0:
+        low, high, width = low - width, low, 2 * width
+    width = step
+    while off(high) > 0:
+        low, high, width = high, high + width, 2 * width
+    return float(brentq(off, low, high, xtol=1e-8 * step)) if low < high else low
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,178 +183,135 @@ class QuadraticForm:
         """Number of equal terms with the same relative scatter: (sum of weights)^2 / sum of squared weights."""
         return float(self.weight.sum() ** 2 / np.sum(self.weight**2))
 
-    def sf(self, value: float, *, relative: bool = True) -> float:
-        """Return the probability of exceeding `value`; if not `relative`, an error of 1e-15 is enough.
-
-        For many terms and values near the mean, the characteristic function is inverted by a trapezoidal sum (Davies
-        1973, doi 10.1093/biomet/60.2.415), whose terms are computed once for all values. Its aliasing error is the
-        probability of a distance above 2 pi / spacing. The spacing makes this distance 40 standard deviations, for an
-        error below 1e-15 with ten terms or more, and the sum ends when its terms are below 1e-15. Otherwise the
-        contour integral is used, which is accurate far in the tail.
-        """
-        if value <= 0.0:
-            return 1.0
-        if self._chi_squared:
-            return float(special.chdtrc(self.weight.size, value))
-        if self.effective_terms >= MANY:
-            above = float(value < self.mean)
-            if abs(value - self.mean) <= NEAR * self.std:
-                u, size, phase = self._transform
-                above = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
-            if above >= RARE or not relative:
-                return min(max(above, 0.0), 1.0)
-        upper = value > self.mean
-        tail = float(np.exp(self._tail(value / self._unit, upper=upper)[0]))
-        return tail if upper else 1.0 - tail
+    def sf(self, value: float) -> float:
+        """Return the probability of exceeding `value`."""
+        return float(self._tails.above(value)[0])
 
     def isf(self, probability: float) -> float:
         """Return the value that is exceeded with a probability in (0, 1)."""
-        if self._chi_squared:
-            return float(special.chdtri(self.weight.size, probability))
-        if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
-            from scipy.optimize import brentq
-
-            low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
-            return float(brentq(lambda x: self.sf(x) - probability, low, high, xtol=1e-9 * self.std))
-        upper = probability <= 0.5
-        tail = probability if upper else 1.0 - probability
+        upper = np.array([probability <= 0.5])
+        tail = probability if upper[0] else 1.0 - probability
         # Start from a gamma distribution of the same mean and variance.
-        mean, variance = self.mean / self._unit, (self.std / self._unit) ** 2
-        start = (special.gammainccinv if upper else special.gammaincinv)(mean**2 / variance, tail)
-        at = float(np.log(max(start * variance / mean, 1e-300)))
-        # The logarithm of the tail is concave in that of the value, so Newton steps converge.
-        for _ in range(MAX_STEPS):
-            mass, ratio = self._tail(float(np.exp(at)), upper=upper)
-            # The derivative of the logarithm of the tail with respect to that of the value is -+ ratio * value.
-            step = (mass - float(np.log(tail))) / (ratio * float(np.exp(at))) * (1.0 if upper else -1.0)
-            if abs(step) <= STEP_TOLERANCE:
-                return self._unit * float(np.exp(at + step))
-            at += float(np.clip(step, -3.0, 3.0))
-        raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
+        shape, scale = (self.mean / self.std) ** 2, self.std**2 / self.mean
+        start = (special.gammainccinv if upper[0] else special.gammaincinv)(shape, tail)
+
+        def off(log_value: float) -> float:
+            more = float(self._tails.logarithms(float(np.exp(log_value)), upper)[0] - np.log(tail))
+            return more if upper[0] else -more
+
+        return float(np.exp(_falling_root(off, float(np.log(max(start * scale, 1e-300))), 1e-2)))
 
     @cached_property
-    def _chi_squared(self) -> bool:
-        """True for a central chi-squared variable with as many degrees of freedom as terms."""
-        return bool(np.all(self.weight == 1.0)) and not self.shift.any()
+    def _tails(self) -> _Tails:
+        return _Tails((self,))
 
-    @cached_property
-    def _unit(self) -> float:
-        """Largest weight, the unit of the distinct weights and of arguments of the contour integral."""
-        return float(self.weight.max())
 
-    @cached_property
-    def _distinct(self) -> tuple[Float, Float, Float]:
-        """Distinct weights, the largest of which is 1, the number of squares of each, and the sum of their shifts^2."""
-        values, member = np.unique(self.weight / self._unit, return_inverse=True)
-        count, push = (np.bincount(member, of, values.size).astype(np.float64) for of in (None, self.shift**2))
-        return values, count, push
+class _Tails:
+    """Tails of several quadratic forms, by a contour integral of each.
 
-    @cached_property
-    def _transform(self) -> tuple[Float, Float, Float]:
-        """Frequencies, and modulus and phase of the characteristic function, for values near the mean."""
-        spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
-        weight, count, push = self._distinct
-        weight = self._unit * weight
-        pull = weight * push
-        parts = []
-        k = 0.5 + np.arange(256)
-        while True:
-            u = k * spacing
-            turn = 2.0 * np.outer(u, weight)
-            spread = 1.0 + turn**2
-            log_size = -0.25 * (np.log(spread) * count).sum(axis=1) - (u[:, None] * turn * pull / spread).sum(axis=1)
-            phase = 0.5 * (np.arctan(turn) * count).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)
-            parts.append((u, np.exp(log_size) / k, phase))
-            k = k + 256
-            if log_size[-1] < np.log(1e-15 * k[0]):
-                us, sizes, phases = zip(*parts, strict=True)
-                return np.concatenate(us), np.concatenate(sizes), np.concatenate(phases)
+    Weights, which are in units of the largest of a form, are distinct, and have a number of squares and the sum of
+    their shifts^2; the shape of each array is (n_form, n_weight). Padding has a weight of zero.
+    """
 
-    def _tail(self, value: float, *, upper: bool) -> tuple[float, float]:
-        """Return the natural logarithm of the probability above or below a positive value, and density / probability.
+    def __init__(self, forms: Sequence[QuadraticForm]) -> None:
+        self.mean, self.unit = np.array([(form.mean, form.weight.max()) for form in forms]).T
+        distinct = []
+        for form, unit in zip(forms, self.unit, strict=True):
+            values, member = np.unique(form.weight / unit, return_inverse=True)
+            distinct.append((values, np.bincount(member), np.bincount(member, form.shift**2)))
+        size = max(values.size for values, *_ in distinct)
+        padded = np.array([[np.pad(part, (0, size - part.size)) for part in parts] for parts in distinct], np.float64)
+        self.weight, self.count, self.push = padded.transpose(1, 0, 2)
 
-        The result has full precision in the tail that does not contain the mean.
+    def above(self, value: float) -> Float:
+        """Return the probabilities of exceeding a value, shape (n_form,)."""
+        if value <= 0.0:
+            return np.ones(self.mean.size)
+        upper = value > self.mean
+        tail = np.exp(self.logarithms(value, upper))
+        return np.where(upper, tail, 1.0 - tail)
+
+    def logarithms(self, value: float, upper: NDArray[np.bool_]) -> Float:
+        """Return the natural logarithms of the probabilities above or below a positive value, shape (n_form,).
+
+        They have full precision in the tail that does not contain the mean.
         """
-        gap = self._saddle(value, upper)
-        left = self._factors(np.array(gap))
-        bend = self._derivative(left, 3) / (6.0 * self._derivative(left, 2))
-        scale = 1.0 / np.sqrt(self._derivative(left, 2) + 1.0 / (0.5 - gap) ** 2)
-        top = float(self._exponent(np.array([gap + 0j]), value, upper)[0].real)
-        while np.isnan(mass := self._integral(value, upper, (gap, bend, scale), top))[0]:
-            bend = bend / 4 if bend * scale > 1e-6 else 0.0
-        probability, density = mass.tolist()
-        return top + float(np.log(probability / np.pi)), density / probability
+        x = value / self.unit
+        with np.errstate(all="ignore"):
+            gap = self._saddles(x, upper)
+            second, third = (self._derivative(gap, order) for order in (2, 3))
+            bend, scale = third / (6.0 * second), 1.0 / np.sqrt(second + 1.0 / (0.5 - gap) ** 2)
+            top = self._exponent(gap[:, None] + 0j, x, upper)[:, 0].real
+            while True:
+                mass = self._integrals(x, upper, (gap, bend, scale), top)
+                grown = np.isnan(mass) & (bend > 0)
+                if not grown.any():
+                    return np.asarray(top + np.log(mass / np.pi))
+                bend = np.where(grown, np.where(bend * scale > 1e-6, bend / 4, 0.0), bend)
 
-    def _integral(self, value: float, upper: bool, path: tuple[float, float, float], top: float) -> Float:
-        """Integrate probability and density divided by exp(top); NaN if the integrand grows on the contour."""
-        gap, bend, scale = path
+    def _integrals(self, x: Float, upper: NDArray[np.bool_], path: tuple[Float, Float, Float], top: Float) -> Float:
+        """Integrate the probabilities divided by exp(top); NaN if the integrand grows on the contour."""
+        gap, bend, scale = (each[:, None] for each in path)
 
         def summed(first: float, step: float) -> Float:
-            """Sum both integrands over points first, first + step, ... until they are negligible."""
-            total = np.zeros(2)
+            """Sum the integrands over points first, first + step, ... until they are negligible."""
+            total, grown = np.zeros(x.size), np.zeros(x.size, bool)
             while True:
                 t = first + step * np.arange(BLOCK)
                 y = scale * np.sinh(t)
-                s_gap = gap - bend * y**2 - 1j * y
-                exponent = self._exponent(s_gap, value, upper) - top
-                if exponent.real.max() > GROWTH:
-                    return np.full(2, np.nan)
-                size = np.exp(exponent) * (1.0 - 2j * bend * y) * scale * np.cosh(t)
-                size[t == 0.0] /= 2
-                total += np.sum(size.real), np.sum((size * (0.5 - s_gap if upper else s_gap - 0.5)).real)
-                if exponent[-1].real + 2 * t[-1] < -NEGLIGIBLE or t[-1] > MAX_T:
-                    return total
+                exponent = self._exponent(gap - bend * y**2 - 1j * y, x, upper) - top[:, None]
+                size = (np.exp(exponent) * (1.0 - 2j * bend * y)).real * scale * np.cosh(t)
+                size[:, t == 0.0] /= 2
+                total += size.sum(axis=1)
+                grown |= exponent.real.max(axis=1) > GROWTH
+                negligible = exponent[:, -1].real + 2 * t[-1] < -NEGLIGIBLE
+                if (negligible | grown).all() or t[-1] > MAX_T:
+                    return np.where(grown, np.nan, total)
                 first = t[-1] + step
 
-        step, total, before = STEP, summed(0.0, STEP), 0.0
+        step, total, before = STEP, summed(0.0, STEP), np.zeros(x.size)
         for _ in range(HALVINGS):
-            mass = float(total[0]) * step
-            if np.isnan(mass) or abs(mass - before) <= TOLERANCE * before:
+            mass = total * step
+            if (np.isnan(mass) | (np.abs(mass - before) <= TOLERANCE * before)).all():
                 break
             before, total, step = mass, total + summed(step / 2, step), step / 2
         return step * total
 
     def _factors(self, gap: NDArray[Any]) -> NDArray[Any]:
-        """Return 1 - 2 weight s for s = 1/2 - gap, without cancellation near the branch point."""
-        weight = self._distinct[0]
-        return np.asarray((1.0 - weight) + 2.0 * np.multiply.outer(gap, weight))
+        """Return 1 - 2 weight s for s = 1/2 - gap, of shape (n_form, n), without cancellation at the branch point."""
+        weight = self.weight[:, None]
+        return np.asarray((1.0 - weight) + 2.0 * gap[..., None] * weight)
 
-    def _exponent(self, gap: NDArray[np.complex128], value: float, upper: bool) -> NDArray[np.complex128]:
-        """Return K(s) - s x - log(+-s)."""
-        (_, count, push), left, s = self._distinct, self._factors(gap), 0.5 - gap
+    def _exponent(self, gap: NDArray[Any], x: Float, upper: NDArray[np.bool_]) -> NDArray[np.complex128]:
+        """Return K(s) - s x - log(+-s), shape of the gap."""
+        left, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
         # Real logarithms and angles are several times faster than complex ones.
         square = left.real**2 + left.imag**2
         log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(left.imag, left.real) @ count)
-        turn = (left.real / square) @ push - push.sum() - 1j * ((left.imag / square) @ push)
-        return np.asarray(-0.5 * log + 0.5 * turn - s * value - np.log(s if upper else -s))
+        turn = (left.real / square) @ push - push.sum(axis=1, keepdims=True) - 1j * ((left.imag / square) @ push)
+        sign = np.where(upper, 1.0, -1.0)[:, None]
+        return np.asarray((0.5 * (turn - log))[..., 0] - s * x[:, None] - np.log(sign * s))
 
-    def _derivative(self, left: Float, order: int) -> float:
-        """Return a derivative of K of order 1 to 3."""
-        weight, count, push = self._distinct
-        return (0.0, 1.0, 2.0, 8.0)[order] * float(((weight / left) ** order * (count + order * push / left)).sum())
+    def _derivative(self, gap: Float, order: int) -> Float:
+        """Return a derivative of K of order 1 to 3, shape (n_form,)."""
+        left = self._factors(gap[:, None])[:, 0]
+        terms = (self.weight / left) ** order * (self.count + order * self.push / left)
+        return np.asarray((0.0, 1.0, 2.0, 8.0)[order] * terms.sum(axis=1))
 
-    def _saddle(self, value: float, upper: bool) -> float:
-        """Return 1/2 - s at the minimum of K(s) - s x - log(+-s) on the real axis.
+    def _saddles(self, x: Float, upper: NDArray[np.bool_]) -> Float:
+        """Return 1/2 - s near the minimum of K(s) - s x - log(+-s) on the real axis, shape (n_form,).
 
         The minimum lies between 0 and the branch point for the upper tail, and below 0 for the lower tail.
         """
-        from scipy.optimize import brentq
-
-        # The parameter v is logarithmic in the distance from 0 and in that from the branch point.
-        def gap(v: float) -> float:
-            return 0.5 * float(special.expit(-v)) if upper else 0.5 + float(np.exp(v))
-
-        def slope(v: float) -> float:
-            s = 0.5 * float(special.expit(v)) if upper else -float(np.exp(v))
-            return self._derivative(self._factors(np.array(gap(v))), 1) - value - 1.0 / s
-
-        sign = 1.0 if upper else -1.0
-        low, high = -1.0, 1.0
-        while sign * slope(low) > 0:
-            low *= 2
-        while sign * slope(high) < 0:
-            high *= 2
-        return gap(float(brentq(slope, low, high, rtol=1e-10)))
+        # The parameter is logarithmic in the distance from 0 and in that from the branch point.
+        low, high = np.full(x.size, -700.0), np.full(x.size, 700.0)
+        for _ in range(BISECTIONS):
+            v = (low + high) / 2
+            s = np.where(upper, 0.5 * special.expit(v), -np.exp(v))
+            gap = np.where(upper, 0.5 * special.expit(-v), 0.5 + np.exp(v))
+            beyond = (self._derivative(gap, 1) - x - 1.0 / s > 0) == upper
+            low, high = np.where(beyond, low, v), np.where(beyond, v, high)
+        return np.asarray(gap)
 
 
 @dataclass(frozen=True)
@@ -368,58 +337,47 @@ class Mixture:
     weights: Float  # probability of each part, shape (n,)
 
     @cached_property
+    def _moments(self) -> Float:
+        """Mean, standard deviation and third central moment of each part, shape (3, n)."""
+        return np.array([(part.mean, part.std, part.third) for part in self.parts]).T
+
+    @cached_property
     def mean(self) -> float:
-        return float(self.weights @ [part.mean for part in self.parts])
+        return float(self.weights @ self._moments[0])
 
     @cached_property
     def std(self) -> float:
-        return float(np.sqrt(self.weights @ [part.std**2 + (part.mean - self.mean) ** 2 for part in self.parts]))
+        mean, std, _ = self._moments
+        return float(np.sqrt(self.weights @ (std**2 + (mean - self.mean) ** 2)))
 
     @cached_property
     def third(self) -> float:
-        away = [part.mean - self.mean for part in self.parts]
-        each = [part.third + 3.0 * d * part.std**2 + d**3 for part, d in zip(self.parts, away, strict=True)]
-        return float(self.weights @ each)
+        mean, std, third = self._moments
+        away = mean - self.mean
+        return float(self.weights @ (third + 3.0 * away * std**2 + away**3))
 
     def sf(self, value: float) -> float:
-        if self._normal is not None:
-            mean, std = self._normal
-            return min(float(self.weights @ special.ndtr((mean - value) / std)), 1.0)
-        # Parts that hardly contribute need no relative precision.
-        for relative in (False, True):
-            each = [
-                part.sf(value, relative=relative) if isinstance(part, QuadraticForm) else part.sf(value)
-                for part in self.parts
-            ]
-            above = float(self.weights @ each)
-            if above >= RARE:
-                break
-        return min(above, 1.0)
+        mean, std, _ = self._moments
+        above = special.ndtr((mean - value) / std)
+        for places, tails in self._tails:
+            above[places] = tails.above(value)
+        return min(float(self.weights @ above), 1.0)
 
     @cached_property
-    def _normal(self) -> Float | None:
-        """Means and standard deviations if all parts are normal, shape (2, n)."""
-        if not all(isinstance(part, Gaussian) for part in self.parts):
-            return None
-        return np.array([(part.mean, part.std) for part in self.parts]).T
+    def _tails(self) -> list[tuple[NDArray[np.intp], _Tails]]:
+        """Tails of the quadratic forms among the parts, and the places of these."""
+        forms = {place: part for place, part in enumerate(self.parts) if isinstance(part, QuadraticForm)}
+        chunks = [[*forms][k : k + TOGETHER] for k in range(0, len(forms), TOGETHER)]
+        return [(np.array(chunk), _Tails([forms[place] for place in chunk])) for chunk in chunks]
 
     def isf(self, probability: float) -> float:
-        from scipy.optimize import brentq
-
-        @cache
         def off(value: float) -> float:
             return float(np.log(max(self.sf(value), 1e-300) / probability))
 
         # From the quantile of a normal distribution with the same skewness (Cornish & Fisher 1938), outwards.
         z = -float(special.ndtri(probability))
-        low = high = self.mean + self.std * z + (z**2 - 1.0) * self.third / (6.0 * self.std**2)
-        step = 0.01 * self.std
-        while off(low) < 0:
-            low, high, step = low - step, low, 4 * step
-        step = 0.01 * self.std
-        while off(high) > 0:
-            low, high, step = high, high + step, 4 * step
-        return float(brentq(off, low, high, xtol=1e-9 * self.std)) if low < high else low
+        start = self.mean + self.std * z + (z**2 - 1.0) * self.third / (6.0 * self.std**2)
+        return _falling_root(off, start, 0.02 * self.std)
 
 
 #: Closed form of a statistic's distribution.

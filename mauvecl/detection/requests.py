@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import DEFAULT_STATISTICS, Tails, check_statistic
 from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
-from mauvecl.detection.counts import TailSamples, grids_of
+from mauvecl.detection.counts import TailSamples, Tally, grids_of
 from mauvecl.detection.distributions import Form
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.statistics import Linear, LinearStatistic, Matched, Setting, Statistic, UvExcess
@@ -25,7 +25,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.expectation import Expectation, entirely_saturated
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.layout import FIXED_STATISTICS
-from mauvecl.noise.scene import BATCH, Scene, factor_distributions, prepare
+from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message
@@ -73,8 +73,7 @@ class Hypotheses:
             raise InputError(f"no statistic is named; give some of {', '.join(STATISTICS)}", key="statistics")
         self.statistics = tuple(self._chosen)
         scene = self.scene
-        drawn = factor_distributions(scene.modulations, scene.priors, scene.medians, scene.n_frames)
-        self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, drawn)
+        self.setting = Setting(self.quiet, scene.used, scene.comparison, self.flares, self.nuisances, scene.processes)
         shaped = [name for name, kind in self._chosen.items() if kind.shaped]
         if shaped and not self.flares:
             raise InputError(f"the statistic {shaped[0]!r} needs at least one flare, but none is given", key="flares")
@@ -203,11 +202,10 @@ class ChannelPlan:
     # Row of chi-squared, and first and one past the last row whose squares are subtracted from it, shape (3, n).
     subtractions: NDArray[np.uint32]
 
-    def tails(self) -> list[TailSamples | None]:
-        """Return accumulators of each grid's extremes: the largest values of a null, the smallest of a flare."""
-        return [
-            None if role == "flare_on_null_grid" else TailSamples(largest=role == "null") for _, role, _ in self.keys
-        ]
+    def tally(self) -> Tally:
+        """Return the empty tally of the grids, with the largest values of nulls and the smallest of flares."""
+        roles = {index: role for index, (_, role, _) in enumerate(self.keys) if role != "flare_on_null_grid"}
+        return Tally(self.grids, {index: TailSamples(largest=role == "null") for index, role in roles.items()})
 
     @property
     def n_rows(self) -> int:
@@ -258,8 +256,8 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     channels = {key: fixed * n_scenario + number for number, key in enumerate([*weighted, *smoothed])}
 
     def channel_of(statistic: Statistic, scenario: int, flare: int) -> int:
-        if statistic.kernel_sum is not None:
-            return fixed * scenario + FIXED_STATISTICS.index(statistic.kernel_sum)
+        if statistic.name in FIXED_STATISTICS:
+            return fixed * scenario + FIXED_STATISTICS.index(statistic.name)
         return channels[statistic.name, scenario, flare if statistic.shaped else 0]
 
     subtractions: list[tuple[int, int, int]] = []

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import SparseCounts, TailSamples, Tally, steps_of, unpacked
+from mauvecl.detection.counts import RowCounts, Tally, steps_of
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.requests import DetectRequest, SnrRequest
 from mauvecl.host.arrays import Arrays, ContentEquality, Float
@@ -97,8 +98,8 @@ class Counts:
 
     def __init__(self, n_pixel: int, n_element: int) -> None:
         self.shapes = {"pixel": (n_pixel, layout.OBSERVER_BINS), "element": (n_element, layout.OBSERVER_BINS)}
-        # Filled bins; keys combine the pixel or element and the bin.
-        self.bins = {"pixel": SparseCounts(), "element": SparseCounts()}
+        # Filled bins of each pixel or element; bin 0 contains the expected value.
+        self.bins = {"pixel": RowCounts(), "element": RowCounts()}
         # Frames clipped at zero and at saturation.
         self.clipped = np.zeros((n_pixel, 2), np.int64)
         self.n = 0
@@ -109,8 +110,7 @@ class Counts:
         """Add the device's histograms of one or more tiles."""
         for kind, dense in (("pixel", pixel), ("element", element)):
             which, column = np.nonzero(dense[:, 1:-1])
-            keys = which * (2 * MAX_BIN) + MAX_BIN + FIRST_BIN + column
-            self.bins[kind].add(keys, dense[which, 1 + column].astype(np.int64))
+            self.bins[kind].add(which, FIRST_BIN + column, dense[which, 1 + column])
         self.clipped += clipped
         self.n += n
 
@@ -137,26 +137,18 @@ class Counts:
             self._count_far("element", e, steps.astype(np.int64))
 
     def _count_far(self, kind: str, which: int, bins: NDArray[np.int64]) -> None:
-        outside = bins[(bins < FIRST_BIN) | (bins > LAST_BIN)]
-        self.bins[kind].count(which * (2 * MAX_BIN) + MAX_BIN + outside)
-
-    def filled(self, kind: str, which: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the filled bins of a pixel or element, ascending, with 0 at the expected value, and their counts."""
-        every, offset = self.bins[kind], which * (2 * MAX_BIN) + MAX_BIN
-        mine = slice(*np.searchsorted(every.keys, (offset - MAX_BIN, offset + MAX_BIN)))
-        return every.keys[mine] - offset, every.counts[mine]
+        self.bins[kind].count(which, bins[(bins < FIRST_BIN) | (bins > LAST_BIN)])
 
     def dense(self, kind: str) -> NDArray[np.int64]:
         """Return the histograms in the device's columns, without values beyond, shape (n, OBSERVER_BINS)."""
         dense = np.zeros(self.shapes[kind], np.int64)
-        which, place = np.divmod(self.bins[kind].keys, 2 * MAX_BIN)
-        inner = self.within(kind)
-        dense[which[inner], place[inner] - MAX_BIN - FIRST_BIN + 1] = self.bins[kind].counts[inner]
+        (which, bins), inner = self.bins[kind].places, self.within(kind)
+        dense[which[inner], bins[inner] - FIRST_BIN + 1] = self.bins[kind].counts[inner]
         return dense
 
     def within(self, kind: str) -> NDArray[np.bool_]:
         """Return which filled bins are among the device's."""
-        bins = self.bins[kind].keys % (2 * MAX_BIN) - MAX_BIN
+        _, bins = self.bins[kind].places
         return (bins >= FIRST_BIN) & (bins <= LAST_BIN)
 
     def pack(self) -> Arrays:
@@ -167,7 +159,7 @@ class Counts:
     def merge(self, packed: Arrays) -> None:
         """Add packed counts of other realisations."""
         for kind, each in self.bins.items():
-            each.add(*unpacked(kind, packed))
+            each.merge(kind, packed)
         self.clipped += packed["clipped"]
         self.n += int(packed["n"])
 
@@ -190,9 +182,12 @@ class SnrResult(Drawable, ContentEquality):
 
     expectation: Expectation
     scene: Scene
-    observers: NDArray[np.void]  # layout.OBSERVER, shape (n_padded,)
-    elements: NDArray[np.void]  # layout.ELEMENT, shape (n_element,)
     counts: Counts
+
+    @cached_property
+    def observers(self) -> NDArray[np.void]:
+        """Structures of `observers`."""
+        return observers(self.expectation, self.scene)
 
     @property
     def pixel(self) -> QTable:
@@ -216,12 +211,11 @@ class SnrResult(Drawable, ContentEquality):
     @property
     def element(self) -> QTable:
         """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
-        x = self.expectation
-        per_unit = self.elements["bins_per_unit"]
-        step = np.divide(1.0, per_unit, out=np.zeros(len(per_unit)), where=per_unit > 0)
+        x, every = self.expectation, elements(self.expectation)
+        step = np.divide(1.0, every["bins_per_unit"], out=np.zeros(len(every)), where=every["bins_per_unit"] > 0)
 
         def snr(which: int, place: NDArray[np.number]) -> Float:
-            return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
+            return np.asarray(every["centre"][which] + step[which] * (place - 0.5))
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
@@ -235,7 +229,7 @@ class SnrResult(Drawable, ContentEquality):
         """Return the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
         rows = []
         for which in range(len(expected)):
-            filled, counts = self.counts.filled(kind, which)
+            filled, counts = self.counts.bins[kind].of(which)
             middle = snr(which, filled + 0.5)
             mean = counts @ middle / self.counts.n
             edges = np.column_stack([snr(which, filled), snr(which, filled + 1)]).ravel()
@@ -253,39 +247,9 @@ def counts_of(request: SnrRequest) -> Counts:
     return Counts(request.scene.n_pixel, request.expectation.element_wavelength_nm.size)
 
 
-def snr_of(request: SnrRequest, counts: Counts) -> SnrResult:
-    """Return the result of a request from its histograms."""
-    x, scene = request.expectation, request.scene
-    return SnrResult(x, scene, observers(x, scene), elements(x), counts)
-
-
-def detection_of(request: DetectRequest, sums: Iterable[tuple[Tally, Sequence[TailSamples | None]]]) -> Detection:
-    """Return the result of a request from the sums and extremes of its parts."""
+def detection_of(request: DetectRequest, tallies: Iterable[Tally]) -> Detection:
+    """Return the result of a request from the tallies of its parts."""
     detection = Detection.of(request.hypotheses, request.realisations, request.tails, request.seed)
-    for (plan, _), (tally, samples) in zip(request.plans, sums, strict=True):
-        detection.collect(plan, tally, samples)
+    for (plan, _), tally in zip(request.plans, tallies, strict=True):
+        detection.collect(plan, tally, tally.tails)
     return detection
-
-
-def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arrays:
-    """Pack a shard of a detection as arrays."""
-    shard = tally.fine.pack("counts") | {"sums": tally.sums.astype(str), "n": np.array(tally.n)}
-    for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
-        if far.n or far.undefined:
-            shard |= far.pack(f"far-{number}")
-            shard[f"far-{number}-sums"] = np.array([str(x) for x in (far.first, far.second, far.undefined)])
-        if tail is not None:
-            shard[f"values-{number}"], shard[f"realisations-{number}"] = tail.values, tail.realisations
-    return shard
-
-
-def add_detection(tally: Tally, samples: Sequence[TailSamples | None], shard: Arrays) -> None:
-    """Add a packed shard of a detection to the sums and extremes of its part."""
-    sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
-    tally.merge(*unpacked("counts", shard), sums, int(shard["n"]))
-    for number, (far, tail) in enumerate(zip(tally.far, samples, strict=True)):
-        if f"far-{number}" in shard:
-            far.add(*unpacked(f"far-{number}", shard))
-            far.add_sums(*(int(value) for value in shard[f"far-{number}-sums"]))
-        if tail is not None:
-            tail.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])

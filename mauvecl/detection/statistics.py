@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.host.arrays import ContentEquality, Float
-from mauvecl.noise.scene import FactorDistribution, changes_of, factor_nodes
-from mauvecl.noise.unknowns import NOISE_FREE, Comparison, SignalPart
+from mauvecl.noise.scene import FactorDistribution, changes_of, drawn_factors, factor_nodes
+from mauvecl.noise.unknowns import NOISE_FREE, NONE, Comparison, Processes, SignalPart
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 
@@ -33,8 +33,7 @@ class Setting:
     comparison: Comparison = NOISE_FREE  # the subtracted reference and the choice of variances
     flares: Sequence[Expectation] = ()  # possible templates
     nuisances: Nuisances | None = None  # parameters that statistics marginalise over
-    # Random factors over which closed forms of marginalised statistics integrate.
-    drawn: Mapping[SignalPart, FactorDistribution] = field(default_factory=dict)
+    processes: Processes = NONE  # drawn factors over which closed forms of marginalised statistics integrate
     _cache: dict[tuple[str, int], Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -47,6 +46,11 @@ class Setting:
         return self.nuisances.free if self.nuisances else 0
 
     @property
+    def drawn(self) -> dict[SignalPart, FactorDistribution]:
+        """Distributions of the drawn factors on parts of the signal."""
+        return self.cached("drawn", lambda: drawn_factors(self.processes, self.quiet))
+
+    @property
     def integrates(self) -> bool:
         """Whether closed forms integrate over the drawn factors."""
         return bool(self.nuisances and self.drawn and not self.comparison.exposures)
@@ -57,17 +61,6 @@ class Setting:
         if (name, id(flare)) not in self._cache:
             self._cache[name, id(flare)] = flare, make()
         return cast("T", self._cache[name, id(flare)][1])
-
-
-@dataclass(frozen=True, eq=False)
-class Tilt:
-    """Directions along which importance sampling shifts or stretches the noise."""
-
-    # Orthonormal in standard deviations of each pixel's difference, dense or sparse, shape (n_direction, n_pixel).
-    directions: Any
-    # Coefficients of squared standard normals along the directions in a quadratic statistic, shape (n_direction,).
-    square: Float | None = None
-    per_sigma: float = 1.0  # change of a linear statistic for one standard deviation along its direction
 
 
 class DetectionForms(NamedTuple):
@@ -109,8 +102,6 @@ class Statistic(ABC):
     shaped: ClassVar[bool] = False
     #: Whether the reference is always one noisy quiescent exposure, which excludes marginalising over unknowns.
     paired: ClassVar[bool] = False
-    #: Name of the sum that kernels always compute (`layout.FIXED_STATISTICS`); None if the statistic has weights.
-    kernel_sum: ClassVar[str | None] = None
     #: Whether the statistic uses sums over resolution elements instead of pixels.
     by_element: ClassVar[bool] = False
 
@@ -197,8 +188,12 @@ class Statistic(ABC):
         """Compute the statistic of differences, DN, divided by variances, DN^2, both (n, n_pixel), shape (n,)."""
 
     @abstractmethod
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
-        """Return the directions of importance sampling."""
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, Float | None]:
+        """Return the directions along which importance sampling shifts or stretches the noise, and their squares.
+
+        The directions, dense or sparse and of the shape (n_direction, n_pixel), are orthonormal in standard deviations
+        of each pixel's difference. A quadratic statistic has coefficients of squared standard normals along them.
+        """
 
 
 class LinearStatistic(Statistic):
@@ -269,10 +264,9 @@ class LinearStatistic(Statistic):
         total = x @ weights
         return np.asarray(total / np.sqrt(variance @ weights**2) if setting.comparison.estimated else total)
 
-    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> tuple[Any, None]:
         along = self.weights_per_dn(setting, flare) * np.sqrt(self.variance(setting))
-        length = float(np.linalg.norm(along))
-        return Tilt((along / length)[None], per_sigma=1.0 if setting.comparison.estimated else length)
+        return (along / np.linalg.norm(along))[None], None
 
 
 #: Range of `uv_excess`, nm.

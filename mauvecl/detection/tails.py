@@ -251,7 +251,7 @@ class _Tilt:
         """Choose a tilt that makes alarms of a given probability common."""
         kind, setting = hypotheses.statistic(statistic), hypotheses.setting
         flare = hypotheses.shape(statistic, template)
-        tilt = kind.tilt(setting, flare)
+        directions, square = kind.tilt(setting, flare)
         nothing = Differences(np.zeros(setting.used.size), kind.variance(setting), setting.comparison.estimated)
         # Nuisance parameters that are not drawn do not scatter.
         null = kind.integrate_drawn(setting, hypotheses.quiet, nothing, flare, priors=False)
@@ -261,25 +261,22 @@ class _Tilt:
             # Posterior probability of the factors given an alarm.
             chance = null.weights * [part.sf(goal) for part in parts]
             chance = chance / chance.sum()
-            nodes = factor_nodes(setting.drawn, hypotheses.quiet, weighted=tilt.square is None)
+            nodes = factor_nodes(setting.drawn, hypotheses.quiet, weighted=square is None)
             for name, score in nodes.scores.items():
                 mean = float(chance @ score)
                 scores[name] = mean, max(float(np.sqrt(chance @ (score - mean) ** 2)), 1.0)
-        if tilt.square is None:
+        if square is None:
             # Linear statistic: shift the mean along its direction, by the mean in alarms.
-            moves = np.array([goal / tilt.per_sigma])
-            if scores:
-                z = np.array([(goal - part.mean) / part.std for part in parts])
-                moves = np.exp(-(z**2) / 2 - special.log_ndtr(-z)) / np.sqrt(2 * np.pi)
-            return cls(tilt.directions, np.ones(1), float(chance @ moves), scores)
-        if setting.nuisances:
-            # Account for squares that marginalisation subtracts and factors add: the growth, at least one, of the
-            # central squares that makes the mean of each sum of squares equal to the goal.
-            squares = [part for part in parts if isinstance(part, QuadraticForm)]
-            growth = [(goal - float(part.weight @ part.shift**2)) / float(part.weight.sum()) for part in squares]
-            goal = float(tilt.square.sum() * (chance @ np.maximum(growth, 1.0)))
-        # Quadratic statistic: exponential tilting of each independent square increases the spread.
-        return cls(tilt.directions, _stretch(tilt.square, goal), scores=scores)
+            z = np.array([(goal - part.mean) / part.std for part in parts])
+            moves = np.exp(-(z**2) / 2 - special.log_ndtr(-z)) / np.sqrt(2 * np.pi)
+            return cls(directions, np.ones(1), float(chance @ moves), scores)
+        # Quadratic statistic: exponential tilting of each independent square increases the spread, by the growth, at
+        # least one, of the central squares that makes the mean of each sum of squares equal to the goal. The sums have
+        # fewer squares if marginalisation subtracts some, and more if factors add some.
+        squares = [part for part in parts if isinstance(part, QuadraticForm)]
+        growth = [(goal - float(part.weight @ part.shift**2)) / float(part.weight.sum()) for part in squares]
+        goal = float(square.sum() * (chance @ np.maximum(growth, 1.0)))
+        return cls(directions, _stretch(square, goal), scores=scores)
 
     def apply(self, difference: Float) -> tuple[Float, Float]:
         """Return the change of differences, shape (n, n_pixel), and the logarithms of the draws' weights."""

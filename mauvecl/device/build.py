@@ -219,26 +219,19 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
     local = "" if variant.width == 1 else "__attribute__((reqd_work_group_size(1, 1, 1)))"
     values = asdict(variant) | {
         "attributes": local,
-        "streams": layout.STREAMS,
         "polynomials": {k: [f"{c}f" for c in v] for k, v in layout.POLYNOMIALS.items()},
         "two_ln2": f"{layout.TWO_LN2}f",
         "magic": f"{layout.MAGIC}f",
-        "reference": layout.REFERENCE,
+        "log2_e": f"{layout.LOG2_E}f",
+        "exponential": [f"{c!r}f" for c in layout.EXPONENTIAL],
         "fixed": len(layout.FIXED_STATISTICS),
         "linear": variant.linears > 0,
         "modulated": bool(variant.modulations),
         "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if PROCESSES[name].when == "frame"), None),
-        "prior_bits": layout.PRIOR_BITS,
-        "prior_finest": layout.PRIOR_FINEST,
-        "prior_nodes": layout.PRIOR_NODES,
-        "observer_bins": layout.OBSERVER_BINS,
-        "log2_e": f"{layout.LOG2_E}f",
-        "ln2_parts": layout.LN2_PARTS,
-        "exponential": [f"{c!r}f" for c in layout.EXPONENTIAL],
-        "bins": layout.BINS,
-        "fine_bits": layout.FINE_BITS,
         "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
     }
+    plain = "streams reference prior_bits prior_finest prior_nodes observer_bins ln2_parts bins fine_bits"
+    values |= {name: getattr(layout, name.upper()) for name in plain.split()}
     names = (*SHARED_FILES, *kernel_files)
     folder = files("mauvecl.kernels")
     texts = [folder.joinpath(f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection import DEFAULT_STATISTICS, Tails, requests, snr
-from mauvecl.detection.counts import TailSamples, Tally
+from mauvecl.detection.counts import Tally
 from mauvecl.detection.detection import Detection
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.snr import Counts, SnrResult
@@ -200,7 +200,8 @@ class Engine:
             See `Drawing`.
         """
         request = requests.SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
-        return snr.snr_of(request, self._snr(request, requests.Shard(0, request.start, request.realisations)))
+        counts = self._snr(request, requests.Shard(0, request.start, request.realisations))
+        return SnrResult(request.expectation, request.scene, counts)
 
     def _snr(self, request: requests.SnrRequest, shard: requests.Shard) -> Counts:
         x, scene, counts = request.expectation, request.scene, snr.counts_of(request)
@@ -214,7 +215,7 @@ class Engine:
         """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
         match request:
             case requests.DetectRequest():
-                return snr.pack_detection(*self._detection(request, shard))
+                return self._detection(request, shard).pack()
             case requests.SnrRequest():
                 return self._snr(request, shard).pack()
             case requests.RealiseRequest():
@@ -273,26 +274,25 @@ class Engine:
         request = requests.DetectRequest(quiet, flares, realisations, seed, statistics, *how)  # type: ignore[arg-type]
         each, total = request.realisations, request.parts * request.realisations
         shards = [requests.Shard(part, request.start, each) for part in range(request.parts)]
-        sums = (self._detection(request, shard, before=shard.part * each, total=total) for shard in shards)
-        return snr.detection_of(request, sums)
+        tallies = (self._detection(request, shard, before=shard.part * each, total=total) for shard in shards)
+        return snr.detection_of(request, tallies)
 
     def _detection(
         self, request: requests.DetectRequest, shard: requests.Shard, *, before: int = 0, total: int | None = None
-    ) -> tuple[Tally, list[TailSamples | None]]:
+    ) -> Tally:
         plan, scene = request.plans[shard.part]
-        tally, samples = Tally(plan.grids), plan.tails()
+        tally = plan.tally()
         with detection_launches(self.open_device, scene, request.seed, plan, request.hypotheses) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
                 launches.tally(tile, tally)
-                for channel, extremes in zip(plan.grids["channel"].tolist(), samples, strict=True):
-                    if extremes is not None:
-                        extremes.add(launches.channel(tile, channel), shard.start + done)
+                for index, extremes in tally.tails.items():
+                    extremes.add(launches.channel(tile, int(plan.grids["channel"][index])), shard.start + done)
 
             self._tiles.for_each(shard.start, shard.count, 4 * plan.n_rows, work, before=before, total=total)
             launches.flush(tally)
-        return tally, samples
+        return tally
 
     def statistic_values(
         self,

@@ -371,13 +371,12 @@ def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPla
     bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
     if len(plan.scales):
         bands, finished = Paper().smoothing(hypotheses.setting).bands(len(scene.pixels), device.variant.chunk)
-    sums = {hypotheses.statistic(name).kernel_sum for name in hypotheses.statistics}
     launches = scene_launches(
         device,
         scene,
         seed,
-        pair="chi2_pair" in sums,
-        elements="chi2_element" in sums,
+        pair="chi2_pair" in hypotheses.statistics,
+        elements="chi2_element" in hypotheses.statistics,
         linears=len(plan.weights),
         smooths=len(plan.scales),
         slots=bands.shape[1],

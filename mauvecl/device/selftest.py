@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.detection.counts import Distribution
+from mauvecl.detection.counts import FAR, Distribution
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.detection.snr import Counts
 from mauvecl.device import drivers
@@ -313,8 +313,11 @@ def histograms_of(counts: Counts) -> NDArray[np.int64]:
 
 def tally_of(distribution: Distribution) -> NDArray[np.int64]:
     """Return all counts and sums of a tally as one array."""
-    moments, far = np.array([distribution.first, distribution.second]), distribution.far
-    return np.concatenate([each.astype(np.int64) for each in (distribution.counts, moments, far.keys, far.counts)])
+    moments, far = np.array([distribution.first, distribution.second]), ~distribution.is_fine
+    keys, counts = distribution.numbers[far], distribution.filled[far]
+    # The known answers number the bins below the fine ones without an offset.
+    keys = np.where(keys < 0, keys + FAR, keys)
+    return np.concatenate([each.astype(np.int64) for each in (distribution.counts, moments, keys, counts)])
 
 
 @cache

@@ -84,26 +84,13 @@ class Cumulants:
         """Total variance before the draw's own rounding."""
         return self.gaussian + self.photon_cumulant(2) + self.dark_variance
 
-    def shape(self) -> tuple[Float, Float, Float]:
-        """Return the third, fourth and fifth cumulants divided by powers of the standard deviation."""
-        sd = np.sqrt(self.variance)
-        third, fourth, fifth = (
-            np.divide(self.photon_cumulant(r) + self.dark_cumulant(r), sd**r, out=np.zeros_like(sd), where=sd > 0)
-            for r in (3, 4, 5)
-        )
-        return third, fourth, fifth
-
     def over_sd(self) -> list[Float]:
-        """Return the standardised third to seventh cumulants, by products, which are faster than powers."""
+        """Return the third to seventh cumulants divided by powers of the standard deviation."""
         sd = np.sqrt(self.variance)
-        each = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
-        light, dark = self.photon_step * each, self.dark_step * each
-        of_light, of_dark = self.photons * light**2, self.dark_dn * each * dark
-        bounds = []
-        for _ in range(3, 8):
-            of_light, of_dark = of_light * light, of_dark * dark
-            bounds.append(of_light + of_dark)
-        return bounds
+        return [
+            np.divide(self.photon_cumulant(r) + self.dark_cumulant(r), sd**r, out=np.zeros_like(sd), where=sd > 0)
+            for r in range(3, 8)
+        ]
 
     def scaled(self, x: Expectation, on_light: float, dark: float, sky: float) -> Cumulants:
         """Return the cumulants with factors on all light, on the dark and on the sky of the scenario."""
@@ -196,7 +183,7 @@ def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
 
 def polynomial(c: Cumulants) -> tuple[Float, Float, Float, Float, Float]:
     """Return the coefficients of z^0 to z^4 of a draw minus its mean, DN, each shape (n_pixel,)."""
-    g1, g2, g3 = c.shape()
+    g1, g2, g3, *_ = c.over_sd()
     sd = np.sqrt(c.variance)
     return (
         sd * (-g1 / 6 + g3 / 40 - g1 * g2 / 12 + 17 * g1**3 / 324),

@@ -14,10 +14,9 @@ from scipy import special
 
 from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
-from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Drawing, Factors, check_reach, choose_method, nodes, polynomial, sky_share
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table, alias_table_of
-from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, SIGNAL_PARTS, Comparison, Processes, SignalPart
+from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,20 +84,13 @@ def changes_of(x: Expectation) -> tuple[Float, Float]:
 
 
 def drawn_factors(processes: Processes, quiet: Expectation) -> dict[SignalPart, FactorDistribution]:
-    """Return the distributions of the factors that processes draw for a star, averaged over an exposure."""
-    factors = Factors.of(processes, quiet.conditions)
-    return factor_distributions(processes.modulations, factors.tables, tuple(factors.medians.values()), quiet.n_frames)
-
-
-def factor_distributions(
-    modulations: Sequence[tuple[str, SignalPart]], tables: NDArray[np.float32], medians: Sequence[float], n_frames: int
-) -> dict[SignalPart, FactorDistribution]:
-    """Return the distributions of drawn factors on light, dark and sky; parameters as the fields of `Scene`.
+    """Return the distributions of the factors on light, dark and sky that processes draw, averaged over an exposure.
 
     A product of several independent factors is treated as normal.
     """
+    factors, n_frames = Factors.of(processes, quiet.conditions), quiet.n_frames
     every = dict[SignalPart, list[FactorDistribution]]()
-    for (name, factor), table in zip(modulations, tables, strict=True):
+    for (name, factor), table in zip(processes.modulations, factors.tables, strict=True):
         # Relative to the factor at the median, as the table is.
         one = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
         if PROCESSES[name].when == "frame" and n_frames > 1:
@@ -110,7 +102,7 @@ def factor_distributions(
         if len(ones) > 1:
             mean = np.prod([one.mean for one in ones])
             values = mean + np.sqrt(np.prod([one.mean**2 + one.sd**2 for one in ones]) - mean**2) * SCORE
-        found[name] = FactorDistribution(medians[SIGNAL_PARTS.index(name)] * values)
+        found[name] = FactorDistribution(factors.medians[name] * values)
     return found
 
 
@@ -222,7 +214,7 @@ class Scene:
     quartic: bool  # whether a joint draw needs the fourth power of its normal and, if factors vary, fifth cumulants
     photons: bool  # whether photon counts are also drawn separately
     clip: bool  # whether single draws are clipped at the ADC's rails
-    modulations: tuple[tuple[str, SignalPart], ...]  # priors that change light, dark or sky; see `Processes`
+    processes: Processes  # optional processes that are drawn
     job: NDArray[np.void]  # shape (); parameters of a launch without the seed
     pixels: NDArray[np.void]  # shape (n_padded,)
     levels: NDArray[np.void]  # shape (n_scenario, n_padded)
@@ -249,7 +241,12 @@ class Scene:
     @property
     def additive(self) -> tuple[str, ...]:
         """Names of the additive processes that are drawn."""
-        return tuple(name for name in ADDITIVE if self.job[f"{name}_bits"])
+        return tuple(self.processes.additive)
+
+    @property
+    def modulations(self) -> tuple[tuple[str, SignalPart], ...]:
+        """Priors that change light, dark or sky."""
+        return self.processes.modulations
 
     def constants(
         self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
@@ -308,7 +305,7 @@ def prepare(
     tables = np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32)
     return Scene(
         used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons, clip=method.each == 1,
-        modulations=drawing.processes.modulations, job=job, pixels=pixels, dark_counts=darks,
+        processes=drawing.processes, job=job, pixels=pixels, dark_counts=darks,
         tables=tables, priors=method.factors.tables, medians=tuple(method.factors.medians.values()),
         references=compared, comparison=comparison, used=used, **arrays,
     )  # fmt: skip

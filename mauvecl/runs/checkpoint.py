@@ -77,7 +77,7 @@ def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 #: Version of the content of a shard, raised with every change, so that shards of older versions are never added.
-FORM = 3
+FORM = 4
 #: Approximate work of a shard, realisations times pixels times scenarios: some seconds on a processor.
 SHARD_WORK = 2**34
 #: Approximate largest number of shards per part. Larger requests have larger shards, so that one process can add up

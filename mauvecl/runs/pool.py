@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import Tally
 from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
-from mauvecl.detection.snr import add_detection, counts_of, detection_of, snr_of
+from mauvecl.detection.snr import SnrResult, counts_of, detection_of
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import Arrays, map_in_threads
@@ -27,7 +26,6 @@ from mauvecl.schema.fields import Range, Realisations
 
 if TYPE_CHECKING:
     from mauvecl.detection.detection import Detection
-    from mauvecl.detection.snr import SnrResult
     from mauvecl.device.stares import Stares
     from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation
@@ -194,16 +192,16 @@ class Pool:
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
         request = DetectRequest.of(quiet, flares, **how)
-        sums = [(Tally(plan.grids), plan.tails()) for plan, _ in request.plans]
-        self._add_up(request, lambda part, shard: add_detection(*sums[part], shard))
-        return detection_of(request, sums)
+        tallies = [plan.tally() for plan, _ in request.plans]
+        self._add_up(request, lambda part, shard: tallies[part].merge(shard))
+        return detection_of(request, tallies)
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """Compute distributions of the S/N; parameters as for `Engine.snr`."""
         request = SnrRequest.of(expectation, **how)
         counts = counts_of(request)
         self._add_up(request, lambda _, shard: counts.merge(shard))
-        return snr_of(request, counts)
+        return SnrResult(request.expectation, request.scene, counts)
 
     def stares(self, request: StaresRequest) -> Arrays:
         """Reduce all stares of a request; see `Stares.reduced`."""

@@ -322,11 +322,9 @@ class Case:
     def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
         """Return the input of statistics for closed forms."""
         from mauvecl.detection.statistics import Setting
-        from mauvecl.noise.scene import drawn_factors
 
-        unknown = self.unknowns(quiet)
-        drawn = drawn_factors(self.processes, quiet) if unknown else {}
-        return Setting(quiet, ~quiet.saturated, self.study.run.comparison(), flares, unknown, drawn)
+        comparison = self.study.run.comparison()
+        return Setting(quiet, ~quiet.saturated, comparison, flares, self.unknowns(quiet), self.processes)
 
     def with_value(self, quantity: str, value: float | str) -> Self:
         """Return the case at another value of a quantity of `quantities.QUANTITIES`."""

@@ -42,7 +42,7 @@ def test_null_follows_its_closed_form(found: Detection, statistic: str) -> None:
     exact = stats.norm() if statistic in ("matched", "uv_excess") else stats.chi2(found.dof(statistic))
     exact = found.closed_form(statistic) if statistic == "paper" else exact
     assert ks_probability(d, exact.sf) > 1e-6
-    assert d.far.n == 0
+    assert d.n_far == 0
 
 
 @pytest.mark.long

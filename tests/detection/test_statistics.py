@@ -106,7 +106,8 @@ def test_few_centres_represent_all_pixels() -> None:
         ours = (x @ smoothing.rows.T) ** 2 @ smoothing.scale(flare)
         np.testing.assert_allclose(ours, (x @ rows.T) ** 2 @ factor, rtol=1e-3)
     full = distributions.QuadraticForm(modes, np.zeros(modes.size))
-    form = smoothing.form(smoothing.scale(flare), np.zeros(len(rows)), 2 * quiet.variance_dn2)
+    weights, _ = smoothing.modes(smoothing.scale(flare), 2 * quiet.variance_dn2)
+    form = distributions.QuadraticForm(weights, np.zeros(weights.size))
     for fap, error in ((1e-2, 1e-3), (1e-10, 5e-3)):
         assert form.isf(fap) == pytest.approx(full.isf(fap), rel=1e-4)
         assert full.sf(form.isf(fap)) == pytest.approx(fap, rel=error)

@@ -153,7 +153,7 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
     inside = step[(step >= -inner) & (step < inner)].astype(np.int64)
     np.testing.assert_array_equal(found.counts, np.bincount(inside // fine + half, minlength=layout.BINS))
     assert (found.first, found.second) == (inside.sum(), (inside**2).sum())
-    assert (found.far.n, found.far.undefined) == (values.size - inside.size - 6, 6)
+    assert (found.n_far, found.undefined) == (values.size - inside.size - 6, 6)
     histogram, sums, outside = numpy_kernels.tally(values[None], tally.grids)
     np.testing.assert_array_equal(histogram[0, 1:-1], found.counts[1:-1])
     assert (*sums[0], outside[0]) == (found.first, found.second, values.size - inside.size)

@@ -140,7 +140,7 @@ def histograms(scene: Any, observers: Any, elements: np.ndarray, realisation: np
     n = reference.observed(scene, realisation, seed, scenarios=[0])[0]
 
     def count(kind: str, which: int, numbers: np.ndarray) -> None:
-        counts.bins[kind].count(which * 2**32 + 2**31 + numbers)
+        counts.bins[kind].count(which, numbers)
 
     for e, element in enumerate(elements):
         first, end = int(element["first"]), int(element["end"])
