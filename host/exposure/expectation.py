@@ -20,9 +20,8 @@ from mauvecl.host.exposure.background import Neighbours, Sky, check_level
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
-from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.source import Source, check_covers, listed_star
-from mauvecl.host.stars.spectrum import continued
+from mauvecl.host.stars.spectrum import SPAN_NM, continued
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, number, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package

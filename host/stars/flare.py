@@ -18,8 +18,7 @@ from astropy.constants import c, h, k_B
 from numpy.typing import ArrayLike
 
 from mauvecl.host.arrays import ContentEquality, Float, array_cache, set_read_only
-from mauvecl.host.spectra.units import NEEDED_NM
-from mauvecl.host.stars.spectrum import ANGSTROM, attached, check_points, photons, supplemented
+from mauvecl.host.stars.spectrum import ANGSTROM, NEEDED_NM, attached, check_points, photons, supplemented
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.schema import fields
 from mauvecl.schema.calls import validated
@@ -380,7 +379,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends. Raises
         InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
         """
-        from mauvecl.host.spectra.formats import read_spectrum
+        from mauvecl.host.stars.formats import read_spectrum
 
         units: dict[str, Any] = {"wavelength_unit": wavelength_unit, "flux_unit": flux_unit}
         read = read_spectrum(Path(path), **units)

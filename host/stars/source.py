@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mauvecl.host.arrays import ContentEquality, Float, set_read_only
-from mauvecl.host.spectra.units import NEEDED_NM, SPAN_NM, measured_part
 from mauvecl.host.stars import library
 from mauvecl.host.stars import spectrum as points
 from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbody, with_flare
+from mauvecl.host.stars.spectrum import NEEDED_NM, SPAN_NM
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
@@ -27,7 +27,7 @@ from mauvecl.schema.fields import Amplitude, AnyUnit, BinWidth, Magnitude, Redde
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.host.spectra.conversion import ReadSpectrum
+    from mauvecl.host.stars.conversion import ReadSpectrum
 
 #: Unit of flux densities.
 FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)
@@ -149,7 +149,7 @@ class Source(Drawable, ContentEquality):
         ignore_checksum : bool
             Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
         """
-        from mauvecl.host.spectra.formats import read_spectrum
+        from mauvecl.host.stars.formats import read_spectrum
 
         read = read_spectrum(
             Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit, ignore_checksum=ignore_checksum
@@ -170,7 +170,7 @@ class Source(Drawable, ContentEquality):
         wavelength, flux, cut = points.without_undefined_ends(name, wavelength, flux)
         messages = given.messages
         if given.axis_unit or extend is not None:
-            part = measured_part(wavelength)
+            part = points.measured_part(wavelength)
             share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
             messages += (f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}",)
         messages += points.remarks(wavelength, flux)
@@ -212,7 +212,7 @@ class Source(Drawable, ContentEquality):
 
         `extend` is a library spectrum, or its name, that continues the arrays beyond their ends.
         """
-        from mauvecl.host.spectra.conversion import ReadSpectrum
+        from mauvecl.host.stars.conversion import ReadSpectrum
 
         try:
             nm, values = (

@@ -16,8 +16,7 @@ import astropy.units as u
 import numpy as np
 from astropy.constants import c, h
 
-from mauvecl.host.arrays import Float, array_cache, true_runs
-from mauvecl.host.spectra.units import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
+from mauvecl.host.arrays import Bool, Float, array_cache, true_runs
 from mauvecl.host.stars.library import known_band, spectrum_table
 from mauvecl.schema.errors import InputError
 
@@ -139,6 +138,73 @@ def _interpolate(grid: Float, at: Float, values: Float) -> Float:
     after = np.clip(np.searchsorted(at, grid, side="right"), 1, at.size - 1)
     share = np.clip((grid - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
     return np.asarray(values[after - 1] * (1.0 - share) + values[after] * share)
+
+
+#: Range of the nominal instrument, nm (the paper's abstract).
+NEEDED_NM = (200.0, 700.0)
+#: The same, extended by the reach of the line spread function (the paper, section "Preparing the input spectrum").
+SPAN_NM = (180.0, 750.0)
+#: Fraction of `NEEDED_NM` that a spectrum must cover; with less, nearly all of the light would be another star's.
+MIN_MEASURED = 1 / 3
+#: Range of wavelengths, nm, outside which an assumed unit is unlikely.
+PLAUSIBLE_NM = (50.0, 10_000.0)
+#: A step between points is a gap if it exceeds this width, nm, and this multiple of the usual spacing.
+GAP_NM, GAP_TIMES = 10.5, 10.0
+#: Likely units of wavelengths without a stated unit, in nm.
+_USUAL_UNITS = {"nm": 1.0, "Angstrom": 0.1, "um": 1000.0}
+
+
+def measured_part(nm: Float) -> float:
+    """Return the fraction of `NEEDED_NM` that wavelengths cover, without gaps."""
+    if nm.size < 2:
+        return 0.0
+    steps = np.diff(np.clip(nm, *NEEDED_NM))[~is_gap(np.diff(nm))]
+    return float(steps.sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
+
+
+def is_gap(steps: Float) -> Bool:
+    """Return which of the steps between wavelengths, nm, are gaps."""
+    wide: Bool = (steps > GAP_NM) & (steps > GAP_TIMES * np.median(steps))
+    return wide
+
+
+def _part(low: float, high: float) -> float:
+    shared = min(high, NEEDED_NM[1]) - max(low, NEEDED_NM[0])
+    return max(0.0, shared / (NEEDED_NM[1] - NEEDED_NM[0]))
+
+
+def likely_unit(low: float, high: float, unit: str) -> str | None:
+    """Return the only unit other than `unit` in which the numbers cover the required range, or None."""
+    parts = {other: _part(low * factor, high * factor) for other, factor in _USUAL_UNITS.items() if other != unit}
+    fitting = [other for other, part in parts.items() if part >= MIN_MEASURED and low > 0.0]
+    # Short ultraviolet spectra cover part of the range in Angstrom, but would start in the infrared in nm.
+    if not fitting and parts.get("Angstrom", 0.0) > 0.0 and low > 900.0:
+        fitting = ["Angstrom"]
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def check_assumed_unit(values: Float, unit: str) -> None:
+    """Raise InputError if another unit of the wavelengths is as likely as the assumed one."""
+    finite = values[np.isfinite(values)]
+    factor = _USUAL_UNITS.get(unit)
+    if not finite.size or factor is None:
+        return
+    low, high = float(finite.min()), float(finite.max())
+    own, other = _part(low * factor, high * factor), likely_unit(low, high, unit)
+    elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
+    fault = f"wavelengths from {low:g} to {high:g} without a stated unit"
+    needed, remedy = f"of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "give their unit: `wavelength_unit"
+    if other is not None and (own < MIN_MEASURED or elsewhere >= max(own, 1.0 - 1e-9)):
+        fault += f" look like {other}, in which they cover {elsewhere:.0%} {needed}, and {own:.0%} in {unit}"
+        also = f" or `wavelength_unit={unit!r}`" if own >= MIN_MEASURED else ""
+        raise InputError(f"{fault}; {remedy}={other!r}`{also}", key="wavelength_unit")
+    if own < MIN_MEASURED:
+        fault += f" cover {own:.0%} {needed}, not at least a third, in {unit}"
+    elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
+        fault += f" extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}"
+    else:
+        return
+    raise InputError(f"{fault}; {remedy}` names it", key="wavelength_unit")
 
 
 #: Range of wavelengths, nm, from gamma rays to metre waves, whose products stay within double precision.

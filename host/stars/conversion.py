@@ -17,11 +17,20 @@ import astropy.units as u
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.spectra.columns import Role, as_typed, choose, listed, numbered, role_of
-from mauvecl.host.spectra.units import Medium, check_assumed_unit, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.stars.columns import Role, as_typed, choose, listed, numbered, role_of
+from mauvecl.host.stars.spectrum import check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, marks_in, without_indefinite
-from mauvecl.host.tables.units import flux_kind, is_spectral, is_stated, linear, unit_of
+from mauvecl.host.tables.units import (
+    Medium,
+    flux_kind,
+    is_spectral,
+    is_stated,
+    linear,
+    unit_and_medium,
+    unit_of,
+    vacuum_wavelengths,
+)
 from mauvecl.schema.errors import InputError
 
 
@@ -81,9 +90,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
     named: list[int] = []
     rest: list[str] = []
     for word in asked:
-        place = numbered("table", word)
-        if place is not None and place >= len(tables):
-            raise InputError.of("table", place + 1, f"between 1 and {len(tables)}")
+        place = numbered("table", word, len(tables))
         fits = [i for i, label in enumerate(labels) if label == word.lower()] if place is None else [place]
         named += fits
         rest += [] if fits else [word]
@@ -238,19 +245,15 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
     fitting = list(range(len(identifiers)))
     for word in asked:
-        if (place := numbered("row", word)) is not None:
-            if place >= len(identifiers):
-                raise InputError.of("row", place + 1, f"between 1 and {len(identifiers)}")
-            fitting = [row for row in fitting if row == place]
-        else:
-            fitting = [row for row in fitting if word.strip() in identifiers[row]]
+        place = numbered("row", word, len(identifiers))
+        fitting = [row for row in fitting if (word.strip() in identifiers[row] if place is None else row == place)]
         if not fitting:
             raise _no_such(word, names)
     if len(fitting) == 1:
         return fitting[0]
-    labels = [(identifiers[row] or [""])[0] or f"row {row + 1}" for row in fitting]
-    if len(set(labels)) < len(labels):
-        labels = [f"row {row + 1}" for row in fitting]
+    numbers = [f"row {row + 1}" for row in fitting]
+    labels = [(identifiers[row] or [""])[0] or number for row, number in zip(fitting, numbers, strict=True)]
+    labels = labels if len(set(labels)) == len(labels) else numbers
     fault = f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})"
     raise InputError(f"{fault}; give one as in {as_typed(labels[0], 'row', fitting[0], labels)}", key="rows")
 
@@ -391,8 +394,8 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
 
 
 def _check_flux_unit(unit: Any, role: Role) -> None:
-    kind = flux_kind(unit)
-    usual = "one such as erg / (s cm2 Angstrom)"
+    kind, usual = flux_kind(unit), "one such as erg / (s cm2 Angstrom)"
+    fault = ""
     if kind == "other":
         raise InputError.of("flux_unit", str(unit), usual)
     if kind == "total" and not role.total:
@@ -401,10 +404,9 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
     elif kind == "density" and role.total:
         fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density, but they must agree"
     elif kind == "surface brightness":
-        fault = f"the unit {unit} is per solid angle; use the flux of the whole star, such as erg / (s cm2 Angstrom)"
-    else:
-        return
-    raise InputError(fault, key="flux_unit")
+        fault = f"the unit {unit} is per solid angle; use the flux of the whole star, {usual}"
+    if fault:
+        raise InputError(fault, key="flux_unit")
 
 
 def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:

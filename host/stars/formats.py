@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
-from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
-from mauvecl.host.spectra.units import stated_units
+from mauvecl.host.stars.columns import AXES, Role, divided, is_unit, listed, role_of, stated_units, words_of
+from mauvecl.host.stars.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
 from mauvecl.host.tables import text_tables
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
 from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, text_at, unit_at
