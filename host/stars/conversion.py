@@ -394,13 +394,13 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
 
 
 def _check_flux_unit(unit: Any, role: Role) -> None:
-    kind, usual = flux_kind(unit), "one such as erg / (s cm2 Angstrom)"
+    kind, usual = flux_kind(unit), "such as erg / (s cm2 Angstrom)"
     fault = ""
     if kind == "other":
-        raise InputError.of("flux_unit", str(unit), usual)
+        raise InputError.of("flux_unit", str(unit), f"one {usual}")
     if kind == "total" and not role.total:
         fault = f"the unit {unit} is not a flux density (it is not per wavelength or frequency)"
-        fault += f"; use {usual}, or a column whose name says lambda F_lambda, such as lamFlam"
+        fault += f"; use one {usual}, or a column whose name says lambda F_lambda, such as lamFlam"
     elif kind == "density" and role.total:
         fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density, but they must agree"
     elif kind == "surface brightness":
