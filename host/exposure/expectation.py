@@ -97,10 +97,7 @@ class Expectation(Drawable, ContentEquality):
     neighbour_electrons: Float = field(default_factory=lambda: np.zeros(0))
 
     def to_specutils(self) -> Any:
-        """Convert the mean signal of the exposure, DN, and its standard deviation to a specutils Spectrum.
-
-        This needs the extra ``spectra``.
-        """
+        """Convert the exposure's mean signal and noise, DN, to a specutils Spectrum (needs the extra ``spectra``)."""
         try:
             from astropy.nddata import StdDevUncertainty
             from specutils import Spectrum
@@ -210,10 +207,7 @@ class Expectation(Drawable, ContentEquality):
 
     @cached_property
     def subtracted_dn(self) -> Float:
-        """Mean that an observer subtracts in addition to bias and dark, DN, shape (n_pixel,).
-
-        This is the mean of neighbours and, unless it counts as signal, of the sky.
-        """
+        """Mean of neighbours and, unless it counts as signal, of the sky, which observers subtract, DN, (n_pixel,)."""
         return self.neighbour_dn + self.sky_dn if self.signal == "net" else self.neighbour_dn
 
     @cached_property
@@ -299,8 +293,7 @@ class Expectation(Drawable, ContentEquality):
         """Return the signal-to-noise ratio per pixel, shape (n_pixel,).
 
         The ratio is S / sqrt(sigma_L^2 + sigma_R^2 + sigma_D^2), all in DN, where S is `signal_dn` and sigma_L is the
-        gain times the root of all electrons of light, of neighbours and sky as well. The ADC's rounding is not
-        included.
+        gain times the root of all electrons of light, of neighbours and sky as well, without the ADC's rounding.
         """
         return _ratio(self.signal_dn, self._noise_dn2)
 
@@ -542,21 +535,18 @@ def _saturation(x: Expectation) -> list[str]:
     safe_s = _safe_frame_s(x)
     flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
     name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
-    text = (
-        f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and reach it in "
-        f"{100 * touched:.3g} % of exposures; in frames of up to {safe_s:g} s none does on average."
-    )
-    if x.saturated.any():
-        # First and last wavelength of each run of saturated pixels.
-        runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
-        where = ", ".join(runs)
-        if len(runs) > MOST_RUNS:
-            where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
-        text = (
-            f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach "
-            f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s."
-        )
-    return [Message(text, "saturated")]
+    if not x.saturated.any():
+        near = f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and reach it in"
+        safe = f"in frames of up to {safe_s:g} s none does on average"
+        return [Message(f"{near} {100 * touched:.3g} % of exposures; {safe}.", "saturated")]
+    # First and last wavelength of each run of saturated pixels.
+    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
+    where = ", ".join(runs)
+    if len(runs) > MOST_RUNS:
+        where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
+    pixels = f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach"
+    reached = f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s"
+    return [Message(f"{pixels} {reached}.", "saturated")]
 
 
 def _faint_enough(electrons: Float, name: str) -> Float:

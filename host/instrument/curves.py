@@ -64,8 +64,7 @@ class SpectralCurve:
     def read(cls, path: str | Path) -> SpectralCurve:
         """Read an ECSV table of two columns with units: wavelength, and the value (A/W, per cent or dimensionless).
 
-        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
-        is missing or is not such a table.
+        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`.
         """
         with _opened(path, "curve file") as (table, source):
             if "wavelength" not in table.columns or len(table.columns) != 2:
@@ -120,9 +119,9 @@ class PixelMap(ContentEquality):
     def __post_init__(self) -> None:
         sizes = set()
         for name in COLUMNS:
-            if getattr(self, name) is None:
+            if (given := getattr(self, name)) is None:
                 continue
-            values = np.asarray(getattr(self, name), np.float64)
+            values = np.asarray(given, np.float64)
             if values.ndim != 1:
                 fault = f"{name} of the pixel map must have one value per pixel, not the shape {values.shape}"
                 raise InputError(fault, key=name)
@@ -144,11 +143,9 @@ class PixelMap(ContentEquality):
     @property
     def digest(self) -> str:
         """SHA-256 of the values."""
-        hashed = hashlib.sha256()
-        for name in COLUMNS:
-            if (values := getattr(self, name)) is not None:
-                hashed.update(name.encode() + values.tobytes())
-        return hashed.hexdigest()
+        held = ((name, getattr(self, name)) for name in COLUMNS)
+        parts = (name.encode() + values.tobytes() for name, values in held if values is not None)
+        return hashlib.sha256(b"".join(parts)).hexdigest()
 
     def __repr__(self) -> str:
         # The instrument's digest is computed from representations.
@@ -180,8 +177,7 @@ class PixelMap(ContentEquality):
     ) -> PixelMap:
         """Draw a map with assumed scatter, to test pipelines; it describes no real detector.
 
-        Response and dark have a relative scatter, log-normal. `hot_share` is the fraction of hot pixels, and `hot_dark`
-        the factor on their dark current.
+        Response and dark have a log-normal scatter. `hot_share` of the pixels have a dark current of `hot_dark` times.
         """
         generator = np.random.default_rng(seed)
         response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)
@@ -203,12 +199,9 @@ class PixelMap(ContentEquality):
 
     def over(self, name: str, chosen: slice, nominal: float) -> Float:
         """Return a column over a range of pixels: factors times `nominal`, or the values that replace it."""
-        values = getattr(self, name)
-        size = len(range(*chosen.indices(self.size)))
-        if values is None:
-            return np.full(size, nominal)
-        part = values[chosen]
-        return np.asarray(part if COLUMNS[name] == u.DN else nominal * part)
+        if (values := getattr(self, name)) is None:
+            return np.full(len(range(*chosen.indices(self.size))), nominal)
+        return np.asarray(values[chosen] if COLUMNS[name] == u.DN else nominal * values[chosen])
 
 
 #: Share of the variances of a covariance that is lost by leaving out the smallest modes.

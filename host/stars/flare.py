@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import astropy.units as u
 import numpy as np
@@ -94,7 +94,7 @@ class FlareSpectrum:
     temperature_k: float | None = None  # temperature of the hottest blackbody of the flare; None for an observed flare
     # Shape (n,); wavelengths that a grid must contain so that linear interpolation conserves the flux.
     nodes_nm: Float = np.empty(0)
-    surface: ClassVar[bool] = True  # whether `flux` is that of the flare's surface, from which an area follows
+    surface: bool = True  # whether `flux` is that of the flare's surface, from which an area follows
     fixed_lines: bool = False  # whether some lines have a fixed flux at the telescope, independent of the amplitude
     messages: tuple[str, ...] = ()  # assumptions that every answer must report
 
@@ -208,19 +208,14 @@ class EmissionLine:
 
     @classmethod
     def named(cls, name: str) -> Self:
-        """Return a line or group of lines by name, or a line at a wavelength in nm.
-
-        Raises InputError for an unknown name, or a wavelength outside 100 to 1000 nm.
-        """
-        wanted = name.strip().casefold().replace("_", " ")
-        for known in (*LINES_NM, *LINE_GROUPS):
-            if wanted == known.casefold():
-                return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
+        """Return a line or group of lines by name, or a line at a wavelength of 100 to 1000 nm."""
+        names, wanted = (*LINE_GROUPS, *LINES_NM), name.strip().casefold().replace("_", " ")
+        if (known := next((one for one in names if wanted == one.casefold()), None)) is not None:
+            return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
         try:
             nm = float(name)
         except ValueError:
-            names = ", ".join((*LINE_GROUPS, *LINES_NM))
-            raise InputError.of("lines", name, f"a wavelength in nm or one of {names}") from None
+            raise InputError.of("lines", name, f"a wavelength in nm or one of {', '.join(names)}") from None
         return cls(name.strip(), (number(f"wavelength of the line {name!r}", nm, "nm", Range(100.0, 1000.0)),))
 
     @property
@@ -249,37 +244,15 @@ class FlareWithLines(FlareSpectrum):
     fluxes_cgs: Mapping[str, LineFlux] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in (*self.fractions, *self.fluxes_cgs):
-            EmissionLine.named(name)
         both = set(self.fractions) & set(self.fluxes_cgs)
         if both:
             raise InputError(f"the line {min(both)!r} needs either a fraction or a flux, but has both", key="lines")
-
-    @property
-    def temperature_k(self) -> float | None:  # type: ignore[override]
-        """Temperature of the continuum, K."""
-        return self.continuum.temperature_k
-
-    @property
-    def surface(self) -> bool:  # type: ignore[override]
-        """True if `flux` is that of the flare's surface."""
-        return self.continuum.surface
-
-    @property
-    def messages(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Assumptions of the continuum."""
-        return self.continuum.messages
-
-    @property
-    def fixed_lines(self) -> bool:  # type: ignore[override]
-        """True if some lines have a fixed flux at the telescope."""
-        return any(self.fluxes_cgs.values())
-
-    @property
-    def nodes_nm(self) -> Float:  # type: ignore[override]
-        """Nodes of the continuum and of the lines, nm."""
         lines = [EmissionLine.named(name).nodes_nm for name in (*self.fractions, *self.fluxes_cgs)]
-        return np.unique(np.concatenate([self.continuum.nodes_nm, *lines]))
+        own = {name: getattr(self.continuum, name) for name in ("temperature_k", "surface", "messages")}
+        own |= {"fixed_lines": any(self.fluxes_cgs.values())}
+        own |= {"nodes_nm": np.unique(np.concatenate([self.continuum.nodes_nm, *lines]))}
+        for name, value in own.items():
+            object.__setattr__(self, name, value)
 
     @property
     def continuum_flux(self) -> float:
@@ -318,21 +291,20 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     #: Range of the measurement; what lies outside was continued.
     measured_nm: Annotated[tuple[float, float], Unit("nm")] = (0.0, 0.0)
     messages: tuple[str, ...] = ()
-    surface: ClassVar[bool] = False
+    surface = False
 
     def __post_init__(self) -> None:
         set_read_only(self, wavelength_nm=self.wavelength_nm, flux_flam=self.flux_flam)
         check_points(self.name, self.wavelength_nm, self.flux_flam)
         ends = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
         if ends[0] > NEEDED_NM[0] or ends[1] < NEEDED_NM[1]:
-            needed = f"{NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers {ends[0]:g}-{ends[1]:g} nm"
-            fault = f"the flare spectrum {self.name} must cover {needed}"
+            fault = f"the flare spectrum {self.name} must cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers"
             remedy = "give the temperature of a blackbody that continues it"
-            raise InputError(f"{fault}; {remedy}", key="continue_at_k")
+            raise InputError(f"{fault} {ends[0]:g}-{ends[1]:g} nm; {remedy}", key="continue_at_k")
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)
-        if not self.bolometric_flux() > 0.0:
-            fault = f"the flare spectrum {self.name} needs a total flux above 0, not {self.bolometric_flux():g}"
+        if not (total := self.bolometric_flux()) > 0.0:
+            fault = f"the flare spectrum {self.name} needs a total flux above 0, not {total:g}"
             raise InputError(fault, key="flux")
 
     @classmethod
@@ -376,8 +348,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         """Read the spectrum of a star with its flare, and subtract its quiescent one, on the same scale, from it.
 
         Without `quiescent` the file has the flare alone. Formats are those of `Source.read`; the units override what
-        both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends. Raises
-        InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
+        both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends.
         """
         from mauvecl.host.stars.formats import read_spectrum
 
@@ -506,10 +477,7 @@ def check_scales(spectrum: FlareSpectrum) -> None:
 def added_light(
     nm: Float, flux_flam: Float, spectrum: FlareSpectrum, band: str, geometry: Geometry, photosphere_k: float | None
 ) -> AddedLight:
-    """Return the light of a flare of amplitude 1, without lines of a fixed flux; see `with_flare`.
-
-    `with_flare` adds it times the amplitude, whose largest value it checks.
-    """
+    """Return the light of a flare of amplitude 1, without lines of a fixed flux; see `with_flare`."""
     grid = spectrum.grid(nm)
     star = photons(grid, np.interp(grid, nm, flux_flam), band)
     if not star > 0.0:

@@ -97,30 +97,26 @@ class Source(Drawable, ContentEquality):
             nearest = cls.from_library(star.nearest)
             return replace(nearest, name=star.name, messages=(library.listed_note(name), *nearest.messages))
         if isinstance(light, library.ModelStar):
-            nm, kelvin = np.geomspace(*GRID), light.temperature_k
-            flux = (nm / PIVOT_NM) ** light.index if kelvin is None else blackbody(nm, kelvin)
-            level = "a formula has no absolute level"
-            return cls(nm, flux, light.name, light.origin, unscaled=level, temperature_k=kelvin)
+            nm, level = np.geomspace(*GRID), "a formula has no absolute level"
+            flux = (nm / PIVOT_NM) ** light.index if light.temperature_k is None else blackbody(nm, light.temperature_k)
+            return cls(nm, flux, light.name, light.origin, unscaled=level, temperature_k=light.temperature_k)
         if isinstance(light, library.OwnStar):
-            return cls(
-                *library.own_spectrum(light), light.name, light.origin, light.notes,
-                messages=light.messages, measured_nm=light.measured_nm, unscaled=light.unscaled,
-            )  # fmt: skip
+            nm, flux = (np.asarray(light.table[key], np.float64) for key in ("wavelength", "flux"))
+            own = cls(nm, flux, light.name, light.origin, light.notes, messages=light.messages,
+                      measured_nm=light.measured_nm, unscaled=light.unscaled)  # fmt: skip
+            if own.digest != light.table.meta["spectrum_sha256"]:
+                fault = f"kept star {light.name!r} must be unchanged, but its digest differs: add or fetch it again"
+                raise InputError(fault, key="name")
+            return own
         table, noisy = library.spectrum_table(light["file"]), light["noisy_below_nm"]
         limit = f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit"
+        quality = f"library spectrum {light['name']} is {light['star']}; {light['uv_quality']}"
+        kelvin = f"photosphere of {light['temperature_k']} K: {light['temperature_source']}"
         return cls(
-            table["wavelength"],
-            table["flux"],
-            light["name"],
-            f"{light['origin']}; {light['citation']}",
-            (
-                f"library spectrum {light['name']} is {light['star']}; {light['uv_quality']}",
-                f"photosphere of {light['temperature_k']} K: {light['temperature_source']}",
-            ),
-            messages=(limit,) if noisy else (),
+            table["wavelength"], table["flux"], light["name"], f"{light['origin']}; {light['citation']}",
+            (quality, kelvin), messages=(limit,) if noisy else (), temperature_k=float(light["temperature_k"]),
             unscaled="" if light["level"] == "as seen" else f"the library keeps it at {light['level']}",
-            temperature_k=float(light["temperature_k"]),
-        )
+        )  # fmt: skip
 
     @classmethod
     def read(
@@ -135,8 +131,7 @@ class Source(Drawable, ContentEquality):
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
         `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
-        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or holds no usable
-        spectrum, or less than a third of 200-700 nm.
+        180-750 nm are continued at their level. At least a third of 200-700 nm must be in the file.
 
         Parameters
         ----------
@@ -312,8 +307,8 @@ class Source(Drawable, ContentEquality):
         """
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         history = (*self.history, f"scaled to {points.band(band).name} = {magnitude:g}")
-        scaled = replace(self, flux_flam=self.flux_flam * factor, history=history)
-        return replace(scaled, scale=points.scale(band, system), unscaled="")
+        explained = {"history": history, "scale": points.scale(band, system), "unscaled": ""}
+        return replace(self, flux_flam=self.flux_flam * factor, **explained)
 
     def flaring(
         self,
@@ -353,8 +348,7 @@ class Source(Drawable, ContentEquality):
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
         """Return the star reddened by dust of a colour excess E(B-V), 0 to 10 mag (needs the extra ``extinction``).
 
-        The law is one of dust_extinction, and `rv` is A_V / E(B-V). Raises InputError if the law does not cover
-        180-750 nm, or the extra is missing.
+        The law is one of dust_extinction, which must cover 180-750 nm, and `rv` is A_V / E(B-V).
         """
         try:
             from dust_extinction import parameter_averages

@@ -61,12 +61,9 @@ def band(name: str) -> Band:
 def scale(name: str, system: System = "catalogue") -> str:
     """Return a sentence that explains the magnitudes of a system in a band."""
     chosen = band(name)
-    if system == "vega":
-        return f"Magnitudes in {chosen.name} have Vega at 0, unlike catalogues'."
-    if system == "ab":
-        return f"Magnitudes in {chosen.name} are AB."
     meaning = "AB" if chosen.system == "AB" else f"Vega has {chosen.vega:g}"
-    return f"Magnitudes in {chosen.name} are as in catalogues: {meaning}."
+    meanings = {"vega": "have Vega at 0, unlike catalogues'", "ab": "are AB"}
+    return f"Magnitudes in {chosen.name} {meanings.get(system, f'are as in catalogues: {meaning}')}."
 
 
 @array_cache(256)
@@ -225,11 +222,7 @@ MIN_JOIN_SNR = 5.0
 
 
 def check_points(name: str, wavelength: Float, flux: Float) -> None:
-    """Raise InputError for points that are no spectrum.
-
-    Wavelengths and fluxes, nm and erg s-1 cm-2 A-1, must have equal length and be in range; wavelengths must be finite,
-    increasing and distinct.
-    """
+    """Raise InputError for points, nm and erg s-1 cm-2 A-1, of unequal number, out of range or not increasing."""
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
         fault = f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes"
         raise InputError(f"{fault}, but needs two equal columns of at least two points", key="flux")
@@ -338,8 +331,7 @@ def continued(
 
     `needed_nm` is the range of the pixels; the line spread function, by default that of the nominal instrument, reaches
     beyond it as `SPAN_NM` beyond `NEEDED_NM`. With `dark_only`, ends that are too bright or within the range of the
-    pixels are left unchanged. Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest
-    pixel's light.
+    pixels are left unchanged; otherwise a continuation must be at most `MAX_CONTINUED` of the brightest pixel's light.
     """
     span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
     if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
@@ -401,8 +393,7 @@ def extended(
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
 
-    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
-    InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
+    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue.
     """
     longer, nm, others = other
     messages = []

@@ -22,8 +22,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mauvecl.host.stars.conversion import ReadSpectrum
-from mauvecl.host.stars.formats import read_spectrum
 from mauvecl.host.stars.flare import ObservedFlare
+from mauvecl.host.stars.formats import read_spectrum
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import as_text, parsing, toml
 from mauvecl.observations.frame_files import read_frames
