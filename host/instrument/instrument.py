@@ -39,10 +39,7 @@ MAX_EXTENDED = 16
 
 
 def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
-    """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path.
-
-    The source is empty for a path, whose file states it.
-    """
+    """Return value and source of an entry: a value, a table of value, tag and source, or a path, whose file has it."""
     source = f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]

@@ -23,9 +23,6 @@ from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, 
 from mauvecl.host.tables.names import key_of
 from mauvecl.schema.errors import InputError
 
-#: Unit of the fluxes of kept stars.
-FLUX = "erg / (s cm2 Angstrom)"
-
 
 def add(
     path: str | Path,
@@ -49,7 +46,7 @@ def add(
     check_covers(source)
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
-    table = Table([source.wavelength_nm, source.flux_flam], names=("wavelength", "flux"), units=("nm", FLUX))
+    table = Table(source.table)
     table.meta = {
         "name": name,
         "origin": origin or f"file {file.name}",

@@ -11,12 +11,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 from mauvecl.host.tables.names import by_word, key_of
-from mauvecl.host.tables.units import NO_FLUX, SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
+from mauvecl.host.tables.units import NO_FLUX, SCALE, balanced, is_stated, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
+#: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
+FluxKind = Literal["density", "total", "surface brightness", "other"]
 Kind = Literal[
     "wavelength", "lower edge", "upper edge", "flux", "model", "error", "quality", "continuum", "counts", "background",
     "width", "magnitude", "throughput", "luminosity", "unknown",
@@ -184,6 +186,32 @@ def _kinds_of_unit(unit: str | None) -> tuple[bool, bool, FluxKind]:
     if parsed is None or str(parsed) == "dex":
         return False, False, "other"
     return True, is_spectral(parsed), flux_kind(parsed)
+
+
+def linear(unit: Any) -> Any:
+    """Return the linear unit of a logarithmic unit or magnitude; others unchanged."""
+    return getattr(unit, "physical_unit", unit)
+
+
+def is_spectral(unit: Any) -> bool:
+    """Return whether a unit is one of wavelength, frequency, wavenumber or photon energy."""
+    import astropy.units as u
+
+    return bool(linear(unit).is_equivalent(u.m, u.spectral()))
+
+
+def flux_kind(unit: Any) -> FluxKind:
+    """Classify a unit of flux."""
+    import astropy.units as u
+
+    unit = linear(unit)
+    per_area = (u.W / u.m**2, u.photon / (u.s * u.m**2))
+    densities = tuple(one / per for one in per_area for per in (u.m, u.Hz))
+    if unit.is_equivalent(densities):
+        return "density"
+    if unit.is_equivalent(per_area):
+        return "total"
+    return "surface brightness" if (unit * u.sr).is_equivalent(densities + per_area) else "other"
 
 
 def divided(name: str) -> tuple[str, str | None]:

@@ -301,10 +301,7 @@ class Source(Drawable, ContentEquality):
         return points.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
     def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: points.System = "catalogue") -> Self:
-        """Return the star scaled to a magnitude, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1).
-
-        Band and system are those of `magnitude`.
-        """
+        """Return the star scaled to a `magnitude`, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1)."""
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         history = (*self.history, f"scaled to {points.band(band).name} = {magnitude:g}")
         explained = {"history": history, "scale": points.scale(band, system), "unscaled": ""}

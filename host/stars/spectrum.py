@@ -68,10 +68,7 @@ def scale(name: str, system: System = "catalogue") -> str:
 
 @array_cache(256)
 def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: System = "catalogue") -> float:
-    """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in the band of a name or alias.
-
-    Raises InputError if the spectrum does not cover the band or has no light in it.
-    """
+    """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in a band that it must cover, by name or alias."""
     chosen = _covered(wavelength_nm, name)
     grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0
     star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
@@ -90,7 +87,7 @@ def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: S
 
 @array_cache(256)
 def photons(wavelength_nm: Float, flux_flam: Float, name: str) -> float:
-    """Return the photons s-1 cm-2 in a band, weighted by its throughput; raises as `magnitude`."""
+    """Return the photons s-1 cm-2 in a band, weighted by its throughput; see `magnitude`."""
     chosen = _covered(wavelength_nm, name)
     at, light = _photon_density(wavelength_nm, flux_flam, chosen)
     grid = np.union1d(at, chosen.wavelength_nm * ANGSTROM)

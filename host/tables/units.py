@@ -19,9 +19,6 @@ from mauvecl.schema.errors import InputError, shortened
 if TYPE_CHECKING:
     import astropy.units as u
 
-#: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
-FluxKind = Literal["density", "total", "surface brightness", "other"]
-
 _DENSITIES = {
     "flam": "erg / (s cm2 Angstrom)",
     "fnu": "erg / (s cm2 Hz)",
@@ -149,33 +146,6 @@ def balanced(name: str) -> str:
     while name[-1:] == ")" and name.count(")") > name.count("("):
         name = name[:-1]
     return name.strip()
-
-
-def linear(unit: Any) -> u.UnitBase:
-    """Return the linear unit of a logarithmic unit or magnitude; others unchanged."""
-    physical: u.UnitBase = getattr(unit, "physical_unit", unit)
-    return physical
-
-
-def is_spectral(unit: Any) -> bool:
-    """Return whether a unit is one of wavelength, frequency, wavenumber or photon energy."""
-    import astropy.units as u
-
-    return bool(linear(unit).is_equivalent(u.m, u.spectral()))
-
-
-def flux_kind(unit: Any) -> FluxKind:
-    """Classify a unit of flux."""
-    import astropy.units as u
-
-    unit = linear(unit)
-    per_area = (u.W / u.m**2, u.photon / (u.s * u.m**2))
-    densities = tuple(one / per for one in per_area for per in (u.m, u.Hz))
-    if unit.is_equivalent(densities):
-        return "density"
-    if unit.is_equivalent(per_area):
-        return "total"
-    return "surface brightness" if (unit * u.sr).is_equivalent(densities + per_area) else "other"
 
 
 #: Epochs by name, as modified Julian dates: of TESS and Kepler (their archive manuals), GPS and Unix seconds.

@@ -96,10 +96,7 @@ class FieldValues:
         return data
 
     def _value(self, name: str, folder: Path) -> Any:
-        """Return the value of a field's key, whose file is written to a folder.
-
-        It is None if the field is empty, or if another field's value or file leaves its key out of a study.
-        """
+        """Return the value of a field's key, with its file in a folder, or None if it is empty or has no effect."""
         values, uploads, page_field = self.values, self.uploads, FIELDS[name]
         conditions: dict[str, bool] = {
             # Files are written in nm.
