@@ -303,7 +303,7 @@ class Source(Drawable, ContentEquality):
     def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: points.System = "catalogue") -> Self:
         """Return the star scaled to a `magnitude`, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1)."""
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
-        history = (*self.history, f"scaled to {points.band(band).name} = {magnitude:g}")
+        history = (*self.history, f"scaled to {library.known_band(band)} = {magnitude:g}")
         explained = {"history": history, "scale": points.scale(band, system), "unscaled": ""}
         return replace(self, flux_flam=self.flux_flam * factor, **explained)
 
@@ -336,7 +336,7 @@ class Source(Drawable, ContentEquality):
         light = Blackbody(temperature) if spectrum is None else spectrum
         photosphere = self.temperature_k if photosphere_temperature is None else photosphere_temperature
         nm, flux = with_flare(self.wavelength_nm, self.flux_flam, amplitude, light, band, geometry, photosphere)
-        title = f"flare of {100 * amplitude:g} % in {points.band(band).name} at {light.describe()}, {geometry}"
+        title = f"flare of {100 * amplitude:g} % in {library.known_band(band)} at {light.describe()}, {geometry}"
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
         history, messages = (*self.history, title), (*self.messages, *light.messages)

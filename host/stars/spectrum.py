@@ -8,7 +8,6 @@ longer than everything else that a star needs.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Literal
 
@@ -18,6 +17,7 @@ from astropy.constants import c, h
 
 from mauvecl.host.arrays import Bool, Float, array_cache, true_runs
 from mauvecl.host.stars.library import known_band, spectrum_table
+from mauvecl.host.tables.files import Numbers
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,51 +38,40 @@ SAME_WAVELENGTH_A = 1e-12
 AB_ZERO = 10.0 ** (48.6 / -2.5)
 
 
-@dataclass(frozen=True, eq=False)
-class Band:
-    """A photometric band."""
-
-    name: str
-    system: Literal["Vega", "AB"]  # magnitude system of catalogues in this band
-    vega: float  # Vega's magnitude in that system; NaN for AB
-    wavelength_nm: Float  # shape (n,)
-    throughput: Float  # relative response per photon, shape (n,)
-
-
 @cache
-def band(name: str) -> Band:
-    """Return a band, given its name or alias in any case."""
-    name = known_band(name)
-    table = spectrum_table(f"{name.lower().replace(' ', '_')}.ecsv", "bands")
-    vega = float(table.meta.get("vega", np.nan))
-    return Band(name, table.meta["system"], vega, table["wavelength"], table["throughput"])
+def band(name: str) -> Numbers:
+    """Return wavelengths, nm, and throughput per photon of a band, given its name or alias in any case.
+
+    The metadata are its name, the system of catalogues in it ("AB" or "Vega"), and Vega's magnitude in the latter.
+    """
+    return spectrum_table(f"{known_band(name).lower().replace(' ', '_')}.ecsv", "bands")
 
 
 def scale(name: str, system: System = "catalogue") -> str:
     """Return a sentence that explains the magnitudes of a system in a band."""
-    chosen = band(name)
-    meaning = "AB" if chosen.system == "AB" else f"Vega has {chosen.vega:g}"
+    told = band(name).meta
+    meaning = "AB" if told["system"] == "AB" else f"Vega has {told['vega']:g}"
     meanings = {"vega": "have Vega at 0, unlike catalogues'", "ab": "are AB"}
-    return f"Magnitudes in {chosen.name} {meanings.get(system, f'are as in catalogues: {meaning}')}."
+    return f"Magnitudes in {told['name']} {meanings.get(system, f'are as in catalogues: {meaning}')}."
 
 
 @array_cache(256)
 def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: System = "catalogue") -> float:
     """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in a band that it must cover, by name or alias."""
     chosen = _covered(wavelength_nm, name)
-    grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0
+    grid = np.union1d(wavelength_nm, chosen["wavelength"]) * 10.0
     star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
     if not star > 0.0:
-        raise InputError(f"the spectrum must have light in the band {chosen.name}, but has none", key="band")
-    if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
+        raise InputError(f"the spectrum must have light in the band {chosen.meta['name']}, but has none", key="band")
+    if system == "ab" or (system == "catalogue" and chosen.meta["system"] == "AB"):
         # The mean flux per wavelength, converted at the pivot wavelength.
-        at, through = chosen.wavelength_nm * ANGSTROM, chosen.throughput
+        at, through = chosen["wavelength"] * ANGSTROM, chosen["throughput"]
         pivot = float(np.sqrt(np.trapezoid(through * at, at) / np.trapezoid(through / at, at)))
         mean = HC * star / float(np.trapezoid(grid * _interpolate(grid, at, through), grid))
         return -2.5 * math.log10(mean * pivot**2 / c.to_value(u.AA / u.s) / AB_ZERO)
     vega = spectrum_table("vega.ecsv")
-    zero = math.log10(photons(vega["wavelength"], vega["flux"], chosen.name))
-    return 2.5 * (zero - math.log10(star)) + (chosen.vega if system == "catalogue" else 0.0)
+    zero = math.log10(photons(vega["wavelength"], vega["flux"], chosen.meta["name"]))
+    return 2.5 * (zero - math.log10(star)) + (float(chosen.meta["vega"]) if system == "catalogue" else 0.0)
 
 
 @array_cache(256)
@@ -90,40 +79,40 @@ def photons(wavelength_nm: Float, flux_flam: Float, name: str) -> float:
     """Return the photons s-1 cm-2 in a band, weighted by its throughput; see `magnitude`."""
     chosen = _covered(wavelength_nm, name)
     at, light = _photon_density(wavelength_nm, flux_flam, chosen)
-    grid = np.union1d(at, chosen.wavelength_nm * ANGSTROM)
+    grid = np.union1d(at, chosen["wavelength"] * ANGSTROM)
     return _photon_rate(grid[np.append(np.diff(grid) > SAME_WAVELENGTH_A, True)], at, light, chosen)
 
 
-def _covered(wavelength_nm: Float, name: str) -> Band:
+def _covered(wavelength_nm: Float, name: str) -> Numbers:
     """Return a band; raises InputError if the spectrum does not cover it."""
     chosen = band(name)
-    inside = (chosen.wavelength_nm >= wavelength_nm[0]) & (chosen.wavelength_nm <= wavelength_nm[-1])
-    seen, whole = np.trapezoid([chosen.throughput * inside, chosen.throughput], chosen.wavelength_nm)
+    inside = (chosen["wavelength"] >= wavelength_nm[0]) & (chosen["wavelength"] <= wavelength_nm[-1])
+    seen, whole = np.trapezoid([chosen["throughput"] * inside, chosen["throughput"]], chosen["wavelength"])
     share = seen / whole
     if share < COVERAGE:
-        band_nm, own_nm = (f"({nm[0]:.0f}-{nm[-1]:.0f} nm)" for nm in (chosen.wavelength_nm, wavelength_nm))
-        needed = f"{COVERAGE:.0%} of the band {chosen.name} {band_nm}"
+        band_nm, own_nm = (f"({nm[0]:.0f}-{nm[-1]:.0f} nm)" for nm in (chosen["wavelength"], wavelength_nm))
+        needed = f"{COVERAGE:.0%} of the band {chosen.meta['name']} {band_nm}"
         raise InputError(f"the spectrum must cover {needed}, but covers {share:.0%} {own_nm}", key="band")
     return chosen
 
 
-def _photon_density(wavelength_nm: Float, flux_flam: Float, chosen: Band) -> tuple[Float, Float]:
+def _photon_density(wavelength_nm: Float, flux_flam: Float, chosen: Numbers) -> tuple[Float, Float]:
     """Return wavelengths, Angstrom, and photon flux densities, photons s-1 cm-2 A-1.
 
     A spectrum that ends within the band falls to zero over one more step of the same ratio, as in synphot.
     """
     at = wavelength_nm * ANGSTROM
     light = flux_flam * at / HC
-    seen = chosen.wavelength_nm[chosen.throughput > 0.0] * ANGSTROM
+    seen = chosen["wavelength"][chosen["throughput"] > 0.0] * ANGSTROM
     if at[0] <= seen[0] and seen[-1] <= at[-1]:
         return at, light
     before, after = at[0] ** 2 / at[1], at[-1] ** 2 / at[-2]
     return np.array([before, *at, after]), np.array([0.0, *light, 0.0])
 
 
-def _photon_rate(grid: Float, at: Float, light: Float, chosen: Band) -> float:
+def _photon_rate(grid: Float, at: Float, light: Float, chosen: Numbers) -> float:
     """Integrate photons s-1 cm-2 in a band by the trapezoidal rule on a grid in Angstrom."""
-    through = _interpolate(grid, chosen.wavelength_nm * ANGSTROM, chosen.throughput)
+    through = _interpolate(grid, chosen["wavelength"] * ANGSTROM, chosen["throughput"])
     return float(np.trapezoid(_interpolate(grid, at, light) * through, grid))
 
 
