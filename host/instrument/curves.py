@@ -251,37 +251,25 @@ class ThroughputErrors(ContentEquality):
 
     @classmethod
     def of_covariance(
-        cls,
-        wavelength_nm: ArrayLike,
-        covariance: ArrayLike,
-        source: str,
-        *,
-        names: Sequence[str] = (),
-        sums: Float | None = None,
+        cls, wavelength_nm: Float, covariance: Float, source: str, *, names: Sequence[str], sums: Float
     ) -> ThroughputErrors:
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
-        The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. If
-        `sums`, shape (n_sum, n), are weighted sums of the curve, such as the light in bands, the first modes hold all
-        errors of these sums and of the other values.
+        The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. The
+        first modes hold all errors of weighted sums of the curve, (n_sum, n), such as the light in bands, and of these.
         """
-        nm, total = np.asarray(wavelength_nm, np.float64), np.asarray(covariance, np.float64)
-        sd = np.sqrt(np.diag(total))
+        n, sd = wavelength_nm.size, np.sqrt(np.diag(covariance))
         scale = np.where(sd > 0, sd, 1.0)
-        variances, vectors = np.linalg.eigh(total / np.outer(scale, scale))
+        variances, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
         variances, vectors = np.maximum(variances[::-1], 0.0), vectors[:, ::-1]
         left = 1.0 - np.cumsum(variances) / max(variances.sum(), np.finfo(float).tiny)
         n_modes = int((left > LOST_VARIANCE).sum()) + 1
         modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :n_modes]
-        first = np.vstack([np.zeros((0, nm.size)) if sums is None else sums]) @ modes[: nm.size]
-        first = np.vstack([first, modes[nm.size :] / scale[nm.size :, None]])
-        if len(first):
-            # Any rotation of the modes has the same covariance.
-            modes = modes @ np.linalg.svd(first)[2].T
-        others = {
-            name: tuple(row[: len(first)]) for name, row in zip(names, modes[nm.size :], strict=True) if row.any()
-        }
-        return cls(nm, modes[: nm.size].T, source, others)
+        first = np.vstack([sums @ modes[:n], modes[n:] / scale[n:, None]])
+        # Any rotation of the modes has the same covariance.
+        modes = modes @ np.linalg.svd(first)[2].T
+        others = {name: tuple(row[: len(first)]) for name, row in zip(names, modes[n:], strict=True) if row.any()}
+        return cls(wavelength_nm, modes[:n].T, source, others)
 
     @classmethod
     def read(cls, path: str | Path) -> ThroughputErrors:

@@ -304,8 +304,8 @@ class Source(Drawable, ContentEquality):
         """Return the star scaled to a `magnitude`, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1)."""
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         history = (*self.history, f"scaled to {library.known_band(band)} = {magnitude:g}")
-        explained = {"history": history, "scale": points.scale(band, system), "unscaled": ""}
-        return replace(self, flux_flam=self.flux_flam * factor, **explained)
+        flux, scale = self.flux_flam * factor, points.scale(band, system)
+        return replace(self, flux_flam=flux, history=history, scale=scale, unscaled="")
 
     def flaring(
         self,
