@@ -111,8 +111,7 @@ class Sky:
 
         The table has a cell every 15 deg. Magnitudes are interpolated bilinearly, or taken from the nearest cell as in
         the paper. Cells in the solar avoidance zone have no value: the other corners share their weight, which makes
-        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel). A position whose nearest cell is in the
-        zone is refused.
+        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel). Positions nearest to those are refused.
 
         Parameters
         ----------
