@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import astropy.units as u
 import numpy as np
@@ -94,7 +94,7 @@ class FlareSpectrum:
     temperature_k: float | None = None  # temperature of the hottest blackbody of the flare; None for an observed flare
     # Shape (n,); wavelengths that a grid must contain so that linear interpolation conserves the flux.
     nodes_nm: Float = np.empty(0)
-    surface: bool = True  # whether `flux` is that of the flare's surface, from which an area follows
+    surface: ClassVar[bool] = True  # whether `flux` is that of the flare's surface, from which an area follows
     fixed_lines: bool = False  # whether some lines have a fixed flux at the telescope, independent of the amplitude
     messages: tuple[str, ...] = ()  # assumptions that every answer must report
 
@@ -244,15 +244,37 @@ class FlareWithLines(FlareSpectrum):
     fluxes_cgs: Mapping[str, LineFlux] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name in (*self.fractions, *self.fluxes_cgs):
+            EmissionLine.named(name)
         both = set(self.fractions) & set(self.fluxes_cgs)
         if both:
             raise InputError(f"the line {min(both)!r} needs either a fraction or a flux, but has both", key="lines")
+
+    @property
+    def temperature_k(self) -> float | None:  # type: ignore[override]
+        """Temperature of the continuum, K."""
+        return self.continuum.temperature_k
+
+    @property
+    def surface(self) -> bool:  # type: ignore[override]
+        """True if `flux` is that of the flare's surface."""
+        return self.continuum.surface
+
+    @property
+    def messages(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Assumptions of the continuum."""
+        return self.continuum.messages
+
+    @property
+    def fixed_lines(self) -> bool:  # type: ignore[override]
+        """True if some lines have a fixed flux at the telescope."""
+        return any(self.fluxes_cgs.values())
+
+    @property
+    def nodes_nm(self) -> Float:  # type: ignore[override]
+        """Nodes of the continuum and of the lines, nm."""
         lines = [EmissionLine.named(name).nodes_nm for name in (*self.fractions, *self.fluxes_cgs)]
-        own = {name: getattr(self.continuum, name) for name in ("temperature_k", "surface", "messages")}
-        own |= {"fixed_lines": any(self.fluxes_cgs.values())}
-        own |= {"nodes_nm": np.unique(np.concatenate([self.continuum.nodes_nm, *lines]))}
-        for name, value in own.items():
-            object.__setattr__(self, name, value)
+        return np.unique(np.concatenate([self.continuum.nodes_nm, *lines]))
 
     @property
     def continuum_flux(self) -> float:
@@ -291,7 +313,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     #: Range of the measurement; what lies outside was continued.
     measured_nm: Annotated[tuple[float, float], Unit("nm")] = (0.0, 0.0)
     messages: tuple[str, ...] = ()
-    surface = False
+    surface: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         set_read_only(self, wavelength_nm=self.wavelength_nm, flux_flam=self.flux_flam)

@@ -20,7 +20,8 @@ from mauvecl.host.stars.columns import AXES, Role, divided, is_unit, listed, rol
 from mauvecl.host.stars.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
 from mauvecl.host.tables import text_tables
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
-from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, text_at, unit_at
+from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, unit_at
+from mauvecl.host.tables.names import text_at
 from mauvecl.host.tables.opening import open_content, text_in, votables
 from mauvecl.host.tables.table import MemoryTable, Values, number_in
 from mauvecl.host.tables.units import is_stated, time_in_name

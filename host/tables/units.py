@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing
+from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing, text_at
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
@@ -412,8 +412,6 @@ _CONVERTED = tuple(
 
 def medium_of(headers: Sequence[Mapping[str, Any]]) -> Medium | None:
     """Return the medium of wavelengths that keywords of headers state, which must agree, or None."""
-    from mauvecl.host.tables.fits_tables import text_at
-
     found: dict[str, Medium] = {}
     for header in headers:
         for key in map(str, header):
