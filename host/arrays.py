@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from functools import lru_cache, wraps
+from itertools import chain
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -58,7 +59,7 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
         @wraps(function)
         def wrapper(*arguments: P.args, **named: P.kwargs) -> R:
             hashed = hashlib.sha256()
-            for value in (*arguments, *sorted(named.items())):
+            for value in (*arguments, *chain.from_iterable(sorted(named.items()))):
                 if isinstance(value, np.ndarray):
                     hashed.update(f"{value.dtype.str}{value.shape}".encode())
                     hashed.update(np.ascontiguousarray(value).data)

@@ -22,8 +22,8 @@ from refusals import refused
 from scenes import instrument, star
 
 from mauvecl import Source, Study, read_frames
-from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars import flare as flare_tables
+from mauvecl.host.stars.formats import read_spectrum
 from mauvecl.host.tables import opening
 from mauvecl.observations import frames as observed
 

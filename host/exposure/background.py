@@ -35,33 +35,8 @@ if TYPE_CHECKING:
 YEARS = (1990, 2100)
 
 
-def helioecliptic(target: SkyCoord | str, time: Time | str) -> tuple[float, float, float]:
-    """Return a target's position relative to the Sun in the true geocentric ecliptic of date, deg.
-
-    It is the absolute difference of their longitudes, 0-180, the absolute latitude, and the angle between them. The
-    arguments are those of `Sky.at`.
-    """
-    with offline():
-        from astropy.coordinates import GeocentricTrueEcliptic, get_sun
-
-        moment = parse_time(time)
-        position = parse_position(target)
-        frame = GeocentricTrueEcliptic(equinox=moment, obstime=moment)
-        sun = get_sun(moment).transform_to(frame)
-        try:
-            star = position.transform_to(frame)
-        except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
-            fault = f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic; use ICRS"
-            raise InputError(fault, key="target") from None
-        difference = float((star.lon - sun.lon).wrap_at("180d").deg)
-        return abs(difference), abs(float(star.lat.deg)), float(star.separation(sun).deg)
-
-
 def parse_time(time: Time | str, name: str = "time") -> Time:
-    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`.
-
-    The time is called `name` in errors.
-    """
+    """Return a finite time between 1990 and 2100, `name` in errors; text is ISO 8601, UTC. Call inside `offline`."""
     from astropy.time import Time
 
     moment = time
@@ -136,8 +111,7 @@ class Sky:
 
         The table has a cell every 15 deg. Magnitudes are interpolated bilinearly, or taken from the nearest cell as in
         the paper. Cells in the solar avoidance zone have no value: the other corners share their weight, which makes
-        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel). Raises InputError if the nearest cell is
-        in the zone.
+        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel). Positions nearest to those are refused.
 
         Parameters
         ----------
@@ -148,7 +122,19 @@ class Sky:
             Single time in 1990-2100; a string is ISO 8601, UTC.
         lookup : {"bilinear", "nearest"}
         """
-        longitude, latitude, separation = helioecliptic(target, time)
+        with offline():
+            from astropy.coordinates import GeocentricTrueEcliptic, get_sun
+
+            moment, position = parse_time(time), parse_position(target)
+            frame = GeocentricTrueEcliptic(equinox=moment, obstime=moment)
+            sun = get_sun(moment).transform_to(frame)
+            try:
+                star = position.transform_to(frame)
+            except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
+                fault = f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic; use ICRS"
+                raise InputError(fault, key="target") from None
+            longitude = abs(float((star.lon - sun.lon).wrap_at("180d").deg))
+            latitude, separation = abs(float(star.lat.deg)), float(star.separation(sun).deg)
         brightness = zodiacal_brightness(longitude, latitude, separation, lookup)
         return cls(
             brightness,
@@ -198,19 +184,18 @@ def zodiacal_table() -> Float:
 def zodiacal_brightness(
     longitude_deg: float, latitude_deg: float, separation_deg: float, lookup: Lookup = "bilinear"
 ) -> float:
-    """Return the surface brightness of the zodiacal light at a position of `helioecliptic`, V mag arcsec^-2.
+    """Return the surface brightness of the zodiacal light, V mag arcsec^-2, at a position relative to the Sun.
 
-    Raises InputError if the nearest cell (of two equally near, the one farther from the Sun) is in the solar avoidance
-    zone.
+    Longitude, 0-180 deg, and latitude are absolute, in the true geocentric ecliptic of date. The nearest cell (of two
+    equally near, the one farther from the Sun) must be outside the solar avoidance zone.
     """
     table = zodiacal_table()
     row, column = longitude_deg / STEP_DEG, latitude_deg / STEP_DEG
     nearest = float(table[int(np.floor(row + 0.5)), int(np.floor(column + 0.5))])
     if np.isnan(nearest):
         place = f"helio-ecliptic longitude {longitude_deg:.1f} deg, latitude {latitude_deg:.1f} deg"
-        fault = f"the Sun is {separation_deg:.1f} deg from the target ({place})"
         needed = "which must be outside the zone of solar avoidance, some 50 deg"
-        raise InputError(f"{fault}, {needed}", key="target")
+        raise InputError(f"the Sun is {separation_deg:.1f} deg from the target ({place}), {needed}", key="target")
     if lookup == "nearest":
         return nearest
     i, j = (min(int(at), size - 2) for at, size in zip((row, column), table.shape, strict=True))
@@ -242,10 +227,7 @@ class Neighbour:
 
     @cached_property
     def spectrum(self) -> tuple[str, str]:
-        """Name of the spectrum, and the statement on its choice, empty if it is the star's own.
-
-        Raises InputError if nothing tells the spectrum.
-        """
+        """Name of the spectrum, and the statement on its choice, empty if it is the star's own."""
         if self.file is not None:
             return self.file.name, ""
         if self.spectral_type:
@@ -325,14 +307,11 @@ class Neighbours:
         beyond = "1 star beyond does not enter" if outside == 1 else f"{outside} stars beyond do not enter"
         if not inside:
             return [f"NEIGHBOURS of {target}: none within {radius:g} arcsec; {beyond}.", *self.notes]
-        named = [f"{star.name} at {star.separation_arcsec:.3g} arcsec" for star in inside[:MOST_NAMED]]
-        more = len(inside) - MOST_NAMED
+        named = ", ".join(f"{star.name} at {star.separation_arcsec:.3g} arcsec" for star in inside[:MOST_NAMED])
+        named += f" and {len(inside) - MOST_NAMED} more" if len(inside) > MOST_NAMED else ""
         stars = "1 star" if len(inside) == 1 else f"{len(inside)} stars"
-        text = (
-            f"NEIGHBOURS of {target}: the light of {stars} within {radius:g} arcsec is in the fibre "
-            f"({', '.join(named)}{f' and {more} more' if more > 0 else ''}); assumption: {100 * self.share:g} % of it "
-            "enters"
-        )
+        text = f"NEIGHBOURS of {target}: the light of {stars} within {radius:g} arcsec is in the fibre ({named})"
+        text += f"; assumption: {100 * self.share:g} % of it enters"
         chosen = [f"Light of {star.name}, {star.spectrum[1]}." for star in inside if star.spectrum[1]]
         if len(chosen) > MOST_NAMED:
             chosen = [*chosen[:MOST_NAMED], f"Spectra of {len(chosen) - MOST_NAMED} more neighbours are chosen alike."]
@@ -392,8 +371,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     for stars within the fibre a magnitude and a spectral type, spectrum file, temperature or Gaia colour, are in
     columns of any of the names in this module, in any case. Files of spectra are relative to the table. The target is
     the name of the row that is the target itself, which is left out, or coordinates such as "290.68 +11.12". Positions
-    are measured from it; it is needed if there are no separations. Raises InputError if the table has no separations
-    and no positions, or a cell is invalid.
+    are measured from it; it is needed if there are no separations.
     """
     # Only questions with such a table load the readers of files.
     from mauvecl.host.tables.opening import read_table
@@ -432,10 +410,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
 
 
 def _magnitude(table: Rows, row: int, columns: dict[str, str], bands: str | None) -> tuple[float | None, str]:
-    """Return magnitude and band of a star from the first column that has a value; None if it has none.
-
-    `columns` gives the columns' bands, empty for those that tell none, and `bands` is the column of bands.
-    """
+    """Return magnitude, None if unknown, and band of a star, from the first of `columns` (with bands) with a value."""
     for name, band in columns.items():
         value = table.number(name, row, "mag")
         if value is not None:
@@ -454,13 +429,12 @@ def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Floa
         return _from_positions(table, ra, dec, own, target), ()
     name = table.first(SEPARATIONS)
     if name is None:
-        fault = f"{table.named} has the columns {shown(', '.join(table.names), 300)}"
-        needed, key = "separation (arcsec), or ra and dec", "neighbours"
+        fault, key = f"{table.named} has the columns {shown(', '.join(table.names), 300)}", "neighbours"
+        needed = "ra and dec"
         if ra is not None:
-            fault += " and no position of the star itself"
-            own_place = "star.neighbours_of: the star's own row by name, or its coordinates"
-            needed, key = f"separation (arcsec), or {own_place}", "neighbours_of"
-        raise InputError(f"{fault}, but needs {needed}", key=key)
+            fault, key = f"{fault} and no position of the star itself", "neighbours_of"
+            needed = "star.neighbours_of: the star's own row by name, or its coordinates"
+        raise InputError(f"{fault}, but needs separation (arcsec), or {needed}", key=key)
     if target is not None and own is None:
         fault = f"{table.named} has no row named {shortened(target)}, and no positions"
         raise InputError(f"{fault}; give the name of a row, which is then left out", key="neighbours_of")
@@ -501,10 +475,7 @@ def _from_positions(table: Rows, ra: str, dec: str, own: int | None, target: str
 
 def _column(table: Rows, name: str, read: Callable[[int], float | None]) -> Float:
     """Return the values of a column that must have one in each row."""
-    values = []
-    for row in range(table.n):
-        value = read(row)
-        if value is None:
-            raise table.error(f"row {row + 1} needs a {name}", name)
-        values.append(value)
-    return np.array(values)
+    values = list(map(read, range(table.n)))
+    if None in values:
+        raise table.error(f"row {values.index(None) + 1} needs a {name}", name)
+    return np.array(values, np.float64)

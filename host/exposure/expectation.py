@@ -20,9 +20,8 @@ from mauvecl.host.exposure.background import Neighbours, Sky, check_level
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
-from mauvecl.host.spectra.units import SPAN_NM
 from mauvecl.host.stars.source import Source, check_covers, listed_star
-from mauvecl.host.stars.spectrum import continued
+from mauvecl.host.stars.spectrum import SPAN_NM, continued
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, number, table_of
 from mauvecl.schema.errors import InputError, Message, missing_package
@@ -98,10 +97,7 @@ class Expectation(Drawable, ContentEquality):
     neighbour_electrons: Float = field(default_factory=lambda: np.zeros(0))
 
     def to_specutils(self) -> Any:
-        """Convert the mean signal of the exposure, DN, and its standard deviation to a specutils Spectrum.
-
-        This needs the extra ``spectra``.
-        """
+        """Convert the exposure's mean signal and noise, DN, to a specutils Spectrum (needs the extra ``spectra``)."""
         try:
             from astropy.nddata import StdDevUncertainty
             from specutils import Spectrum
@@ -211,10 +207,7 @@ class Expectation(Drawable, ContentEquality):
 
     @cached_property
     def subtracted_dn(self) -> Float:
-        """Mean that an observer subtracts in addition to bias and dark, DN, shape (n_pixel,).
-
-        This is the mean of neighbours and, unless it counts as signal, of the sky.
-        """
+        """Mean of neighbours and, unless it counts as signal, of the sky, which observers subtract, DN, (n_pixel,)."""
         return self.neighbour_dn + self.sky_dn if self.signal == "net" else self.neighbour_dn
 
     @cached_property
@@ -300,8 +293,7 @@ class Expectation(Drawable, ContentEquality):
         """Return the signal-to-noise ratio per pixel, shape (n_pixel,).
 
         The ratio is S / sqrt(sigma_L^2 + sigma_R^2 + sigma_D^2), all in DN, where S is `signal_dn` and sigma_L is the
-        gain times the root of all electrons of light, of neighbours and sky as well. The ADC's rounding is not
-        included.
+        gain times the root of all electrons of light, of neighbours and sky as well, without the ADC's rounding.
         """
         return _ratio(self.signal_dn, self._noise_dn2)
 
@@ -381,13 +373,11 @@ def expect(
 ) -> Expectation:
     """Compute the expectation of an exposure: means and noise per pixel, without drawing anything.
 
-    Raises InputError if the source does not cover the output range, or its flux has no absolute scale.
-
     Parameters
     ----------
     source : Source or str
-        A source, which emits no light beyond its wavelengths, or a name of the library. A well-known star,
-        such as AU Mic, has the V magnitude of the embedded list.
+        A source, which must cover the output range and have an absolute scale, and emits no light beyond its
+        wavelengths, or a name of the library. A well-known star, such as AU Mic, has the V of the embedded list.
     instrument : Instrument, str or Path, optional
         An instrument, or a name or file for `Instrument.load`; "mauve" by default.
     exposure : Quantity or float
@@ -543,21 +533,18 @@ def _saturation(x: Expectation) -> list[str]:
     safe_s = _safe_frame_s(x)
     flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
     name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
-    text = (
-        f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and reach it in "
-        f"{100 * touched:.3g} % of exposures; in frames of up to {safe_s:g} s none does on average."
-    )
-    if x.saturated.any():
-        # First and last wavelength of each run of saturated pixels.
-        runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
-        where = ", ".join(runs)
-        if len(runs) > MOST_RUNS:
-            where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
-        text = (
-            f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach "
-            f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s."
-        )
-    return [Message(text, "saturated")]
+    if not x.saturated.any():
+        near = f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and reach it in"
+        safe = f"in frames of up to {safe_s:g} s none does on average"
+        return [Message(f"{near} {100 * touched:.3g} % of exposures; {safe}.", "saturated")]
+    # First and last wavelength of each run of saturated pixels.
+    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
+    where = ", ".join(runs)
+    if len(runs) > MOST_RUNS:
+        where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
+    pixels = f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach"
+    reached = f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s"
+    return [Message(f"{pixels} {reached}.", "saturated")]
 
 
 def _faint_enough(electrons: Float, name: str) -> Float:

@@ -108,8 +108,7 @@ def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
 @lru_cache(maxsize=8)
 def _product(line: LineSpread, nodes: bytes, by_light: Instrument | None) -> csr_array:
     """Return the product of both factors; in the paper's order, without the efficiencies."""
-    wavelength = np.frombuffer(nodes, np.float64)
-    gathering, *more = _gathering(line, wavelength, by_light)
+    gathering, *more = _gathering(line, np.frombuffer(nodes, np.float64), by_light)
     for part in more:
         gathering = gathering + part
     return _read_only(csr_array(_line_landing(line, _knots(by_light)) @ gathering))
@@ -142,8 +141,7 @@ def _gathering(line: LineSpread, wavelength: Float, by_light: Instrument | None)
     """Yield the terms of the second factor of the matrix, each of shape (n_panel_node, n_wavelength).
 
     An entry is the integral (nm) over a panel of one of its Lagrange polynomials times the hat function of a node, and
-    times the efficiency in the physical order. A term is that of many cells, each within one panel and between two
-    nodes.
+    times the efficiency in the physical order. A term has many cells, each within one panel and between two nodes.
     """
     panels = line.panel_edges(np.array(_knots(by_light)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])

@@ -64,8 +64,7 @@ class SpectralCurve:
     def read(cls, path: str | Path) -> SpectralCurve:
         """Read an ECSV table of two columns with units: wavelength, and the value (A/W, per cent or dimensionless).
 
-        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
-        is missing or is not such a table.
+        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`.
         """
         with _opened(path, "curve file") as (table, source):
             if "wavelength" not in table.columns or len(table.columns) != 2:
@@ -120,9 +119,9 @@ class PixelMap(ContentEquality):
     def __post_init__(self) -> None:
         sizes = set()
         for name in COLUMNS:
-            if getattr(self, name) is None:
+            if (given := getattr(self, name)) is None:
                 continue
-            values = np.asarray(getattr(self, name), np.float64)
+            values = np.asarray(given, np.float64)
             if values.ndim != 1:
                 fault = f"{name} of the pixel map must have one value per pixel, not the shape {values.shape}"
                 raise InputError(fault, key=name)
@@ -144,11 +143,9 @@ class PixelMap(ContentEquality):
     @property
     def digest(self) -> str:
         """SHA-256 of the values."""
-        hashed = hashlib.sha256()
-        for name in COLUMNS:
-            if (values := getattr(self, name)) is not None:
-                hashed.update(name.encode() + values.tobytes())
-        return hashed.hexdigest()
+        held = ((name, getattr(self, name)) for name in COLUMNS)
+        parts = (name.encode() + values.tobytes() for name, values in held if values is not None)
+        return hashlib.sha256(b"".join(parts)).hexdigest()
 
     def __repr__(self) -> str:
         # The instrument's digest is computed from representations.
@@ -180,8 +177,7 @@ class PixelMap(ContentEquality):
     ) -> PixelMap:
         """Draw a map with assumed scatter, to test pipelines; it describes no real detector.
 
-        Response and dark have a relative scatter, log-normal. `hot_share` is the fraction of hot pixels, and `hot_dark`
-        the factor on their dark current.
+        Response and dark have a log-normal scatter. `hot_share` of the pixels have a dark current of `hot_dark` times.
         """
         generator = np.random.default_rng(seed)
         response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)
@@ -203,12 +199,9 @@ class PixelMap(ContentEquality):
 
     def over(self, name: str, chosen: slice, nominal: float) -> Float:
         """Return a column over a range of pixels: factors times `nominal`, or the values that replace it."""
-        values = getattr(self, name)
-        size = len(range(*chosen.indices(self.size)))
-        if values is None:
-            return np.full(size, nominal)
-        part = values[chosen]
-        return np.asarray(part if COLUMNS[name] == u.DN else nominal * part)
+        if (values := getattr(self, name)) is None:
+            return np.full(len(range(*chosen.indices(self.size))), nominal)
+        return np.asarray(values[chosen] if COLUMNS[name] == u.DN else nominal * values[chosen])
 
 
 #: Share of the variances of a covariance that is lost by leaving out the smallest modes.
@@ -258,37 +251,25 @@ class ThroughputErrors(ContentEquality):
 
     @classmethod
     def of_covariance(
-        cls,
-        wavelength_nm: ArrayLike,
-        covariance: ArrayLike,
-        source: str,
-        *,
-        names: Sequence[str] = (),
-        sums: Float | None = None,
+        cls, wavelength_nm: Float, covariance: Float, source: str, *, names: Sequence[str], sums: Float
     ) -> ThroughputErrors:
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
-        The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. If
-        `sums`, shape (n_sum, n), are weighted sums of the curve, such as the light in bands, the first modes hold all
-        errors of these sums and of the other values.
+        The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. The
+        first modes hold all errors of weighted sums of the curve, (n_sum, n), such as the light in bands, and of these.
         """
-        nm, total = np.asarray(wavelength_nm, np.float64), np.asarray(covariance, np.float64)
-        sd = np.sqrt(np.diag(total))
+        n, sd = wavelength_nm.size, np.sqrt(np.diag(covariance))
         scale = np.where(sd > 0, sd, 1.0)
-        variances, vectors = np.linalg.eigh(total / np.outer(scale, scale))
+        variances, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
         variances, vectors = np.maximum(variances[::-1], 0.0), vectors[:, ::-1]
         left = 1.0 - np.cumsum(variances) / max(variances.sum(), np.finfo(float).tiny)
         n_modes = int((left > LOST_VARIANCE).sum()) + 1
         modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :n_modes]
-        first = np.vstack([np.zeros((0, nm.size)) if sums is None else sums]) @ modes[: nm.size]
-        first = np.vstack([first, modes[nm.size :] / scale[nm.size :, None]])
-        if len(first):
-            # Any rotation of the modes has the same covariance.
-            modes = modes @ np.linalg.svd(first)[2].T
-        others = {
-            name: tuple(row[: len(first)]) for name, row in zip(names, modes[nm.size :], strict=True) if row.any()
-        }
-        return cls(nm, modes[: nm.size].T, source, others)
+        first = np.vstack([sums @ modes[:n], modes[n:] / scale[n:, None]])
+        # Any rotation of the modes has the same covariance.
+        modes = modes @ np.linalg.svd(first)[2].T
+        others = {name: tuple(row[: len(first)]) for name, row in zip(names, modes[n:], strict=True) if row.any()}
+        return cls(wavelength_nm, modes[:n].T, source, others)
 
     @classmethod
     def read(cls, path: str | Path) -> ThroughputErrors:

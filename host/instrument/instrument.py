@@ -39,10 +39,7 @@ MAX_EXTENDED = 16
 
 
 def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
-    """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path.
-
-    The source is empty for a path, whose file states it.
-    """
+    """Return value and source of an entry: a value, a table of value, tag and source, or a path, whose file has it."""
     source = f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
@@ -339,8 +336,7 @@ class Instrument(Section):
     def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
 
-        This is the paper's efficiency times (1 - pointing_loss), in the shape of the wavelengths, a Quantity or numbers
-        in nm. Raises InputError outside the curves (`curves_nm`).
+        This is the paper's efficiency times (1 - pointing_loss), at wavelengths within the curves (`curves_nm`).
         """
         return self._optics(self._within(wavelength_nm, *self.curves_nm))
 
@@ -364,16 +360,13 @@ class Instrument(Section):
     def quantum_efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the electrons per photon that reaches the detector.
 
-        This is the sensitivity in A/W times the photon's energy divided by the electron's charge. Parameters and errors
-        as for `efficiency`.
+        This is the sensitivity in A/W times the photon's energy divided by the electron's charge.
         """
         nm = self._within(wavelength_nm, *self.curves_nm)
         return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
 
     def throughput(self, wavelength_nm: Wavelengths) -> Float:
         """Return the end-to-end throughput, electrons per photon, including the quantum efficiency.
-
-        Wavelengths and errors as for `efficiency`.
 
         Examples
         --------
@@ -386,17 +379,13 @@ class Instrument(Section):
         return self.efficiency(wavelength_nm) * self.quantum_efficiency(wavelength_nm)
 
     def effective_area_cm2(self, wavelength_nm: Wavelengths) -> Float:
-        """Return the effective area, cm^2: collecting area times throughput.
-
-        Wavelengths and errors as for `efficiency`.
-        """
+        """Return the effective area, cm^2: collecting area times throughput."""
         return self.collecting_area_cm2 * self.throughput(wavelength_nm)
 
     def electrons_per_joule_cm2(self, wavelength_nm: Wavelengths, *, held: bool = False) -> Float:
         """Return the electrons per fluence at the telescope, e- / (J cm^-2): area * efficiency * QE[A/W] / e.
 
-        Wavelengths and errors as for `efficiency`; if `held`, curves keep their end values beyond their ends (an
-        assumption) instead of raising InputError.
+        If `held`, curves keep their end values beyond their ends (an assumption) instead of raising InputError.
         """
         nm = self._within(wavelength_nm, *((0.0, np.inf) if held else self.curves_nm))
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
@@ -530,10 +519,7 @@ class LineSpread:
         return np.asarray(self.sigma * (z * ndtr(z) + np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)))
 
     def panel_edges(self, knots: Float) -> Float:
-        """Return the edges of panels in which every pixel's `landing` is smooth, shape (n_panel + 1,).
-
-        Panels also end at `knots`.
-        """
+        """Return the edges of panels, also at `knots`, in which each pixel's `landing` is smooth, (n_panel + 1,)."""
         low, high = self.centres[0] - self.reach, self.centres[-1] + self.reach
         parts = [np.array([low, high]), knots[(knots > low) & (knots < high)]]
         if self.sigma > 0:

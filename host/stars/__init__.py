@@ -1,1 +1,1 @@
-"""Spectra of stars, magnitudes, flares, the embedded library and the user's own stars."""
+"""Spectra of stars and their files, magnitudes, flares, the embedded library and the user's own stars."""

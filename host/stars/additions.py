@@ -23,9 +23,6 @@ from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, 
 from mauvecl.host.tables.names import key_of
 from mauvecl.schema.errors import InputError
 
-#: Unit of the fluxes of kept stars.
-FLUX = "erg / (s cm2 Angstrom)"
-
 
 def add(
     path: str | Path,
@@ -40,8 +37,6 @@ def add(
     """Keep a spectrum from a file, as `Source.read` reads it, under a name: by default that in its header or its own.
 
     Reports state its `origin`, by default the file name. With `replace`, a kept star of the same name is replaced.
-    Raises InputError if the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be
-    written.
     """
     from astropy.table import Table
 
@@ -51,7 +46,7 @@ def add(
     check_covers(source)
     name = (name or source.name).strip()
     place = _place_of(name, replace=replace)
-    table = Table([source.wavelength_nm, source.flux_flam], names=("wavelength", "flux"), units=("nm", FLUX))
+    table = Table(source.table)
     table.meta = {
         "name": name,
         "origin": origin or f"file {file.name}",
@@ -113,26 +108,19 @@ class Collection:
     title: str
     citation: str
     base: str  # address of the files, from the archive's pages; not verified by the tests
-    # Path of a star's file below the base, from its name and a function that lists the files of a folder.
-    file_of: Callable[[str, Callable[[str], list[str]]], str]
+    # Path of a star's file below the base, from its name as in names of files and a function that lists the files.
+    file_of: Callable[[str, Callable[[], list[str]]], str]
 
 
-def _file_name(name: str) -> str:
-    """Return a star's name as archives write it in file names."""
-    return re.sub(r"[^a-z0-9+-]", "", name.casefold())
+def _ngsl_file(plain: str, listing: Callable[[], list[str]]) -> str:
+    """Return the path of a star's file, whose name has HD numbers of six digits."""
+    padded = re.sub(r"^hd0*(\d{1,6})$", lambda match: f"hd{int(match[1]):06d}", plain)
+    return f"{padded}/h_stis_ngsl_{padded}_v2.fits"
 
 
-def _six_digit_name(name: str) -> str:
-    """Return a star's name as in file names, with HD numbers padded to six digits."""
-    plain = _file_name(name)
-    match = re.fullmatch(r"(hd)0*(\d{1,6})", plain)
-    return f"{match[1]}{int(match[2]):06d}" if match else plain
-
-
-def _latest_calspec(name: str, listing: Callable[[str], list[str]]) -> str:
+def _latest_calspec(plain: str, listing: Callable[[], list[str]]) -> str:
     """Return the name of a star's STIS file with the highest version number."""
-    plain = _file_name(name)
-    files = [file for file in listing("") if re.fullmatch(rf"{re.escape(plain)}_stis(wfcnic|wfc|nic)?_\d+\.fits", file)]
+    files = [file for file in listing() if re.fullmatch(rf"{re.escape(plain)}_stis(wfcnic|wfc|nic)?_\d+\.fits", file)]
     if not files:
         raise FileNotFoundError(plain)
     return max(files, key=lambda file: (int(file.rsplit("_", 1)[1][:-5]), file))
@@ -151,14 +139,14 @@ COLLECTIONS = (
         "Next Generation Spectral Library, version 2",
         "Heap & Lindler 2007, ASP Conf. Ser. 374, 409",
         "https://archive.stsci.edu/pub/hlsp/stisngsl/v2/",
-        lambda name, listing: f"{_six_digit_name(name)}/h_stis_ngsl_{_six_digit_name(name)}_v2.fits",
+        _ngsl_file,
     ),
     Collection(
         "lowlib",
         "the HST stellar library of 513 stars, dereddened",
         "Pal et al. 2023, doi 10.17909/kmdt-pw63",
         "https://archive.stsci.edu/hlsps/lowlib/",
-        lambda name, listing: f"hlsp_lowlib_hst_stis_{_file_name(name)}_g230lb-g430l-g750l_v1.0_spect.fits",
+        lambda plain, listing: f"hlsp_lowlib_hst_stis_{plain}_g230lb-g430l-g750l_v1.0_spect.fits",
     ),
 )
 
@@ -174,8 +162,7 @@ def fetch(
     """Download a star from a public collection and keep it, as `add` does.
 
     A name such as ``"HD 37202"`` is searched for in all collections, ``"ngsl:HD 37202"`` in one, of whose files `base`
-    may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end. Raises
-    InputError if the network fails, the star is unknown, or its file holds no usable spectrum.
+    may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end.
     """
     word, colon, star = (part.strip() for part in name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
@@ -184,12 +171,13 @@ def fetch(
     if base is not None and not colon:
         raise InputError(f"with another address, {name!r} must name its collection too, as in ngsl:{name}", key="name")
     star = star if colon else word
-    if not _file_name(star):
+    plain = re.sub(r"[^a-z0-9+-]", "", star.casefold())
+    if not plain:
         raise InputError(f"star {name!r} has an empty name; give a name such as ngsl:HD 37202", key="name")
     for collection in chosen:
         try:
             address = _folder(base or collection.base)
-            url = urljoin(address, collection.file_of(star, partial(_listing, address)))
+            url = urljoin(address, collection.file_of(plain, partial(_listing, address)))
             content = _download(url, limit_bytes("MAUVECL_LARGEST_FILE_MIB"), show_progress)
         except FileNotFoundError:
             continue
@@ -264,7 +252,7 @@ def _download(url: str, max_bytes: int, show_progress: bool) -> bytes:
     return bytes(content)
 
 
-def _listing(address: str, below: str) -> list[str]:
+def _listing(address: str) -> list[str]:
     """Return the names of the files to which a server's page of a folder links."""
-    text = _download(urljoin(address, below), MAX_LISTING_BYTES, False).decode("utf-8", "replace")
+    text = _download(address, MAX_LISTING_BYTES, False).decode("utf-8", "replace")
     return [link.rsplit("/", 1)[-1] for link in re.findall(r'href="([^"?#]+)"', text, flags=re.IGNORECASE)]

@@ -18,8 +18,7 @@ from astropy.constants import c, h, k_B
 from numpy.typing import ArrayLike
 
 from mauvecl.host.arrays import ContentEquality, Float, array_cache, set_read_only
-from mauvecl.host.spectra.units import NEEDED_NM
-from mauvecl.host.stars.spectrum import ANGSTROM, attached, check_points, photons, supplemented
+from mauvecl.host.stars.spectrum import ANGSTROM, NEEDED_NM, attached, check_points, photons, supplemented
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.schema import fields
 from mauvecl.schema.calls import validated
@@ -209,19 +208,14 @@ class EmissionLine:
 
     @classmethod
     def named(cls, name: str) -> Self:
-        """Return a line or group of lines by name, or a line at a wavelength in nm.
-
-        Raises InputError for an unknown name, or a wavelength outside 100 to 1000 nm.
-        """
-        wanted = name.strip().casefold().replace("_", " ")
-        for known in (*LINES_NM, *LINE_GROUPS):
-            if wanted == known.casefold():
-                return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
+        """Return a line or group of lines by name, or a line at a wavelength of 100 to 1000 nm."""
+        names, wanted = (*LINE_GROUPS, *LINES_NM), name.strip().casefold().replace("_", " ")
+        if (known := next((one for one in names if wanted == one.casefold()), None)) is not None:
+            return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
         try:
             nm = float(name)
         except ValueError:
-            names = ", ".join((*LINE_GROUPS, *LINES_NM))
-            raise InputError.of("lines", name, f"a wavelength in nm or one of {names}") from None
+            raise InputError.of("lines", name, f"a wavelength in nm or one of {', '.join(names)}") from None
         return cls(name.strip(), (number(f"wavelength of the line {name!r}", nm, "nm", Range(100.0, 1000.0)),))
 
     @property
@@ -326,14 +320,13 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         check_points(self.name, self.wavelength_nm, self.flux_flam)
         ends = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
         if ends[0] > NEEDED_NM[0] or ends[1] < NEEDED_NM[1]:
-            needed = f"{NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers {ends[0]:g}-{ends[1]:g} nm"
-            fault = f"the flare spectrum {self.name} must cover {needed}"
+            fault = f"the flare spectrum {self.name} must cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers"
             remedy = "give the temperature of a blackbody that continues it"
-            raise InputError(f"{fault}; {remedy}", key="continue_at_k")
+            raise InputError(f"{fault} {ends[0]:g}-{ends[1]:g} nm; {remedy}", key="continue_at_k")
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)
-        if not self.bolometric_flux() > 0.0:
-            fault = f"the flare spectrum {self.name} needs a total flux above 0, not {self.bolometric_flux():g}"
+        if not (total := self.bolometric_flux()) > 0.0:
+            fault = f"the flare spectrum {self.name} needs a total flux above 0, not {total:g}"
             raise InputError(fault, key="flux")
 
     @classmethod
@@ -377,10 +370,9 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         """Read the spectrum of a star with its flare, and subtract its quiescent one, on the same scale, from it.
 
         Without `quiescent` the file has the flare alone. Formats are those of `Source.read`; the units override what
-        both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends. Raises
-        InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
+        both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends.
         """
-        from mauvecl.host.spectra.formats import read_spectrum
+        from mauvecl.host.stars.formats import read_spectrum
 
         units: dict[str, Any] = {"wavelength_unit": wavelength_unit, "flux_unit": flux_unit}
         read = read_spectrum(Path(path), **units)
@@ -507,10 +499,7 @@ def check_scales(spectrum: FlareSpectrum) -> None:
 def added_light(
     nm: Float, flux_flam: Float, spectrum: FlareSpectrum, band: str, geometry: Geometry, photosphere_k: float | None
 ) -> AddedLight:
-    """Return the light of a flare of amplitude 1, without lines of a fixed flux; see `with_flare`.
-
-    `with_flare` adds it times the amplitude, whose largest value it checks.
-    """
+    """Return the light of a flare of amplitude 1, without lines of a fixed flux; see `with_flare`."""
     grid = spectrum.grid(nm)
     star = photons(grid, np.interp(grid, nm, flux_flam), band)
     if not star > 0.0:

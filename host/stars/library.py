@@ -9,11 +9,10 @@ from __future__ import annotations
 import contextlib
 import csv
 import difflib
-import hashlib
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -25,7 +24,6 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Temperature, checked, number
 
 if TYPE_CHECKING:
-    import numpy as np
     from astropy.table import Table
 
 
@@ -57,11 +55,11 @@ class OwnStar:
     name: str
     origin: str
     notes: tuple[str, ...]
+    messages: tuple[str, ...]
+    measured_nm: tuple[float, float] | None
+    unscaled: str
     table: Table
     path: Path
-    messages: tuple[str, ...] = ()
-    measured_nm: tuple[float, float] | None = None
-    unscaled: str = ""
 
 
 def folder() -> Path:
@@ -88,23 +86,10 @@ def _described(path: Path) -> OwnStar | None:
     meta = table.meta
     if not {"name", "origin", "spectrum_sha256"} <= set(meta):
         return None
+    name, origin, unscaled = (str(meta.get(key, "")) for key in ("name", "origin", "unscaled"))
     notes, messages = (tuple(map(str, meta.get(key, ()))) for key in ("notes", "told"))
-    measured = meta.get("measured_nm")
-    return OwnStar(
-        str(meta["name"]), str(meta["origin"]), notes, table, path, messages,
-        None if measured is None else (float(measured[0]), float(measured[1])), str(meta.get("unscaled", "")),
-    )  # fmt: skip
-
-
-def own_spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
-    """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1; raises InputError if the file was changed."""
-    import numpy as np
-
-    wavelength, flux = (np.asarray(star.table[name], float) for name in ("wavelength", "flux"))
-    if hashlib.sha256(wavelength.tobytes() + flux.tobytes()).hexdigest() != star.table.meta["spectrum_sha256"]:
-        fault = f"kept star {star.name!r} must be unchanged, but its digest differs: add or fetch it again"
-        raise InputError(fault, key="name")
-    return wavelength, flux
+    measured = None if (ends := meta.get("measured_nm")) is None else (float(ends[0]), float(ends[1]))
+    return OwnStar(name, origin, notes, messages, measured, unscaled, table, path)
 
 
 def remove(name: str) -> None:
@@ -164,13 +149,12 @@ def _rows(file: str) -> list[dict[str, str]]:
 @cache
 def well_known_stars() -> tuple[WellKnown, ...]:
     """Return the stars of the list."""
-    return tuple(
-        WellKnown(
-            row["name"], tuple(name.strip() for name in row["other_names"].split(",")), float(row["ra"]),
-            float(row["dec"]), float(row["distance"]), float(row["V"]), row["spectral_type"], row["source"],
-        )
-        for row in _rows("well_known.ecsv")
-    )  # fmt: skip
+    stars = []
+    for row in _rows("well_known.ecsv"):
+        others = tuple(name.strip() for name in row["other_names"].split(","))
+        ra, dec, distance, v = (float(row[key]) for key in ("ra", "dec", "distance", "V"))
+        stars.append(WellKnown(row["name"], others, ra, dec, distance, v, row["spectral_type"], row["source"]))
+    return tuple(stars)
 
 
 @cache
@@ -256,10 +240,7 @@ def library_table() -> Table:
 
 
 def embedded(name: str) -> dict[str, str] | None:
-    """Return the index entry of an embedded spectrum by name, alias or star in any case and spacing, or None.
-
-    A type may lack its luminosity class: "M3" is M3V.
-    """
+    """Return the index entry of a spectrum by name (of a type also as "M3" for M3V), alias or star, or None."""
     key = name_key(name)
     found = _keys().get(key) or _keys().get(f"{key}v")
     return None if found is None else _index()[found]
@@ -267,10 +248,7 @@ def embedded(name: str) -> dict[str, str] | None:
 
 @lru_cache(8)
 def spectrum_table(file: str, folder: str = "spectra") -> Numbers:
-    """Read a library spectrum with the columns wavelength (nm) and flux (erg s-1 cm-2 A-1).
-
-    In the folder ``bands`` is the throughput per photon of each band in place of a flux.
-    """
+    """Read wavelength (nm) and flux (erg s-1 cm-2 A-1), in the folder ``bands`` the throughput per photon."""
     return parse_numbers(library_text(folder, file), f"library file {file}")
 
 
@@ -333,8 +311,7 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     if star is not None:
         return NamedStar(star.name, star, light)
     if light is not None:
-        named = NamedStar("", light=light)
-        return replace(named, name=named.nearest)
+        return NamedStar(light["name"] if isinstance(light, Mapping) else light.name, light=light)
     # Types of dwarfs and subgiants, such as "m3.5" for M3.5V.
     found = re.fullmatch(rf"d?([{CLASSES}])(\d(?:\.\d+)?)(IV|V)?", "".join(text.split()), flags=re.IGNORECASE)
     return None if found is None else NamedStar(f"{found[1]}{found[2]}{found[3] or 'V'}".upper())
@@ -349,10 +326,7 @@ def named_star(text: str, key: str = "star", *, own: bool = True) -> NamedStar:
 
 
 def listed_values(name: str) -> dict[str, float]:
-    """Return the V magnitude and the distance of a star of the list, as keys of a study.
-
-    They are empty for other names, and for a star whose spectrum has the level of the star.
-    """
+    """Return V and distance of a listed star, as keys of a study; none for others, or if its spectrum has a level."""
     star, entry = by_key().get(name_key(name)), embedded(name)
     if star is None or (entry is not None and entry["level"] == "as seen"):
         return {}

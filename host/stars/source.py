@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mauvecl.host.arrays import ContentEquality, Float, set_read_only
-from mauvecl.host.spectra.units import NEEDED_NM, SPAN_NM, measured_part
 from mauvecl.host.stars import library
 from mauvecl.host.stars import spectrum as points
 from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbody, with_flare
+from mauvecl.host.stars.spectrum import NEEDED_NM, SPAN_NM
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
@@ -27,7 +27,7 @@ from mauvecl.schema.fields import Amplitude, AnyUnit, BinWidth, Magnitude, Redde
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.host.spectra.conversion import ReadSpectrum
+    from mauvecl.host.stars.conversion import ReadSpectrum
 
 #: Unit of flux densities.
 FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)
@@ -97,30 +97,26 @@ class Source(Drawable, ContentEquality):
             nearest = cls.from_library(star.nearest)
             return replace(nearest, name=star.name, messages=(library.listed_note(name), *nearest.messages))
         if isinstance(light, library.ModelStar):
-            nm, kelvin = np.geomspace(*GRID), light.temperature_k
-            flux = (nm / PIVOT_NM) ** light.index if kelvin is None else blackbody(nm, kelvin)
-            level = "a formula has no absolute level"
-            return cls(nm, flux, light.name, light.origin, unscaled=level, temperature_k=kelvin)
+            nm, level = np.geomspace(*GRID), "a formula has no absolute level"
+            flux = (nm / PIVOT_NM) ** light.index if light.temperature_k is None else blackbody(nm, light.temperature_k)
+            return cls(nm, flux, light.name, light.origin, unscaled=level, temperature_k=light.temperature_k)
         if isinstance(light, library.OwnStar):
-            return cls(
-                *library.own_spectrum(light), light.name, light.origin, light.notes,
-                messages=light.messages, measured_nm=light.measured_nm, unscaled=light.unscaled,
-            )  # fmt: skip
+            nm, flux = (np.asarray(light.table[key], np.float64) for key in ("wavelength", "flux"))
+            own = cls(nm, flux, light.name, light.origin, light.notes, messages=light.messages,
+                      measured_nm=light.measured_nm, unscaled=light.unscaled)  # fmt: skip
+            if own.digest != light.table.meta["spectrum_sha256"]:
+                fault = f"kept star {light.name!r} must be unchanged, but its digest differs: add or fetch it again"
+                raise InputError(fault, key="name")
+            return own
         table, noisy = library.spectrum_table(light["file"]), light["noisy_below_nm"]
         limit = f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit"
+        quality = f"library spectrum {light['name']} is {light['star']}; {light['uv_quality']}"
+        kelvin = f"photosphere of {light['temperature_k']} K: {light['temperature_source']}"
         return cls(
-            table["wavelength"],
-            table["flux"],
-            light["name"],
-            f"{light['origin']}; {light['citation']}",
-            (
-                f"library spectrum {light['name']} is {light['star']}; {light['uv_quality']}",
-                f"photosphere of {light['temperature_k']} K: {light['temperature_source']}",
-            ),
-            messages=(limit,) if noisy else (),
+            table["wavelength"], table["flux"], light["name"], f"{light['origin']}; {light['citation']}",
+            (quality, kelvin), messages=(limit,) if noisy else (), temperature_k=float(light["temperature_k"]),
             unscaled="" if light["level"] == "as seen" else f"the library keeps it at {light['level']}",
-            temperature_k=float(light["temperature_k"]),
-        )
+        )  # fmt: skip
 
     @classmethod
     def read(
@@ -135,8 +131,7 @@ class Source(Drawable, ContentEquality):
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
         `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
-        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or holds no usable
-        spectrum, or less than a third of 200-700 nm.
+        180-750 nm are continued at their level. At least a third of 200-700 nm must be in the file.
 
         Parameters
         ----------
@@ -149,7 +144,7 @@ class Source(Drawable, ContentEquality):
         ignore_checksum : bool
             Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
         """
-        from mauvecl.host.spectra.formats import read_spectrum
+        from mauvecl.host.stars.formats import read_spectrum
 
         read = read_spectrum(
             Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit, ignore_checksum=ignore_checksum
@@ -170,7 +165,7 @@ class Source(Drawable, ContentEquality):
         wavelength, flux, cut = points.without_undefined_ends(name, wavelength, flux)
         messages = given.messages
         if given.axis_unit or extend is not None:
-            part = measured_part(wavelength)
+            part = points.measured_part(wavelength)
             share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
             messages += (f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}",)
         messages += points.remarks(wavelength, flux)
@@ -212,7 +207,7 @@ class Source(Drawable, ContentEquality):
 
         `extend` is a library spectrum, or its name, that continues the arrays beyond their ends.
         """
-        from mauvecl.host.spectra.conversion import ReadSpectrum
+        from mauvecl.host.stars.conversion import ReadSpectrum
 
         try:
             nm, values = (
@@ -306,14 +301,11 @@ class Source(Drawable, ContentEquality):
         return points.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
     def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: points.System = "catalogue") -> Self:
-        """Return the star scaled to a magnitude, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1).
-
-        Band and system are those of `magnitude`.
-        """
+        """Return the star scaled to a `magnitude`, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1)."""
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
-        history = (*self.history, f"scaled to {points.band(band).name} = {magnitude:g}")
-        scaled = replace(self, flux_flam=self.flux_flam * factor, history=history)
-        return replace(scaled, scale=points.scale(band, system), unscaled="")
+        history = (*self.history, f"scaled to {library.known_band(band)} = {magnitude:g}")
+        flux, scale = self.flux_flam * factor, points.scale(band, system)
+        return replace(self, flux_flam=flux, history=history, scale=scale, unscaled="")
 
     def flaring(
         self,
@@ -344,7 +336,7 @@ class Source(Drawable, ContentEquality):
         light = Blackbody(temperature) if spectrum is None else spectrum
         photosphere = self.temperature_k if photosphere_temperature is None else photosphere_temperature
         nm, flux = with_flare(self.wavelength_nm, self.flux_flam, amplitude, light, band, geometry, photosphere)
-        title = f"flare of {100 * amplitude:g} % in {points.band(band).name} at {light.describe()}, {geometry}"
+        title = f"flare of {100 * amplitude:g} % in {library.known_band(band)} at {light.describe()}, {geometry}"
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
         history, messages = (*self.history, title), (*self.messages, *light.messages)
@@ -353,8 +345,7 @@ class Source(Drawable, ContentEquality):
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
         """Return the star reddened by dust of a colour excess E(B-V), 0 to 10 mag (needs the extra ``extinction``).
 
-        The law is one of dust_extinction, and `rv` is A_V / E(B-V). Raises InputError if the law does not cover
-        180-750 nm, or the extra is missing.
+        The law is one of dust_extinction, which must cover 180-750 nm, and `rv` is A_V / E(B-V).
         """
         try:
             from dust_extinction import parameter_averages

@@ -8,7 +8,6 @@ longer than everything else that a star needs.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Literal
 
@@ -16,9 +15,9 @@ import astropy.units as u
 import numpy as np
 from astropy.constants import c, h
 
-from mauvecl.host.arrays import Float, array_cache, true_runs
-from mauvecl.host.spectra.units import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
+from mauvecl.host.arrays import Bool, Float, array_cache, true_runs
 from mauvecl.host.stars.library import known_band, spectrum_table
+from mauvecl.host.tables.files import Numbers
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,98 +38,81 @@ SAME_WAVELENGTH_A = 1e-12
 AB_ZERO = 10.0 ** (48.6 / -2.5)
 
 
-@dataclass(frozen=True, eq=False)
-class Band:
-    """A photometric band."""
-
-    name: str
-    system: Literal["Vega", "AB"]  # magnitude system of catalogues in this band
-    vega: float  # Vega's magnitude in that system; NaN for AB
-    wavelength_nm: Float  # shape (n,)
-    throughput: Float  # relative response per photon, shape (n,)
-
-
 @cache
-def band(name: str) -> Band:
-    """Return a band, given its name or alias in any case."""
-    name = known_band(name)
-    table = spectrum_table(f"{name.lower().replace(' ', '_')}.ecsv", "bands")
-    vega = float(table.meta.get("vega", np.nan))
-    return Band(name, table.meta["system"], vega, table["wavelength"], table["throughput"])
+def band(name: str) -> Numbers:
+    """Return wavelengths, nm, and throughput per photon of a band, given its name or alias in any case.
+
+    The metadata are its name, the system of catalogues in it ("AB" or "Vega"), and Vega's magnitude in the latter.
+    """
+    return spectrum_table(f"{known_band(name).lower().replace(' ', '_')}.ecsv", "bands")
 
 
 def scale(name: str, system: System = "catalogue") -> str:
     """Return a sentence that explains the magnitudes of a system in a band."""
-    chosen = band(name)
-    if system == "vega":
-        return f"Magnitudes in {chosen.name} have Vega at 0, unlike catalogues'."
-    if system == "ab":
-        return f"Magnitudes in {chosen.name} are AB."
-    meaning = "AB" if chosen.system == "AB" else f"Vega has {chosen.vega:g}"
-    return f"Magnitudes in {chosen.name} are as in catalogues: {meaning}."
+    told = band(name).meta
+    meaning = "AB" if told["system"] == "AB" else f"Vega has {told['vega']:g}"
+    meanings = {"vega": "have Vega at 0, unlike catalogues'", "ab": "are AB"}
+    return f"Magnitudes in {told['name']} {meanings.get(system, f'are as in catalogues: {meaning}')}."
 
 
 @array_cache(256)
 def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: System = "catalogue") -> float:
-    """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in the band of a name or alias.
-
-    Raises InputError if the spectrum does not cover the band or has no light in it.
-    """
+    """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in a band that it must cover, by name or alias."""
     chosen = _covered(wavelength_nm, name)
-    grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0
+    grid = np.union1d(wavelength_nm, chosen["wavelength"]) * 10.0
     star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
     if not star > 0.0:
-        raise InputError(f"the spectrum must have light in the band {chosen.name}, but has none", key="band")
-    if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
+        raise InputError(f"the spectrum must have light in the band {chosen.meta['name']}, but has none", key="band")
+    if system == "ab" or (system == "catalogue" and chosen.meta["system"] == "AB"):
         # The mean flux per wavelength, converted at the pivot wavelength.
-        at, through = chosen.wavelength_nm * ANGSTROM, chosen.throughput
+        at, through = chosen["wavelength"] * ANGSTROM, chosen["throughput"]
         pivot = float(np.sqrt(np.trapezoid(through * at, at) / np.trapezoid(through / at, at)))
         mean = HC * star / float(np.trapezoid(grid * _interpolate(grid, at, through), grid))
         return -2.5 * math.log10(mean * pivot**2 / c.to_value(u.AA / u.s) / AB_ZERO)
     vega = spectrum_table("vega.ecsv")
-    zero = math.log10(photons(vega["wavelength"], vega["flux"], chosen.name))
-    return 2.5 * (zero - math.log10(star)) + (chosen.vega if system == "catalogue" else 0.0)
+    zero = math.log10(photons(vega["wavelength"], vega["flux"], chosen.meta["name"]))
+    return 2.5 * (zero - math.log10(star)) + (float(chosen.meta["vega"]) if system == "catalogue" else 0.0)
 
 
 @array_cache(256)
 def photons(wavelength_nm: Float, flux_flam: Float, name: str) -> float:
-    """Return the photons s-1 cm-2 in a band, weighted by its throughput; raises as `magnitude`."""
+    """Return the photons s-1 cm-2 in a band, weighted by its throughput; see `magnitude`."""
     chosen = _covered(wavelength_nm, name)
     at, light = _photon_density(wavelength_nm, flux_flam, chosen)
-    grid = np.union1d(at, chosen.wavelength_nm * ANGSTROM)
+    grid = np.union1d(at, chosen["wavelength"] * ANGSTROM)
     return _photon_rate(grid[np.append(np.diff(grid) > SAME_WAVELENGTH_A, True)], at, light, chosen)
 
 
-def _covered(wavelength_nm: Float, name: str) -> Band:
+def _covered(wavelength_nm: Float, name: str) -> Numbers:
     """Return a band; raises InputError if the spectrum does not cover it."""
     chosen = band(name)
-    inside = (chosen.wavelength_nm >= wavelength_nm[0]) & (chosen.wavelength_nm <= wavelength_nm[-1])
-    seen, whole = np.trapezoid([chosen.throughput * inside, chosen.throughput], chosen.wavelength_nm)
+    inside = (chosen["wavelength"] >= wavelength_nm[0]) & (chosen["wavelength"] <= wavelength_nm[-1])
+    seen, whole = np.trapezoid([chosen["throughput"] * inside, chosen["throughput"]], chosen["wavelength"])
     share = seen / whole
     if share < COVERAGE:
-        band_nm, own_nm = (f"({nm[0]:.0f}-{nm[-1]:.0f} nm)" for nm in (chosen.wavelength_nm, wavelength_nm))
-        needed = f"{COVERAGE:.0%} of the band {chosen.name} {band_nm}"
+        band_nm, own_nm = (f"({nm[0]:.0f}-{nm[-1]:.0f} nm)" for nm in (chosen["wavelength"], wavelength_nm))
+        needed = f"{COVERAGE:.0%} of the band {chosen.meta['name']} {band_nm}"
         raise InputError(f"the spectrum must cover {needed}, but covers {share:.0%} {own_nm}", key="band")
     return chosen
 
 
-def _photon_density(wavelength_nm: Float, flux_flam: Float, chosen: Band) -> tuple[Float, Float]:
+def _photon_density(wavelength_nm: Float, flux_flam: Float, chosen: Numbers) -> tuple[Float, Float]:
     """Return wavelengths, Angstrom, and photon flux densities, photons s-1 cm-2 A-1.
 
     A spectrum that ends within the band falls to zero over one more step of the same ratio, as in synphot.
     """
     at = wavelength_nm * ANGSTROM
     light = flux_flam * at / HC
-    seen = chosen.wavelength_nm[chosen.throughput > 0.0] * ANGSTROM
+    seen = chosen["wavelength"][chosen["throughput"] > 0.0] * ANGSTROM
     if at[0] <= seen[0] and seen[-1] <= at[-1]:
         return at, light
     before, after = at[0] ** 2 / at[1], at[-1] ** 2 / at[-2]
     return np.array([before, *at, after]), np.array([0.0, *light, 0.0])
 
 
-def _photon_rate(grid: Float, at: Float, light: Float, chosen: Band) -> float:
+def _photon_rate(grid: Float, at: Float, light: Float, chosen: Numbers) -> float:
     """Integrate photons s-1 cm-2 in a band by the trapezoidal rule on a grid in Angstrom."""
-    through = _interpolate(grid, chosen.wavelength_nm * ANGSTROM, chosen.throughput)
+    through = _interpolate(grid, chosen["wavelength"] * ANGSTROM, chosen["throughput"])
     return float(np.trapezoid(_interpolate(grid, at, light) * through, grid))
 
 
@@ -139,6 +121,73 @@ def _interpolate(grid: Float, at: Float, values: Float) -> Float:
     after = np.clip(np.searchsorted(at, grid, side="right"), 1, at.size - 1)
     share = np.clip((grid - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
     return np.asarray(values[after - 1] * (1.0 - share) + values[after] * share)
+
+
+#: Range of the nominal instrument, nm (the paper's abstract).
+NEEDED_NM = (200.0, 700.0)
+#: The same, extended by the reach of the line spread function (the paper, section "Preparing the input spectrum").
+SPAN_NM = (180.0, 750.0)
+#: Fraction of `NEEDED_NM` that a spectrum must cover; with less, nearly all of the light would be another star's.
+MIN_MEASURED = 1 / 3
+#: Range of wavelengths, nm, outside which an assumed unit is unlikely.
+PLAUSIBLE_NM = (50.0, 10_000.0)
+#: A step between points is a gap if it exceeds this width, nm, and this multiple of the usual spacing.
+GAP_NM, GAP_TIMES = 10.5, 10.0
+#: Likely units of wavelengths without a stated unit, in nm.
+_USUAL_UNITS = {"nm": 1.0, "Angstrom": 0.1, "um": 1000.0}
+
+
+def measured_part(nm: Float) -> float:
+    """Return the fraction of `NEEDED_NM` that wavelengths cover, without gaps."""
+    if nm.size < 2:
+        return 0.0
+    steps = np.diff(np.clip(nm, *NEEDED_NM))[~is_gap(np.diff(nm))]
+    return float(steps.sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
+
+
+def is_gap(steps: Float) -> Bool:
+    """Return which of the steps between wavelengths, nm, are gaps."""
+    wide: Bool = (steps > GAP_NM) & (steps > GAP_TIMES * np.median(steps))
+    return wide
+
+
+def _part(low: float, high: float) -> float:
+    shared = min(high, NEEDED_NM[1]) - max(low, NEEDED_NM[0])
+    return max(0.0, shared / (NEEDED_NM[1] - NEEDED_NM[0]))
+
+
+def likely_unit(low: float, high: float, unit: str) -> str | None:
+    """Return the only unit other than `unit` in which the numbers cover the required range, or None."""
+    parts = {other: _part(low * factor, high * factor) for other, factor in _USUAL_UNITS.items() if other != unit}
+    fitting = [other for other, part in parts.items() if part >= MIN_MEASURED and low > 0.0]
+    # Short ultraviolet spectra cover part of the range in Angstrom, but would start in the infrared in nm.
+    if not fitting and parts.get("Angstrom", 0.0) > 0.0 and low > 900.0:
+        fitting = ["Angstrom"]
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def check_assumed_unit(values: Float, unit: str) -> None:
+    """Raise InputError if another unit of the wavelengths is as likely as the assumed one."""
+    finite = values[np.isfinite(values)]
+    factor = _USUAL_UNITS.get(unit)
+    if not finite.size or factor is None:
+        return
+    low, high = float(finite.min()), float(finite.max())
+    own, other = _part(low * factor, high * factor), likely_unit(low, high, unit)
+    elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
+    fault = f"wavelengths from {low:g} to {high:g} without a stated unit"
+    needed, remedy = f"of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "give their unit: `wavelength_unit"
+    if other is not None and (own < MIN_MEASURED or elsewhere >= max(own, 1.0 - 1e-9)):
+        fault += f" look like {other}, in which they cover {elsewhere:.0%} {needed}, and {own:.0%} in {unit}"
+        also = f" or `wavelength_unit={unit!r}`" if own >= MIN_MEASURED else ""
+        raise InputError(f"{fault}; {remedy}={other!r}`{also}", key="wavelength_unit")
+    if own < MIN_MEASURED:
+        fault += f" cover {own:.0%} {needed}, not at least a third, in {unit}"
+    elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
+        fault += f" extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}"
+    else:
+        return
+    raise InputError(f"{fault}; {remedy}` names it", key="wavelength_unit")
 
 
 #: Range of wavelengths, nm, from gamma rays to metre waves, whose products stay within double precision.
@@ -159,11 +208,7 @@ MIN_JOIN_SNR = 5.0
 
 
 def check_points(name: str, wavelength: Float, flux: Float) -> None:
-    """Raise InputError for points that are no spectrum.
-
-    Wavelengths and fluxes, nm and erg s-1 cm-2 A-1, must have equal length and be in range; wavelengths must be finite,
-    increasing and distinct.
-    """
+    """Raise InputError for points, nm and erg s-1 cm-2 A-1, of unequal number, out of range or not increasing."""
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
         fault = f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes"
         raise InputError(f"{fault}, but needs two equal columns of at least two points", key="flux")
@@ -272,8 +317,7 @@ def continued(
 
     `needed_nm` is the range of the pixels; the line spread function, by default that of the nominal instrument, reaches
     beyond it as `SPAN_NM` beyond `NEEDED_NM`. With `dark_only`, ends that are too bright or within the range of the
-    pixels are left unchanged. Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest
-    pixel's light.
+    pixels are left unchanged; otherwise a continuation must be at most `MAX_CONTINUED` of the brightest pixel's light.
     """
     span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
     if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
@@ -335,8 +379,7 @@ def extended(
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
 
-    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
-    InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
+    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue.
     """
     longer, nm, others = other
     messages = []

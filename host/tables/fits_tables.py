@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.tables import table
 from mauvecl.host.tables.files import limit_bytes, reading
-from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.names import matched, text_at
 from mauvecl.host.tables.table import TableFile, Values, number_in
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
@@ -180,15 +180,6 @@ def _sum(file: IO[bytes], start: int, stop: int) -> int:
         part = _bytes_at(file, place, min(place + PIECE, stop))
         total += int(np.frombuffer(part + b"\0" * (-len(part) % 4), ">u4").sum(dtype=np.uint64))
     return total
-
-
-def text_at(header: Any, key: str) -> str:
-    """Return a keyword's value as text; empty if it is missing or cannot be parsed."""
-    try:
-        value = header.get(key, "")
-    except Exception:  # unparsable cards
-        return ""
-    return "" if value is None else str(value).strip()
 
 
 #: Keywords of the units of wavelengths and of fluxes: of the standard, of Spextool, and of others.

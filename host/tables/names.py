@@ -116,6 +116,15 @@ def matched(name: str, names: Iterable[str], what: str = "") -> str | None:
     return fitting[0] if fitting else None
 
 
+def text_at(header: Any, key: str) -> str:
+    """Return a keyword's value as text; empty if it is missing or cannot be parsed."""
+    try:
+        value = header.get(key, "")
+    except Exception:  # unparsable cards
+        return ""
+    return "" if value is None else str(value).strip()
+
+
 def first_of(wanted: Sequence[str], names: Iterable[str], what: str = "") -> str | None:
     """Return the name that is the first of some wanted ones, in any spelling and with or without a unit in brackets."""
     held = [(name, key_of(name), key_of(divided_unit(name)[0])) for name in names]

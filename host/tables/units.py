@@ -1,4 +1,4 @@
-"""Units, time systems and dates of the numbers in files."""
+"""Units, time systems and dates of the numbers in files, and wavelengths in air or vacuum."""
 
 from __future__ import annotations
 
@@ -13,14 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing
+from mauvecl.host.tables.names import MISSING_WORDS, by_word, divided_unit, in_brackets, is_missing, text_at
 from mauvecl.schema.errors import InputError, shortened
 
 if TYPE_CHECKING:
     import astropy.units as u
-
-#: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
-FluxKind = Literal["density", "total", "surface brightness", "other"]
 
 _DENSITIES = {
     "flam": "erg / (s cm2 Angstrom)",
@@ -149,33 +146,6 @@ def balanced(name: str) -> str:
     while name[-1:] == ")" and name.count(")") > name.count("("):
         name = name[:-1]
     return name.strip()
-
-
-def linear(unit: Any) -> u.UnitBase:
-    """Return the linear unit of a logarithmic unit or magnitude; others unchanged."""
-    physical: u.UnitBase = getattr(unit, "physical_unit", unit)
-    return physical
-
-
-def is_spectral(unit: Any) -> bool:
-    """Return whether a unit is one of wavelength, frequency, wavenumber or photon energy."""
-    import astropy.units as u
-
-    return bool(linear(unit).is_equivalent(u.m, u.spectral()))
-
-
-def flux_kind(unit: Any) -> FluxKind:
-    """Classify a unit of flux."""
-    import astropy.units as u
-
-    unit = linear(unit)
-    per_area = (u.W / u.m**2, u.photon / (u.s * u.m**2))
-    densities = tuple(one / per for one in per_area for per in (u.m, u.Hz))
-    if unit.is_equivalent(densities):
-        return "density"
-    if unit.is_equivalent(per_area):
-        return "total"
-    return "surface brightness" if (unit * u.sr).is_equivalent(densities + per_area) else "other"
 
 
 #: Epochs by name, as modified Julian dates: of TESS and Kepler (their archive manuals), GPS and Unix seconds.
@@ -414,3 +384,107 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
             raise InputError(fault, key=name)
     found[filled] = days - hours / 24
     return found
+
+
+Medium = Literal["air", "vacuum"]
+
+#: Names of keywords whose value is a medium: of IRAF (AIRORVAC), MAST, surveys and users, as in ``WAVSYS = 'air'``.
+_NAMED = re.compile(r"WAV|LAM|WL|DISP|MEDI|REFFRAME|WCSNAME|SPECTRAL|AIR(?:_|OR)?VAC|VAC(?:_|OR)?AIR")
+#: Names of keywords that are true or false, as in ``VACUUM = T``: those of a medium alone, and those of wavelengths.
+_LOGICAL = re.compile(r"(?:IS|IN_?)?(AIR|VAC)(?:UUM)?|(?=.*(?:WAV|LAM|WL|SPEC|DISP)).*?(AIR|VAC)(?!RO).*")
+_MEDIUM = re.compile(r"(?:in |standard )?(air|vac\w*)(?: wavelengths?)?(?:\s*[,;(].*)?")
+_TRUE, _FALSE = ("true", "t", "yes", "y", "1", "1.0"), ("false", "f", "no", "n", "0", "0.0")
+
+#: Words for a medium; those for air include IVOA's UCD (em.wl;obs.atmos) and FITS's AWAV.
+_SPOKEN: dict[Medium, re.Pattern[str]] = {
+    "air": re.compile(
+        r"\b(?:in|are|is|standard)\s+air\b|\bair\s+wavelengths?|wavelengths?\W{0,3}(?:\(|in\s+)?air\b|\bawav"
+        r"|\bem\.wl;obs\.a|_air(?:\b|_)|\bair_|\(air\)",
+        re.IGNORECASE,
+    ),
+    "vacuum": re.compile(r"(?:\b|_)vac(?:uum)?(?:\b|_)|\bvacuum", re.IGNORECASE),
+}
+_CONVERTED = tuple(
+    (re.compile(rf"\b{one}\w*(?:\s+wavelengths?)?[\s_-]*(?:to|2|->|into)[\s_-]*{other}\w*", re.IGNORECASE), medium)
+    for one, other, medium in (("vac", "air", "air"), ("air", "vac", "vacuum"))
+)
+
+
+def medium_of(headers: Sequence[Mapping[str, Any]]) -> Medium | None:
+    """Return the medium of wavelengths that keywords of headers state, which must agree, or None."""
+    found: dict[str, Medium] = {}
+    for header in headers:
+        for key in map(str, header):
+            name = re.sub(r"[\s-]+", "_", key.strip().upper())
+            if (medium := _medium_at(name, text_at(header, key).lower())) is not None:
+                found[name] = medium
+    if len(set(found.values())) > 1:
+        words = " and ".join(f"{key} says {medium}" for key, medium in sorted(found.items()))
+        fault = f"its header contradicts itself: {words}; use `wavelength_unit='nm air'` to say which"
+        raise InputError(fault, key="wavelength_unit")
+    return next(iter(found.values()), None)
+
+
+def _medium_at(name: str, text: str) -> Medium | None:
+    """Return the medium that a keyword's value states; None for no value, and for words on something else."""
+    if re.fullmatch(r"T?CTYPE?\d*|\d*CTYP\d+", name):
+        # The standard's name of wavelengths in air (Greisen et al. 2006); in tables WAVE is a usual name as well.
+        return "air" if text.startswith("awav") else None
+    word, logical = _MEDIUM.fullmatch(text), _LOGICAL.fullmatch(name)
+    if word and (logical or _NAMED.search(name)):
+        return "air" if word[1] == "air" else "vacuum"
+    if logical and text in (*_TRUE, *_FALSE):
+        return "air" if ("AIR" in logical.groups()) == (text in _TRUE) else "vacuum"
+    # Some observatories keep a pressure or a pump under AIR and VAC.
+    if logical and logical[1] and text and name not in ("AIR", "VAC"):
+        raise InputError.of(name, text, "true or false, or air or vacuum", where="its header")
+    return None
+
+
+def unit_and_medium(unit: str) -> tuple[str | None, Medium | None]:
+    """Divide ``nm air`` or ``Angstrom (vacuum)`` into unit and medium."""
+    match = re.fullmatch(r"\s*(.*?)[\s,;(\[_]*(?<![a-z])(?:in )?(air|vac(?:uum)?)[)\].]?\s*", unit, re.IGNORECASE)
+    if match is None:
+        return unit or None, None
+    return match[1] or None, "air" if match[2].lower() == "air" else "vacuum"
+
+
+def vacuum_wavelengths(
+    nm: Float, column: str, remarks: str, given: Medium | None, headers: Sequence[Mapping[str, Any]]
+) -> tuple[Float, tuple[str, ...]]:
+    """Return vacuum wavelengths, nm, and messages about them.
+
+    The medium is the given one, else that in the name of the column, in keywords of headers, or in remarks.
+    """
+    named, said = _media_in(column), _media_in(remarks)
+    own, remarked = (media[0] if len(media) == 1 else None for media in (named, said))
+    medium = given or own or medium_of(headers) or remarked
+    if medium is None and (named or said):
+        return nm, ("its header speaks of air and of vacuum: ASSUMED vacuum; `wavelength_unit='nm air'` says air",)
+    if medium != "air":
+        return nm, ()
+    return vacuum_from_air(nm), ("its wavelengths are in air, converted to vacuum (Ciddor 1996, above 200 nm)",)
+
+
+def _media_in(text: str) -> tuple[Medium, ...]:
+    """Return the media that a text speaks of."""
+    for pattern, medium in _CONVERTED:
+        # Wavelengths that were converted are in the second medium.
+        text = pattern.sub(f" in {medium} ", text)
+    return tuple(medium for medium, pattern in _SPOKEN.items() if pattern.search(text))
+
+
+def vacuum_from_air(air_nm: Float) -> Float:
+    """Return vacuum wavelengths, nm, of wavelengths in standard air (15 C, 101325 Pa, dry, 450 ppm CO2).
+
+    Ciddor 1996, Applied Optics 35, 1566, equation 1, doi 10.1364/AO.35.001566. Wavelengths below 200 nm are vacuum
+    wavelengths by convention and remain unchanged (Morton 1991, ApJS 77, 119).
+    """
+    vacuum = air_nm.copy()
+    there = np.isfinite(air_nm) & (air_nm >= 200.0)
+    for _ in range(4):
+        # Squared wavenumber, um-2. The index hardly changes over the shift, so the iteration converges at once.
+        wavenumber2 = (1000.0 / vacuum[there]) ** 2
+        index = 1.0 + 0.05792105 / (238.0185 - wavenumber2) + 0.00167917 / (57.362 - wavenumber2)
+        vacuum[there] = air_nm[there] * index
+    return vacuum

@@ -124,10 +124,7 @@ MAX_FLARES = 100
 
 
 def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
-    """Return a sentence on the chance with and without the usual unknowns, or none if the study has unknowns.
-
-    The flare is the one whose chance is nearest to one half; others are detected, or missed, either way.
-    """
+    """Return a sentence on the chance with and without the usual unknowns, or none if the study has unknowns."""
     study = prepared[0].study
     if not study.nuisances.none or study.run.comparison().estimated:
         return []
@@ -135,6 +132,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     chances = {item: chance for item in flares if not math.isnan(chance := _matched_chance(*item))}
     if not chances:
         return []
+    # Flares whose chance is far from one half are detected, or missed, either way.
     case, flare = min(chances, key=lambda item: abs(chances[item] - 0.5))
     of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
     try:
@@ -176,10 +174,7 @@ class DrawnStudies:
 
 
 def drawn(study: Study) -> DrawnStudies:
-    """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed.
-
-    Raises InputError if a prior includes values that the instrument cannot have, or nothing is unknown.
-    """
+    """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed."""
     from scipy.stats import qmc
 
     asked, o = study.unknowns, study.observation
@@ -214,8 +209,7 @@ def drawn(study: Study) -> DrawnStudies:
 def throughput_cases(case: Case) -> list[Case]:
     """Return the case with each mode of its calibration at one standard deviation; empty if it has none.
 
-    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range. Raises InputError if
-    the wavelengths are not known well enough for that.
+    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range.
     """
     moved, pixels = [], case.instrument.read_pixels
     for mode in (row for row in values_of(case.instrument).values() if row.mode is not None):
@@ -231,8 +225,7 @@ def throughput_cases(case: Case) -> list[Case]:
 def average(values: Float, low: Float, high: Float) -> tuple[Float, Float, Float]:
     """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
 
-    The arguments have the shape (n_draw, ...). The interval assumes independent draws and is therefore conservative for
-    a Latin hypercube.
+    The arguments have the shape (n_draw, ...). For a Latin hypercube the interval is conservative.
     """
     n, mean = len(values), values.mean(axis=0)
     spread = values.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else 0.0

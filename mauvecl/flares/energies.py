@@ -154,7 +154,7 @@ class EnergyScale:
         star, flare = (flux_in_band(band, Blackbody(kelvin)) for kelvin in (temperature_k, flare_k))
         area = np.pi * (radius_rsun * SUN_CM) ** 2 * star / flare
         return cls(
-            find_band(band).name,
+            find_band(band).meta["name"],
             "bolometric",
             area * STEFAN_BOLTZMANN * flare_k**4,
             f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii, a patch of {flare_k:g} K seen face "
@@ -184,7 +184,7 @@ class EnergyScale:
         how = f"{star}, flare of {flare.describe()}"
         if geometry == "replaces":
             how += f" in place of photosphere of {photosphere_k:g} K"
-        return cls(find_band(band).name, kind, sphere_cm2 * (flux - lost), how)
+        return cls(find_band(band).meta["name"], kind, sphere_cm2 * (flux - lost), how)
 
     def energy(self, equivalent_duration_s: Annotated[float, Unit("s")]) -> float:
         """Return the energy for an equivalent duration, erg."""
@@ -221,9 +221,9 @@ def flux_in_band(band: str, flare: FlareSpectrum) -> float:
 
 def _response(band: str) -> tuple[Float, Float]:
     """Return the wavelengths and the response of a band, with a maximum of 1."""
-    bandpass = find_band(band)
-    wavelength = np.linspace(bandpass.wavelength_nm[0], bandpass.wavelength_nm[-1], POINTS)
-    return wavelength, np.interp(wavelength, bandpass.wavelength_nm, bandpass.throughput / bandpass.throughput.max())
+    at, throughput = find_band(band)["wavelength"], find_band(band)["throughput"]
+    wavelength = np.linspace(at[0], at[-1], POINTS)
+    return wavelength, np.interp(wavelength, at, throughput / throughput.max())
 
 
 def _through(wavelength_nm: Float, flux_flam: Float, band: str) -> float:

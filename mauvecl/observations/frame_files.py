@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.spectra.columns import words_of
-from mauvecl.host.spectra.units import unit_and_medium, vacuum_wavelengths
+from mauvecl.host.stars.columns import words_of
 from mauvecl.host.tables.files import limit_bytes, parsing, without_columns
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import is_magnitude, is_missing, key_of
@@ -30,7 +29,7 @@ from mauvecl.host.tables.table import (
     unit_in_name,
     without_indefinite,
 )
-from mauvecl.host.tables.units import is_dated
+from mauvecl.host.tables.units import is_dated, unit_and_medium, vacuum_wavelengths
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits
 from mauvecl.observations.mapping import KNOWN, FrameMapping, recognised, times_of
 from mauvecl.observations.stored_frames import (

@@ -61,10 +61,7 @@ class FieldValues:
         return "your own star" if "star" in self.uploads else star_words(self.star)
 
     def case(self, folder: Path) -> Case:
-        """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
-
-        The visitor's files are written to the folder for the study to find.
-        """
+        """Return the question as a case, whose files are in a folder; a flare as observed has the amplitude of that."""
         uploaded: Source | None = self.uploads.get("star")
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
@@ -99,10 +96,7 @@ class FieldValues:
         return data
 
     def _value(self, name: str, folder: Path) -> Any:
-        """Return the value of a field's key, whose file is written to a folder.
-
-        It is None if the field is empty, or if another field's value or file leaves its key out of a study.
-        """
+        """Return the value of a field's key, with its file in a folder, or None if it is empty or has no effect."""
         values, uploads, page_field = self.values, self.uploads, FIELDS[name]
         conditions: dict[str, bool] = {
             # Files are written in nm.
@@ -170,7 +164,7 @@ class ClosedForms:
     ) -> ClosedForms:
         """Answer a question; `folder` holds the visitor's files for the study, and `given` their contents.
 
-        Without the chance a star may be too bright for the chance of detection.
+        A star may be too bright for the `chance` of detection.
         """
         case = question.case(folder)
         # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.
@@ -210,10 +204,10 @@ class ClosedForms:
         question = {"unknown": unknown, "instrument": instrument or self.question.instrument}
         if question.items() <= self.question.values.items():
             return self
-        study = self.case.study
-        sections: dict[str, Any] = {"nuisances": study.nuisances.model_copy(update={"usual": unknown == REALISTIC})}
+        changes: dict[str, dict[str, Any]] = {"nuisances": {"usual": unknown == REALISTIC}}
         if question["instrument"] != self.question.instrument:
-            sections["observation"] = study.observation.model_copy(update={"instrument": question["instrument"]})
+            changes["observation"] = {"instrument": question["instrument"]}
+        sections = {key: getattr(self.case.study, key).model_copy(update=one) for key, one in changes.items()}
         case = self.case.with_sections(**sections)
         return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
@@ -243,10 +237,9 @@ class ClosedForms:
         return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
     def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:
-        """Return the closed forms for factors on the light and on the amplitude, of shape (n_rise,).
+        """Return the closed forms for factors on the light, with `sky` also the sky's, and on the amplitude, (n_rise,).
 
-        The list is empty if the star saturates every pixel. `sky` says whether the sky's light changes with the star's,
-        as for another throughput.
+        The list is empty if the star saturates every pixel.
         """
         q, base = self.question, self.quiet
         statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons

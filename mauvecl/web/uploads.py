@@ -21,9 +21,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mauvecl.host.spectra.conversion import ReadSpectrum
-from mauvecl.host.spectra.formats import read_spectrum
+from mauvecl.host.stars.conversion import ReadSpectrum
 from mauvecl.host.stars.flare import ObservedFlare
+from mauvecl.host.stars.formats import read_spectrum
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables.files import as_text, parsing, toml
 from mauvecl.observations.frame_files import read_frames

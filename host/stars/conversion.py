@@ -17,12 +17,14 @@ import astropy.units as u
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.spectra.columns import Role, as_typed, choose, listed, numbered, role_of
-from mauvecl.host.spectra.units import Medium, check_assumed_unit, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.stars.columns import Role, as_typed, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
+from mauvecl.host.stars.spectrum import check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, marks_in, without_indefinite
-from mauvecl.host.tables.units import flux_kind, is_spectral, is_stated, linear, unit_of
+from mauvecl.host.tables.units import Medium, is_stated, unit_and_medium, unit_of, vacuum_wavelengths
 from mauvecl.schema.errors import InputError
+
+UNKNOWN = Role("", "unknown")
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,10 @@ class SpectrumTable:
     row_names: Sequence[str] = ()  # identifiers of its rows, if stored in another table
     row_title: str = ""  # format of a spectrum's name from the identifier of its row, as in ``Gaia DR3 {}``
     known_roles: Sequence[Role] = ()  # roles of the columns, if known from more than their names, units and descriptors
+    #: Of the selected spectrum: wavelengths and fluxes of each segment, shape (n,) each, and the roles of both.
+    segments: Sequence[tuple[Float, Float]] = ()
+    axis: Role = UNKNOWN
+    light: Role = UNKNOWN
 
     @property
     def roles(self) -> Sequence[Role]:
@@ -62,39 +68,26 @@ LENGTHS = ("npoints", "n_points", "nelem", "npts")
 WEIGHTS = ("dq_wgt",)
 
 
-@dataclass(frozen=True, eq=False)
-class RawSpectrum:
-    """Spectrum in the units of its file."""
-
-    segments: list[tuple[Float, Float]]  # wavelengths and fluxes of each segment, shape (n,) each
-    table: SpectrumTable
-    axis: Role
-    light: Role
-    messages: tuple[str, ...] = ()
-
-
-def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpectrum:
-    """Return the spectrum of a file, or the selected one of several."""
+def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> SpectrumTable:
+    """Return the table with the spectrum of a file, or with the selected one of several."""
     if not tables:
         raise InputError("it has no table, but needs one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
     named: list[int] = []
     rest: list[str] = []
     for word in asked:
-        place = numbered("table", word)
-        if place is not None and place >= len(tables):
-            raise InputError.of("table", place + 1, f"between 1 and {len(tables)}")
+        place = numbered("table", word, len(tables))
         fits = [i for i, label in enumerate(labels) if label == word.lower()] if place is None else [place]
         named += fits
         rest += [] if fits else [word]
-    found: list[RawSpectrum] = []
+    found: list[SpectrumTable] = []
     errors: list[InputError] = []
     for table in [tables[i] for i in dict.fromkeys(named)] or tables:
         try:
             found.append(_spectrum_of(table, rest))
         except InputError as error:
             errors.append(error)
-    if errors and any(one.table.group for one in found):
+    if errors and any(one.group for one in found):
         # A missing part would go unnoticed.
         raise errors[0]
     if not found:
@@ -102,21 +95,20 @@ def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpe
         raise next((error for error in errors if "FILE[" in str(error)), errors[0])
     if not named:
         # SDSS: the sum of all exposures, next to each of them.
-        found = [one for one in found if one.table.label.strip().lower() == "coadd"] or found
+        found = [one for one in found if one.label.strip().lower() == "coadd"] or found
         # A legend beside the spectrum has no column of fluxes.
         found = [one for one in found if one.light.kind == "flux"] or found
     if len(found) == 1:
         return found[0]
-    held = [one.table.label for one in found]
-    if found[0].table.group is not None and len({one.table.group for one in found}) == 1:
-        segments = [segment for one in found for segment in one.segments]
-        said = f"its parts {listed(held)} are joined"
+    held = [one.label for one in found]
+    if found[0].group is not None and len({one.group for one in found}) == 1:
+        segments, said = [segment for one in found for segment in one.segments], f"its parts {listed(held)} are joined"
         return replace(found[0], segments=segments, messages=(*found[0].messages, said))
     first = as_typed(held[0], "table", labels.index(held[0].strip().lower()), labels)
     raise InputError(f"{len(held)} tables hold a spectrum: {listed(held)}; give one as in {first}", key="table")
 
 
-def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
+def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> SpectrumTable:
     roles = table.roles
     names = [role.name for role in roles]
     known = {key_of(name) for name in names} | {key_of(f"column {place + 1}") for place in range(len(names))}
@@ -150,7 +142,8 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
         segments.append((sum(waves[1:], waves[0]) / len(waves), flux))
     if sum(flux.size for _, flux in segments) < 2:
         raise InputError("it must have at least two points to be a spectrum", key="flux")
-    return RawSpectrum(segments, table, roles[axes[0]], roles[light], (*table.messages, *messages))
+    said = (*table.messages, *messages)
+    return replace(table, segments=segments, axis=roles[axes[0]], light=roles[light], messages=said)
 
 
 def _numbers(cells: Any, name: str) -> Float:
@@ -170,8 +163,7 @@ def _selected_rows(
 ) -> tuple[list[list[Any]], str, tuple[str, ...]]:
     """Return the selected row, or all rows if they are segments of one spectrum, the name of one, and messages.
 
-    The cells are those of the chosen columns; wavelengths of shape (n,) apply to all rows of fluxes of shape (n_row,
-    n). The user's words in `asked` may name a row.
+    The cells are those of the chosen columns; wavelengths of shape (n,) apply to all rows of fluxes, (n_row, n).
     """
     n, shape = len(cells[-1]), np.shape(cells[-1])
     if len(shape) == 2:
@@ -238,19 +230,15 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
     fitting = list(range(len(identifiers)))
     for word in asked:
-        if (place := numbered("row", word)) is not None:
-            if place >= len(identifiers):
-                raise InputError.of("row", place + 1, f"between 1 and {len(identifiers)}")
-            fitting = [row for row in fitting if row == place]
-        else:
-            fitting = [row for row in fitting if word.strip() in identifiers[row]]
+        place = numbered("row", word, len(identifiers))
+        fitting = [row for row in fitting if (word.strip() in identifiers[row] if place is None else row == place)]
         if not fitting:
             raise _no_such(word, names)
     if len(fitting) == 1:
         return fitting[0]
-    labels = [(identifiers[row] or [""])[0] or f"row {row + 1}" for row in fitting]
-    if len(set(labels)) < len(labels):
-        labels = [f"row {row + 1}" for row in fitting]
+    numbers = [f"row {row + 1}" for row in fitting]
+    labels = [(identifiers[row] or [""])[0] or number for row, number in zip(fitting, numbers, strict=True)]
+    labels = labels if len(set(labels)) == len(labels) else numbers
     fault = f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})"
     raise InputError(f"{fault}; give one as in {as_typed(labels[0], 'row', fitting[0], labels)}", key="rows")
 
@@ -280,27 +268,24 @@ class ReadSpectrum:
     axis_unit: str = ""
 
 
-def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
-    """Convert a spectrum.
-
-    Given units override those of the file, and a unit of wavelength may end in "air" or "vacuum".
-    """
-    table, messages = raw.table, list(raw.messages)
+def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
+    """Convert the spectrum of a table; given units override its own; one of wavelength may end in "air" or "vacuum"."""
+    messages = list(table.messages)
     medium: Medium | None = None
     if isinstance(wavelength_unit, str):
         wavelength_unit, medium = unit_and_medium(wavelength_unit)
-    stated, in_unit = unit_and_medium(raw.axis.unit or "")
+    stated, in_unit = unit_and_medium(table.axis.unit or "")
     implied = table.implied_units or (None, None)
-    axis, is_assumed = _scale("wavelength", replace(raw.axis, unit=stated), wavelength_unit, implied[0], messages)
-    light, is_assumed_flux = _scale("flux", raw.light, flux_unit, implied[1], messages)
-    waves, fluxes = (np.concatenate(parts) for parts in zip(*raw.segments, strict=True))
+    axis, is_assumed = _scale("wavelength", replace(table.axis, unit=stated), wavelength_unit, implied[0], messages)
+    light, is_assumed_flux = _scale("flux", table.light, flux_unit, implied[1], messages)
+    waves, fluxes = (np.concatenate(parts) for parts in zip(*table.segments, strict=True))
     whole = axis(waves)
     if is_assumed:
         check_assumed_unit(whole.value, str(whole.unit))
     marks, said = marks_in(fluxes, "fluxes")
     messages += said
     segments = []
-    for values, flux in raw.segments:
+    for values, flux in table.segments:
         kept = np.where(np.isin(flux, marks), np.nan, flux)
         nm = np.asarray(axis(values).to_value(u.nm, u.spectral()), np.float64)
         bad = np.flatnonzero(~np.isfinite(nm))
@@ -314,7 +299,7 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     nm, flam = _joined(segments, messages)
     if is_assumed_flux:
         _check_assumed_flux(flam, f"{table.remarks}\n{table.origin}")
-    nm, added = vacuum_wavelengths(nm, raw.axis.name, table.remarks, medium or in_unit, table.headers)
+    nm, added = vacuum_wavelengths(nm, table.axis.name, table.remarks, medium or in_unit, table.headers)
     messages += added
     nm, flam = _merged(nm, flam, messages)
     unscaled, notes = table.unscaled, table.notes
@@ -391,20 +376,19 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
 
 
 def _check_flux_unit(unit: Any, role: Role) -> None:
-    kind = flux_kind(unit)
-    usual = "one such as erg / (s cm2 Angstrom)"
+    kind, usual = flux_kind(unit), "such as erg / (s cm2 Angstrom)"
+    fault = ""
     if kind == "other":
-        raise InputError.of("flux_unit", str(unit), usual)
+        raise InputError.of("flux_unit", str(unit), f"one {usual}")
     if kind == "total" and not role.total:
         fault = f"the unit {unit} is not a flux density (it is not per wavelength or frequency)"
-        fault += f"; use {usual}, or a column whose name says lambda F_lambda, such as lamFlam"
+        fault += f"; use one {usual}, or a column whose name says lambda F_lambda, such as lamFlam"
     elif kind == "density" and role.total:
         fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density, but they must agree"
     elif kind == "surface brightness":
-        fault = f"the unit {unit} is per solid angle; use the flux of the whole star, such as erg / (s cm2 Angstrom)"
-    else:
-        return
-    raise InputError(fault, key="flux_unit")
+        fault = f"the unit {unit} is per solid angle; use the flux of the whole star, {usual}"
+    if fault:
+        raise InputError(fault, key="flux_unit")
 
 
 def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:

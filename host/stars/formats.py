@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.host.spectra.columns import AXES, Role, divided, is_unit, listed, role_of, words_of
-from mauvecl.host.spectra.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
-from mauvecl.host.spectra.units import stated_units
+from mauvecl.host.stars.columns import AXES, Role, divided, is_unit, listed, role_of, stated_units, words_of
+from mauvecl.host.stars.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
 from mauvecl.host.tables import text_tables
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
-from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, text_at, unit_at
+from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, unit_at
+from mauvecl.host.tables.names import text_at
 from mauvecl.host.tables.opening import open_content, text_in, votables
 from mauvecl.host.tables.table import MemoryTable, Values, number_in
 from mauvecl.host.tables.units import is_stated, time_in_name
@@ -39,11 +39,7 @@ GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
 def table_of_text(
     text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
 ) -> SpectrumTable:
-    """Read the table of a text file.
-
-    The user's words in `asked` are the numbers of columns if these have no names. The units of wavelength and flux are
-    searched in the header if requested.
-    """
+    """Read the table of a text file, and the units of wavelength and flux in its header if requested."""
     lines = text_tables.NumberLines(text, "wavelength and flux")
     if any(cell[:1] in ("(", "[") for cell in lines.cells[0]):
         return _table_of_arrays(MemoryTable(text_tables.text_table(text, "it", commas=True), "it"), name, origin)
@@ -69,7 +65,7 @@ def table_of_text(
 
 
 def _roles_by_number(lines: text_tables.NumberLines, asked: Sequence[str]) -> list[Role]:
-    """Return the roles of columns without names: the first two are the spectrum, or those selected by the user."""
+    """Return the roles of columns without names: the first two are the spectrum, or those whose numbers are asked."""
     n = lines.n
     indices = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
     if len(indices) != len(asked) or len(indices) > 2:
@@ -340,8 +336,7 @@ class _Reader:
     def _rows(self, hdu: Any) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
         """Return the fluxes of an image, the names of its rows if it has several, and a note.
 
-        Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless the user asks for a
-        part.
+        Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, if no part is asked for.
         """
         header = hdu.header
         shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]

@@ -1,4 +1,4 @@
-"""Columns of spectra: their roles by name, UCD and unit, and the choice among them.
+"""Columns of spectra: their roles by name, UCD and unit, the units that headers state, and the choice among columns.
 
 Names are divided into words (``FluxErr``, ``STATERROR``, ``wave_lo``) with known meanings. A word such as "error" or
 "sky" excludes a column from being the flux, regardless of the rest of its name. Other columns get a score for the match
@@ -11,12 +11,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 from mauvecl.host.tables.names import by_word, key_of
-from mauvecl.host.tables.units import NO_FLUX, SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
+from mauvecl.host.tables.units import NO_FLUX, SCALE, balanced, is_stated, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
+#: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
+FluxKind = Literal["density", "total", "surface brightness", "other"]
 Kind = Literal[
     "wavelength", "lower edge", "upper edge", "flux", "model", "error", "quality", "continuum", "counts", "background",
     "width", "magnitude", "throughput", "luminosity", "unknown",
@@ -186,6 +188,32 @@ def _kinds_of_unit(unit: str | None) -> tuple[bool, bool, FluxKind]:
     return True, is_spectral(parsed), flux_kind(parsed)
 
 
+def linear(unit: Any) -> Any:
+    """Return the linear unit of a logarithmic unit or magnitude; others unchanged."""
+    return getattr(unit, "physical_unit", unit)
+
+
+def is_spectral(unit: Any) -> bool:
+    """Return whether a unit is one of wavelength, frequency, wavenumber or photon energy."""
+    import astropy.units as u
+
+    return bool(linear(unit).is_equivalent(u.m, u.spectral()))
+
+
+def flux_kind(unit: Any) -> FluxKind:
+    """Classify a unit of flux."""
+    import astropy.units as u
+
+    unit = linear(unit)
+    per_area = (u.W / u.m**2, u.photon / (u.s * u.m**2))
+    densities = tuple(one / per for one in per_area for per in (u.m, u.Hz))
+    if unit.is_equivalent(densities):
+        return "density"
+    if unit.is_equivalent(per_area):
+        return "total"
+    return "surface brightness" if (unit * u.sr).is_equivalent(densities + per_area) else "other"
+
+
 def divided(name: str) -> tuple[str, str | None]:
     """Divide a column's name into the quantity and its unit, if any."""
     name = " ".join(name.strip().strip("\"'").split())
@@ -269,6 +297,106 @@ def _unglued(chunk: str) -> list[str] | None:
     return None
 
 
+_LENGTH = (
+    r"Angstroe?ms?|ANGSTROMS?|angstroe?ms?|Å[Nn]gstr[öo]ms?|Angs?|ang|AA|Å|nm|NM|[Nn]anomet(?:er|re)s?|um|[µμ]m|[Mm]icrons?"
+    r"|[Mm]icromet(?:er|re)s?|[GT]?Hz|k?eV|cm\s?\^?\s?[-−⁻][1¹]|1/cm"
+)
+# An optional blank on the same line.
+_B = r"[^\S\n]?"
+_EXPONENT = rf"(?:{_B}(?:\^|\*\*)?{_B}\(?[-+−]?\d\)?|[⁻⁺]?[¹²³])?"
+_PER = r"sr|ster(?:adian)?s?|arcsec(?:ond)?s?|pix(?:el)?s?|beam"
+_ATOM = (
+    rf"(?:[Ee][Rr][Gg][Ss]?|m?W|[Ww]atts?|J|s|S|[Ss]ec(?:onds?)?|SEC|[cC]?[mM]|A|(?<=/)a|{_PER}|{_LENGTH})"
+    rf"(?![A-Za-z]){_EXPONENT}"
+)
+_SCALE = rf"(?:10{_B}(?:\^|\*\*){_B}\(?[-+−]?\d+\)?|10[⁻⁺]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+|\d+(?:\.\d*)?[eEdD][-+]?\d+)"
+_FLUX = re.compile(
+    rf"(?:{_SCALE}{_B}[*x×.]?{_B})?"
+    rf"(?<![A-Za-z])(?:[Ee][Rr][Gg][Ss]?|m?W|[Ww]atts?|[Pp]hotons?|ph)(?![A-Za-z]){_EXPONENT}"
+    rf"(?:(?:{_B}(?:/|\*|\.|·|per\b){_B}|[^\S\n]|_)(?:[^\S\n]|\()*{_ATOM}\)?)+"
+    rf"(?:{_B}/{_B}[A-Za-z]\w*)*(?:{_B}[*x×]{_B}{_SCALE})?"
+    rf"|(?<![A-Za-z])(?:FLAM|flam|FNU|fnu|PHOTLAM|photlam|[mun]?Jy)(?![A-Za-z])(?:{_B}/{_B}[A-Za-z]\w*)*"
+)
+_WAVE_WORD = r"(?:wavelengths?|waves?|wav|lambda|lam|wl|wlen|λ|frequency|freq|wavenumbers?)"
+# A unit after a word for wavelength.
+_NEXT_TO = re.compile(
+    rf"{_WAVE_WORD}[\s_:=,]*(?:\(?\b(?:air|vac(?:uum)?)\b\)?)?[\s_:=,]*(?:is|are)?\s*(?:in|units?)?\s*[\[(<:=]?\s*({_LENGTH}|A)"
+    r"(?![A-Za-z])",
+    re.IGNORECASE,
+)
+_ANYWHERE = re.compile(rf"(?<![\w.])(?<!\d )(?:{_LENGTH})(?![\w/])")
+_LIST = re.compile(rf"^\W*(?:units?\W+)?({_LENGTH}|A)[\s,;|]+(?=$|\W*FLUXUNIT)")
+# "wavelength (pc)", "wavelengths in furlongs": an unknown unit.
+_STATED = re.compile(
+    rf"(?:{_WAVE_WORD}\s*[\[(]\s*|{_WAVE_WORD}(?:\s+units?)?\s*(?:\bin\b|:|=)\s*)([A-Za-zÅµ][\w/^*-]*)(?=\s*(?:[\])\n.,;|&]|and\b|$))",
+    re.IGNORECASE,
+)
+_QUALIFIERS = re.compile(
+    r"(?:in|the|air|vac\w*|rest|observed|obs|helio\w*|bary\w*|standard|frame|true|false|log\w*|none|linear|increasing|decreasing"
+    r"|first|column|nm_?vac|yes|no)$",
+    re.IGNORECASE,
+)
+_NO_FLUX = re.compile(
+    r"\b((?:AB|ST)[\s_]?mag\w*)|(?:wave|lambda|\bwl\b)[^\n]*?(?<![A-Za-z])(mag(?:nitude)?s?(?![a-z])|counts?\b|ADU\b|log\w*\W*flux)",
+    re.IGNORECASE,
+)
+
+
+def stated_units(header: str, *, wavelength: bool, flux: bool, is_named: bool) -> tuple[str | None, str | None]:
+    """Return the requested units of wavelength and flux that a header states, as text.
+
+    Without names of columns (`is_named`), a header that mentions counts or magnitudes implies that there is no flux.
+    """
+    text = header[:20_000]
+    found = [_spelt(match[0].strip()) for match in _FLUX.finditer(text)]
+    distinct = _distinct(found) if flux else []
+    next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
+    if len(distinct) > 1 and next_to is not None:
+        distinct = [_spelt(next_to[1].strip())]
+    if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
+        fault = f"its header speaks of {match[1] or match[2]!r}, but must speak of a flux density"
+        raise InputError(f"{fault}: `flux_unit` names its unit", key="flux_unit")
+    lengths = _lengths(_FLUX.sub(" FLUXUNIT ", text)) if wavelength else []
+    for what, several in (("flux", distinct), ("wavelength", lengths)):
+        if len(several) > 1:
+            fault = f"its header names several units of the {what}: {', '.join(several)}"
+            raise InputError(f"{fault}; use `{what}_unit` to say which", key=f"{what}_unit")
+    return next(iter(lengths), None), next(iter(distinct), None)
+
+
+def _lengths(text: str) -> list[str]:
+    """Return the distinct units of wavelength in a text, without those within units of flux."""
+    listed = [match[1] for line in text.splitlines() if (match := _LIST.match(line.strip().lstrip("#!%;").strip()))]
+    if lengths := _distinct([match[1] for match in _NEXT_TO.finditer(text)]) or _distinct(listed):
+        return lengths
+    for match in _STATED.finditer(text):
+        if not _QUALIFIERS.match(match[1]) and match[1] != "FLUXUNIT":
+            try:
+                unit = unit_of(match[1])
+            except InputError as error:
+                raise error.within("its header, wavelengths") from error
+            if not is_spectral(unit):
+                raise InputError.of("wavelength_unit", unit, "a length or a frequency", where="its header")
+            return [match[1]]
+    return _distinct(_ANYWHERE.findall(text))
+
+
+def _spelt(name: str) -> str:
+    """Convert a unit in the name of a column to the form of a unit: erg_s_cm2_A is erg/s/cm2/A."""
+    name = balanced(name)
+    return name.replace("_", "/") if "_" in name and not re.search(r"[/\-−]|per", name) else name.replace("_", " ")
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Return distinct units regardless of spelling; "W s" in prose is an energy and dropped."""
+    units: dict[object, str] = {}
+    for name in names:
+        unit = unit_of(name)
+        if not unit.is_equivalent("J"):
+            units.setdefault(unit, name)
+    return list(units.values())
+
+
 #: Largest number of names in a message.
 MAX_LISTED = 12
 #: Names that can be typed between the brackets of ``FILE[name]``.
@@ -276,10 +404,14 @@ TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
 AXES = ("wavelength", "lower edge", "upper edge")
 
 
-def numbered(kind: str, word: str) -> int | None:
-    """Return the index in a word such as ``row 3``, or None."""
+def numbered(kind: str, word: str, n: int) -> int | None:
+    """Return the index in a word such as ``row 3``, or None; raise InputError if there are fewer than that, `n`."""
     match = re.fullmatch(rf"{kind}\s+(\d{{1,9}})", word.strip(), re.IGNORECASE)
-    return int(match[1]) - 1 if match and int(match[1]) > 0 else None
+    if match is None or int(match[1]) == 0:
+        return None
+    if int(match[1]) > n:
+        raise InputError.of(kind, int(match[1]), f"between 1 and {n}")
+    return int(match[1]) - 1
 
 
 def listed(names: Sequence[str]) -> str:
@@ -302,14 +434,11 @@ def choose(roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int,
     wanted = [_named(name, names) for name in asked]
     axes = [i for i in wanted if roles[i].kind in AXES] or (wanted[:1] if len(wanted) == 2 else [])
     best, low, high = (_best(kind, roles) for kind in AXES)
-    wavelength: tuple[int, ...]
-    if axes or best:
-        wavelength = (axes[0] if axes else _only("wavelength", names, best),)
-    elif low or high:
+    wavelength: tuple[int, ...] = tuple(axes[:1])
+    if not axes and (best or not (low or high)):
+        wavelength = (_only("wavelength", names, best),)
+    elif not axes:
         wavelength = _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
-    else:
-        fault = f"no column is recognised as the wavelength among {listed(names) or 'none'}"
-        raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     rest = [i for i in wanted if i not in wavelength]
     if len(rest) > 1:
         raise InputError.of("columns", asked, "one flux, and one wavelength at most")
@@ -318,7 +447,7 @@ def choose(roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int,
 
 def _named(name: str, names: Sequence[str]) -> int:
     indices = [i for i, one in enumerate(names) if one.strip() == name]
-    if not indices and (place := numbered("column", name)) is not None and place < len(names):
+    if not indices and (place := numbered("column", name, len(names))) is not None:
         return place
     indices = indices or [i for i, one in enumerate(names) if key_of(one) == key_of(name)]
     if len(indices) != 1:
@@ -351,8 +480,8 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
     if len(indices) == 1:
         return indices[0]
     if not indices:
-        fault = f"no column is the {what} among {listed(names) or 'none'}"
-        raise InputError(f"{fault}; give both edges or the wavelength itself", key="columns")
+        fault = f"no column is recognised as the {what} among {listed(names) or 'none'}"
+        raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     several = [names[i].strip() for i in indices]
     fault = f"{len(several)} columns may be the {what}: {listed(several)}"
     raise InputError(f"{fault}; give one as in {as_typed(several[-1], 'column', indices[-1], names)}", key="columns")

@@ -1,1 +1,0 @@
-"""Readers of spectra of users and archives, on the tables of files."""
