@@ -113,10 +113,9 @@ class Search:
             raise InputError(
                 f"sums must have the shape (n_stare, {expected[0]}, {expected[1]}), not {sums.shape}", key="sums"
             )
-        directions = self.bank.directions.astype(_precision(sums))
         for row, correlated in self.correlations(sums):
             tried = row.per_amplitude > 0
-            rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
+            rho = np.einsum("tk,skn->stn", self.bank.directions.astype(correlated.dtype), correlated, optimize=True)
             if not tried.all():
                 rho[:, :, ~tried] = -np.inf
             yield row, rho
@@ -126,7 +125,8 @@ class Search:
 
         The bank's directions times these values are the values of rho. There may be any number of sums.
         """
-        spectra, real = self._spectra(sums), _precision(sums)
+        real = np.result_type(sums, np.float32)
+        spectra = self._spectra(sums.astype(real, copy=False))
         window, level = (0, 0), []
         for row in self.grid:
             template, onsets = row.template, self._onsets(row.template)
@@ -174,14 +174,13 @@ class Search:
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
-        real = _precision(sums)
-        held = np.zeros((len(sums), sums.shape[2], self.n_grid), real)
+        held = np.zeros((len(sums), sums.shape[2], self.n_grid), sums.dtype)
         levelled = np.moveaxis(sums, 2, 1)
         if self._terms:
             # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
             levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
         held[:, :, self._at] = levelled * self._weight[self._at]
-        return [scipy.fft.rfft(held * series.astype(real), self._size) for series in self._series]
+        return [scipy.fft.rfft(held * series.astype(sums.dtype), self._size) for series in self._series]
 
     @cached_property
     def _level_span(self) -> Float:
@@ -192,8 +191,7 @@ class Search:
 
     def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
         """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
-        real = np.float32 if spectrum.dtype == np.complex64 else np.float64
-        held = np.zeros(self._size, real)
+        held = np.zeros(self._size, spectrum.real.dtype)
         met = slice(max(0, 1 - self.n_grid - first), max(0, self.n_grid - first))
         held[: kernel[met].size] = kernel[met]
         other = np.conj(scipy.fft.rfft(np.roll(held, first + met.start)))
@@ -251,17 +249,12 @@ def largest_values(
     return best
 
 
-def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
-    """Return the type of computations: double precision for sums in double precision, else single."""
-    return np.float64 if sums.dtype == np.float64 else np.float32
-
-
 #: Averaging time of the fit, s; the curvature within it is neglected.
 BLOCK_S = 30.0
 #: Residual in standard deviations above which a mean has less weight.
 HUBER = 3.0
-#: Number of Gauss-Newton steps.
-STEPS = 6
+#: Number of Gauss-Newton steps, and difference of amplitudes from which derivatives follow.
+STEPS, DIFFERENCE = 6, 1e-6
 #: Standard deviations of an unknown at which its effect is evaluated, and smallest significant S/N of the effect.
 REACH, LEAST = 4.0, 0.01
 
@@ -289,12 +282,12 @@ class Trend:
 
         The result has the shape (n_stare, n_frame, n_sum).
         """
-        changes = self._changes(amplitudes)
+        of = np.array(self.of)
+        changes = {name: amplitudes[:, of == name] @ self.curves[of == name] for name in CHANGED_PART}
         light = changes["light"] + 1
         star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
         warm = np.expm1(self.slope_per_c * changes["temperature"])
-        each = (change[..., None] for change in (star, sky, changes["light"], warm))
-        return np.asarray(sum(change * known for change, known in zip(each, self.known, strict=True)))
+        return np.asarray(np.einsum("cnt,ctk->ntk", [star, sky, changes["light"], warm], self.known))
 
     def part(self, part: slice) -> Trend:
         """Return the trend of some frames."""
@@ -303,40 +296,31 @@ class Trend:
 
     def subtracted(self, sums: NDArray[Any]) -> Float:
         """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
-        left = np.array(sums, np.float64)
-        # One stare at a time, since the rounding of matrix products may depend on the number of stares.
-        for row in left:
-            row -= self.nonlinear_effect(self.fitted(row[None]))[0]
-        return left
+        return np.array([stare - self.nonlinear_effect(self.fitted(stare)[None])[0] for stare in sums.astype(float)])
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
-        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, self._linear, optimize=True)
+        star, sky, near, dark = self.known.mean(axis=1)
+        each = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
+        linear = np.array([each[of] for of in self.of])
+        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
 
     def fitted(self, sums: Float) -> Float:
-        """Return the most likely amplitudes, shape (n_stare, n_unknown), in standard deviations."""
+        """Return the most likely amplitudes for the sums of a stare, in standard deviations, shape (n_unknown,)."""
         blocks, weight, means = self._blocks
-        y = np.add.reduceat(sums / self.variance[:, None], blocks, axis=1) / weight[:, None]
-        n, n_unknown = len(y), len(self.of)
-        amplitudes = np.zeros((n, n_unknown))
+        y = np.add.reduceat(sums / self.variance[:, None], blocks) / weight[:, None]
+        amplitudes = np.zeros(len(self.of))
+        steps = DIFFERENCE * np.eye(amplitudes.size + 1, amplitudes.size, -1)
         for _ in range(STEPS):
-            left = y - means.effect(amplitudes)
-            size = np.sqrt(np.sum(left**2, axis=2) * weight)
+            here, *moved = means.effect(amplitudes + steps)
+            left, gradient = y - here, (np.array(moved) - here) / DIFFERENCE
+            size = np.sqrt(np.sum(left**2, axis=1) * weight)
             trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
-            gradient = means._gradient(amplitudes)
-            weighted = gradient * trusted[:, None, :, None]
-            information = np.einsum("nutk,nvtk->nuv", weighted, gradient, optimize=True) + np.eye(n_unknown)
-            pull = np.einsum("nutk,ntk->nu", weighted, left, optimize=True) - amplitudes
-            amplitudes = amplitudes + np.linalg.solve(information, pull[:, :, None])[:, :, 0]
+            weighted = (gradient * trusted[:, None]).reshape(amplitudes.size, -1)
+            information = weighted @ gradient.reshape(weighted.shape).T + np.eye(amplitudes.size)
+            amplitudes = amplitudes + np.linalg.solve(information, weighted @ left.ravel() - amplitudes)
         return amplitudes
-
-    @cached_property
-    def _linear(self) -> Float:
-        """Mean response of the sums to the change of each unknown, shape (n_unknown, n_sum)."""
-        star, sky, near, dark = self.known.mean(axis=1)
-        each = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
-        return np.array([each[of] for of in self.of])
 
     @cached_property
     def _blocks(self) -> tuple[NDArray[np.int64], Float, Trend]:
@@ -348,24 +332,6 @@ class Trend:
         known = np.add.reduceat(self.known / self.variance[:, None], first, axis=1) / weight[:, None]
         means = replace(self, frames=number[first], variance=1.0 / weight, curves=curves, known=known)
         return first, weight, means
-
-    def _changes(self, amplitudes: Float) -> dict[str, Float]:
-        """Return the relative changes of star, light and sky, and that of the temperature, (n_stare, n_frame)."""
-        of = np.array(self.of)
-        return {name: amplitudes[:, of == name] @ self.curves[of == name] for name in CHANGED_PART}
-
-    def _gradient(self, amplitudes: Float) -> Float:
-        """Return the derivatives of `effect` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
-        changes = self._changes(amplitudes)
-        light, star, sky = (1 + changes[of][..., None] for of in ("light", "star", "sky"))
-        warm = np.exp(self.slope_per_c * changes["temperature"])[..., None]
-        each = {
-            "star": light * self.known[0],
-            "light": star * self.known[0] + sky * self.known[1] + self.known[2],
-            "sky": light * self.known[1],
-            "temperature": self.slope_per_c * warm * self.known[3],
-        }
-        return np.stack([each[of] * curve[:, None] for of, curve in zip(self.of, self.curves, strict=True)], axis=1)
 
 
 #: Relative norm of a curve's residual below which it is a linear combination of others.
@@ -414,11 +380,6 @@ class Survey:
         return self.components.coefficients(self.stare)
 
     @cached_property
-    def known(self) -> Float:
-        """Known mean of each frame's sums without a flare, which the observer subtracts, shape (n_frame, n_sum)."""
-        return self.components.means(self.coefficients)
-
-    @cached_property
     def directions(self) -> dict[str, Float]:
         """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
         return self.components.directions(self.coefficients)
@@ -465,7 +426,11 @@ class Survey:
     @cached_property
     def frames(self) -> SearchedFrames:
         """Frames of the stare with what the search knows of them."""
-        return SearchedFrames(self.stare, self.known, self.variance, self.curves, self.trend)
+        known, trend = self.components.means(self.coefficients), self.unknowns
+        if trend is not None:
+            power = np.sum(trend.nonlinear_effect(trend.extremes) ** 2 / trend.variance[:, None], axis=(1, 2))
+            trend = trend if (power > LEAST**2).any() else None
+        return SearchedFrames(self.stare, known, self.variance, self.curves, trend)
 
     @cached_property
     def search(self) -> Search:
@@ -485,20 +450,12 @@ class Survey:
         of = tuple(unknown.of for unknown in self.stare.unknowns)
         return Trend(self.stare.numbers, self.stare.frame_s, self.variance, of, curves, known, slope)
 
-    @cached_property
-    def trend(self) -> Trend | None:
-        """Effect of the stare's unknowns if it is significant beyond first order, else None."""
-        if (known := self.unknowns) is None:
-            return None
-        power = np.sum(known.nonlinear_effect(known.extremes) ** 2 / known.variance[:, None], axis=(1, 2))
-        return known if (power > LEAST**2).any() else None
-
     def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
         if self.unknowns is None:
             return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
         moved = self.unknowns.effect(amplitudes)
-        return moved if self.trend is None else self.trend.subtracted(moved)
+        return moved if self.frames.trend is None else self.frames.trend.subtracted(moved)
 
     def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
         """Return the request for the largest values of stares without a flare."""
