@@ -43,7 +43,7 @@ from mauvecl.flares.stare import select_frames
 from mauvecl.host.arrays import Float
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
-from mauvecl.search.search import BATCH, Search, Survey
+from mauvecl.search.search import Search, Survey
 from mauvecl.search.templates import Bank
 
 #: Smallest number of alarms for a counted threshold.
@@ -85,19 +85,19 @@ WEIGHTING_THRESHOLD = 5.0
 MAX_CORRELATION = 1 - 1e-12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TemplateGrid:
     """Correlations between neighbouring templates of a bank.
 
-    Each correlation tuple is ``(previous, next, between them)``, ``(only,)`` at the edge of the bank, or ``()`` if the
-    template has no neighbour along that axis.
+    Rows of correlations are those with both neighbours along an axis and that between these; the correlation with a
+    neighbour that does not exist is -1.
     """
 
     frame_s: float
     templates_per_frame: Float  # shape (n_row,); one row per half-width and sub-frame phase
-    onset_correlations: tuple[tuple[float, ...], ...]  # one per row
-    width_correlations: tuple[tuple[float, ...], ...]  # one per row
-    temperature_correlations: tuple[tuple[float, ...], ...]  # one per temperature
+    onset: Float  # shape (n_row, 3)
+    width: Float  # shape (n_row, 3)
+    temperature: Float  # shape (n_temperature, 3)
 
     @classmethod
     def from_bank(cls, bank: Bank) -> TemplateGrid:
@@ -127,39 +127,20 @@ class TemplateGrid:
                     aligned.append(np.roll(others[which], int(shift) - own.size + 1))
                 width.append(_neighbour_correlations(own, aligned))
         directions = list(bank.directions)
-        temperature = [
-            _neighbour_correlations(direction, _next_to(directions, k)) for k, direction in enumerate(directions)
-        ]
-        return cls(bank.frame_s, np.array(per_frame), tuple(onset), tuple(width), tuple(temperature))
+        temperature = [_neighbour_correlations(own, _next_to(directions, k)) for k, own in enumerate(directions)]
+        return cls(bank.frame_s, *map(np.array, (per_frame, onset, width, temperature)))
 
     def false_alarms_per_second(self, threshold: float) -> float:
         """Return the rate of local maxima above `threshold`, in standard deviations of the statistic."""
-        density, row_probabilities, temperature_probabilities = self._probabilities(threshold)
-        rate = self.templates_per_frame @ row_probabilities @ (density * sum(temperature_probabilities))
-        return float(rate) / self.frame_s
+        return float(np.sum(self.templates_per_frame @ self.peak_probabilities(threshold))) / self.frame_s
 
     def peak_probabilities(self, threshold: float) -> Float:
-        """Return each template's probability that a value above `threshold` is a local maximum.
-
-        The shape is (n_row, n_temperature).
-        """
-        density, row_probabilities, temperature_probabilities = self._probabilities(threshold)
-        weights = density / density.sum()
-        return np.asarray(np.einsum("z,rz,tz->rt", weights, row_probabilities, temperature_probabilities))
-
-    def _probabilities(self, threshold: float) -> tuple[Float, Float, Float]:
-        """Return the weighted density at nodes z, and the probabilities of rows and temperatures, (n, n_node)."""
+        """Return the probability that each template has a local maximum above `threshold`, (n_row, n_temperature)."""
         x, weights = np.polynomial.laguerre.laggauss(N_NODES)
         z = np.sqrt(threshold**2 + 2 * x)
         density = weights / z * np.exp(-(threshold**2) / 2) / np.sqrt(2 * np.pi)
-        rows = [
-            _probability_neighbours_below(z, onset) * _probability_neighbours_below(z, width)
-            for onset, width in zip(self.onset_correlations, self.width_correlations, strict=True)
-        ]
-        temperatures = [
-            _probability_neighbours_below(z, correlations) for correlations in self.temperature_correlations
-        ]
-        return density, np.array(rows), np.array(temperatures)
+        onset, width, temperature = (_below(z, each) for each in (self.onset, self.width, self.temperature))
+        return np.asarray(np.einsum("z,rz,tz->rt", density, onset * width, temperature))
 
 
 def _next_to(values: list[Float], k: int) -> list[Float]:
@@ -167,31 +148,21 @@ def _next_to(values: list[Float], k: int) -> list[Float]:
     return values[max(k - 1, 0) : k] + values[k + 1 : k + 2]
 
 
-def _neighbour_correlations(own: Float, neighbours: list[Float]) -> tuple[float, ...]:
-    """Return the correlations with the neighbours and, if there are two, between them."""
-    correlations = [float(own @ other) for other in neighbours]
-    if len(neighbours) == 2:
-        correlations.append(float(neighbours[0] @ neighbours[1]))
-    return tuple(correlations)
+def _neighbour_correlations(own: Float, neighbours: list[Float]) -> tuple[float, float, float]:
+    """Return the correlations with two neighbours and between them; without one, those with the opposite of `own`."""
+    before, after = [*neighbours, -own, -own][:2]
+    return float(own @ before), float(own @ after), float(before @ after)
 
 
-def _probability_neighbours_below(z: Float, correlations: tuple[float, ...]) -> Float:
-    """Return P(all neighbours < z | z), shape of `z`."""
-    if not correlations:
-        return np.ones_like(z)
+def _below(z: Float, correlations: Float) -> Float:
+    """Return P(both neighbours < z | z), shape (n, n_node), for correlations of shape (n, 3)."""
+    a, b, between = np.clip(correlations.T[:, :, None], -MAX_CORRELATION, MAX_CORRELATION)
     # A neighbour with correlation r is normal with mean r z and variance 1 - r^2.
-    correlations = tuple(float(np.clip(r, -MAX_CORRELATION, MAX_CORRELATION)) for r in correlations)
-    limits = [z * np.sqrt((1 - r) / (1 + r)) for r in correlations[:2]]
-    first = scipy.special.ndtr(limits[0])
-    if len(correlations) == 1:
-        return np.asarray(first)
-    a, b, between = correlations
-    scale = np.sqrt((1 - a * a) * (1 - b * b))
-    r = np.clip((between - a * b) / scale, -MAX_CORRELATION, MAX_CORRELATION)
+    h, k = (z * np.sqrt((1 - r) / (1 + r)) for r in (a, b))
+    r = np.clip((between - a * b) / np.sqrt((1 - a * a) * (1 - b * b)), -MAX_CORRELATION, MAX_CORRELATION)
     root = np.sqrt(1 - r * r)
-    h, k = limits
-    owen = scipy.special.owens_t
-    return np.asarray((first + scipy.special.ndtr(k)) / 2 - owen(h, (k / h - r) / root) - owen(k, (h / k - r) / root))
+    owen, ndtr = scipy.special.owens_t, scipy.special.ndtr
+    return np.asarray((ndtr(h) + ndtr(k)) / 2 - owen(h, (k / h - r) / root) - owen(k, (h / k - r) / root))
 
 
 #: Sampled thresholds; between them, the logarithm of the number of independent templates is a cubic polynomial.
@@ -333,32 +304,22 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     shares = np.cumsum(weights * sizes[:, None])
     estimates = np.empty((draws, len(LADDER)))
     directions, noise_sd = search.bank.directions, np.sqrt(search.variance)
-    # Batches are small so that they fit into the processor's caches.
-    batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
-    for first in range(0, draws, batch):
-        count = min(batch, draws - first)
-        held, own, along = np.empty((count, search.stare.n_frames, n_sum + 1)), np.empty(count), []
-        for n in range(count):
-            which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
-            template = search.in_time(rows[which], np.array([int(rng.choice(tried[which]))]))[0]
-            noise = noise_sd[:, None] * rng.standard_normal((search.stare.n_frames, n_sum))
-            # One more sum holds the response that changes the chosen template's value by one, since it is proportional
-            # to the template in time.
-            held[n] = np.column_stack([noise, template * search.variance])
-            own[n] = template @ noise @ directions[direction]
-            along.append(directions @ directions[direction])
-        values: list[list[Float]] = [[] for _ in range(count)]
-        for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
+    for n in range(draws):
+        which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
+        template = search.in_time(rows[which], np.array([int(rng.choice(tried[which]))]))[0]
+        noise = noise_sd[:, None] * rng.standard_normal((search.stare.n_frames, n_sum))
+        own, along = template @ noise @ directions[direction], directions @ directions[direction]
+        # One more sum holds the response that changes the chosen template's value by one, since it is proportional to
+        # the template in time.
+        held, values = np.column_stack([noise, template * search.variance]), list[Float]()
+        for (row, (correlated,)), weight in zip(search.correlations(held[None]), weights, strict=True):
             at = row.per_amplitude > 0
-            for n, nearby in enumerate(values):
-                c = along[n][:, None] * correlated[n, n_sum, at]
-                r = directions @ correlated[n, :n_sum, at].T - own[n] * c
-                # Only for these G may be positive.
-                near = np.flatnonzero(_reach(r, c, LADDER[-1]) > LADDER[0] - BELOW / LADDER[0])
-                w = np.broadcast_to(weight[:, None], r.shape)
-                nearby.append(np.array([each.reshape(-1)[near] for each in (r, c, w)]))
-        for n, nearby in enumerate(values):
-            estimates[first + n] = _estimates(np.concatenate(nearby, axis=1))
+            c = along[:, None] * correlated[n_sum, at]
+            r = directions @ correlated[:n_sum, at] - own * c
+            # Only for these G may be positive.
+            near = np.flatnonzero(_reach(r, c, LADDER[-1]) > LADDER[0] - BELOW / LADDER[0])
+            values.append(np.array([each.ravel()[near] for each in (r, c, np.broadcast_to(weight[:, None], r.shape))]))
+        estimates[n] = _estimates(np.concatenate(values, axis=1))
     estimates *= shares[-1]
     error = estimates.std(axis=0, ddof=1) / np.sqrt(draws)
     return SampledRate(np.array(LADDER), estimates.mean(axis=0), error, search.stare.observed_s / DAY_S)
