@@ -230,13 +230,13 @@ class SampledRate:
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
         rates = np.exp(scipy.special.log_ndtr(-fine) + self._fit()(fine))
+        largest = np.where(shares > 0, shifts, -np.inf).max(axis=1)
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
             # Probability of an alarm in each draw of a stare.
-            per_day, largest = np.zeros((2, weights.size))
+            per_day = np.zeros(weights.size)
             for shift, share in zip(shifts, shares.T, strict=True):
                 per_day += share * np.interp((threshold - shift) / scales, fine, rates).mean(axis=1)
-                largest = np.where(share > 0, shift, largest)
             each = -np.expm1(-self.days * per_day)
             if shifted:
                 # A few templates with a large mean suffice for an alarm.

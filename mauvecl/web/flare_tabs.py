@@ -15,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 
 from mauvecl.answers.measure import COLUMNS, expected_measurements, models_of
 from mauvecl.charts.chart import Area, Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
-from mauvecl.charts.limits import RISES
+from mauvecl.charts.spectra import RISES
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.host.arrays import Float
 from mauvecl.schema.columns import View, chance_text, records
