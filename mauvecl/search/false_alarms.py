@@ -39,6 +39,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_counts
+from mauvecl.flares.frames import STEADY
 from mauvecl.flares.stare import select_frames
 from mauvecl.host.arrays import Float
 from mauvecl.schema.errors import InputError
@@ -389,29 +390,21 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, 
     of the draws, of sum 1; means of values, ascending, (n_shift,); and the shares of templates with each mean,
     (n_draw, n_shift).
     """
-    stare, components, rows = survey.stare, survey.components, survey.bank.directions
+    stare, unknown, rows = survey.stare, survey.unknowns, survey.bank.directions
     at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
-    n = len(stare.unknowns)
+    n = len(unknown.of)
     z = rng.standard_normal((RATE_DRAWS, n))
     z[RATE_DRAWS // 2 :] *= WIDENING
     log = -np.sum(z**2, axis=1) / 2
     weights = np.exp(log - np.logaddexp(log, log / WIDENING**2 - n * np.log(WIDENING)))
-    moved = {of: np.zeros((RATE_DRAWS, at.size)) for of in ("star", "light", "sky", "temperature")}
-    for amplitude, unknown in zip(z.T, stare.unknowns, strict=True):
-        moved[unknown.of] += amplitude[:, None] * unknown.sd * unknown.curve[at]
-    slope = components.quiet.conditions["dark_slope_per_c"]
-    coefficients = np.broadcast_to(survey.coefficients[at], (RATE_DRAWS, at.size, survey.coefficients.shape[1])).copy()
-    coefficients[..., 0] *= (1 + moved["light"]) * (1 + moved["star"])
-    coefficients[..., 1] *= (1 + moved["light"]) * (1 + moved["sky"])
-    coefficients[..., 2] *= np.exp(slope * moved["temperature"])
-    coefficients[..., 3] *= 1 + moved["light"]
-    covariance = components.jittered_covariance(coefficients, stare)
+    coefficients = np.tile(survey.coefficients[at], (RATE_DRAWS, 1, 1))
+    coefficients[..., : len(STEADY)] *= np.moveaxis(unknown.part(at).factors(z), 0, 2)
+    covariance = survey.components.jittered_covariance(coefficients, stare)
     variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
-    known = part.unknowns
     # Unknowns of several standard deviations may shift a template's value.
-    if known is None or part.search.largest(part.unsubtracted(known.extremes)).max() <= MIN_SHIFT:
+    if part.search.largest(part.unsubtracted(part.unknowns.extremes)).max() <= MIN_SHIFT:
         return scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1))
     # The same share of draws from both halves.
     some = slice(None, None, ONE_IN)

@@ -30,7 +30,7 @@ from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.host.arrays import Float
-from mauvecl.noise.unknowns import CHANGED_PART, NONE, Changing, Processes
+from mauvecl.noise.unknowns import NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
 
@@ -268,7 +268,7 @@ class Trend:
     variance: Float  # of each frame's sums, shape (n_frame,)
     of: tuple[Changing, ...]  # quantity that each unknown changes
     curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
-    known: Float  # means of star, sky, neighbours and dark, shape (4, n_frame, n_sum)
+    known: Float  # means of the components in `STEADY`, shape (4, n_frame, n_sum)
     slope_per_c: float  # relative change of the dark current per deg C
 
     @cached_property
@@ -277,19 +277,21 @@ class Trend:
         rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
         return np.asarray(REACH * np.vstack([rows, -rows]))
 
-    def effect(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns, (n_stare, n_unknown) in standard deviations, on the sums.
+    def factors(self, amplitudes: Float) -> Float:
+        """Return the factors on the components in `STEADY`, shape (4, n_stare, n_frame).
 
-        The result has the shape (n_stare, n_frame, n_sum).
+        Amplitudes of unknowns are in standard deviations, (n_stare, n_unknown).
         """
-        of = np.array(self.of)
-        changes = {name: amplitudes[:, of == name] @ self.curves[of == name] for name in CHANGED_PART}
-        light = changes["light"] + 1
-        star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
-        warm = np.expm1(self.slope_per_c * changes["temperature"])
-        return np.asarray(np.einsum("cnt,ctk->ntk", [star, sky, changes["light"], warm], self.known))
+        of, names = np.array(self.of), ("star", "sky", "light", "temperature")
+        star, sky, light, warmer = (amplitudes[:, of == name] @ self.curves[of == name] for name in names)
+        light = 1 + light
+        return np.stack([light * (1 + star), light * (1 + sky), np.exp(self.slope_per_c * warmer), light])
 
-    def part(self, part: slice) -> Trend:
+    def effect(self, amplitudes: Float) -> Float:
+        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum), for amplitudes as of `factors`."""
+        return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.known, optimize=True))
+
+    def part(self, part: slice | NDArray[np.int64]) -> Trend:
         """Return the trend of some frames."""
         frames, variance = self.frames[part], self.variance[part]
         return replace(self, frames=frames, variance=variance, curves=self.curves[:, part], known=self.known[:, part])
@@ -300,9 +302,9 @@ class Trend:
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
-        star, sky, near, dark = self.known.mean(axis=1)
+        star, sky, dark, near = self.known.mean(axis=1)
         each = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
-        linear = np.array([each[of] for of in self.of])
+        linear = np.reshape([each[of] for of in self.of], (len(self.of), star.size))
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
 
@@ -380,16 +382,9 @@ class Survey:
         return self.components.coefficients(self.stare)
 
     @cached_property
-    def directions(self) -> dict[str, Float]:
-        """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
-        return self.components.directions(self.coefficients)
-
-    @cached_property
     def response(self) -> Float:
         """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
-        unit = np.zeros(len(STEADY) + self.components.n_flares)
-        unit[: len(STEADY) + 1] = 1.0
-        return self.components.means(unit)
+        return np.asarray(self.components.component_means[len(STEADY)])
 
     @property
     def unit_snr(self) -> float:
@@ -427,10 +422,9 @@ class Survey:
     def frames(self) -> SearchedFrames:
         """Frames of the stare with what the search knows of them."""
         known, trend = self.components.means(self.coefficients), self.unknowns
-        if trend is not None:
-            power = np.sum(trend.nonlinear_effect(trend.extremes) ** 2 / trend.variance[:, None], axis=(1, 2))
-            trend = trend if (power > LEAST**2).any() else None
-        return SearchedFrames(self.stare, known, self.variance, self.curves, trend)
+        power = np.sum(trend.nonlinear_effect(trend.extremes) ** 2 / trend.variance[:, None], axis=(1, 2))
+        significant = trend if (power > LEAST**2).any() else None
+        return SearchedFrames(self.stare, known, self.variance, self.curves, significant)
 
     @cached_property
     def search(self) -> Search:
@@ -438,22 +432,17 @@ class Survey:
         return self.frames.search(self.bank)
 
     @cached_property
-    def unknowns(self) -> Trend | None:
-        """Effect of the stare's unknowns, or None without unknowns."""
-        if not self.stare.unknowns:
-            return None
-        star, sky = self.directions["star"], self.directions["sky"]
-        slope = self.components.quiet.conditions["dark_slope_per_c"]
-        dark = self.directions["temperature"] / slope if slope else np.zeros_like(sky)
-        known = np.stack([star, sky, self.directions["light"] - star - sky, dark])
-        curves = np.array([unknown.sd * unknown.curve for unknown in self.stare.unknowns])
-        of = tuple(unknown.of for unknown in self.stare.unknowns)
+    def unknowns(self) -> Trend:
+        """Effect of the stare's unknowns."""
+        steady = len(STEADY)
+        known = self.coefficients.T[:steady, :, None] * self.components.component_means[:steady, None]
+        unknown, slope = self.stare.unknowns, self.components.quiet.conditions["dark_slope_per_c"]
+        curves = np.reshape([one.sd * one.curve for one in unknown], (len(unknown), self.stare.n_frames))
+        of = tuple(one.of for one in unknown)
         return Trend(self.stare.numbers, self.stare.frame_s, self.variance, of, curves, known, slope)
 
     def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
-        if self.unknowns is None:
-            return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
         moved = self.unknowns.effect(amplitudes)
         return moved if self.frames.trend is None else self.frames.trend.subtracted(moved)
 
