@@ -64,7 +64,6 @@ class Point:
 
     value: float
     probability: Interval
-    seed: int
 
 
 class LimitSearch:
@@ -83,7 +82,6 @@ class LimitSearch:
         self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
         self.points: list[Point] = []
         self._report = report
-        self._base: tuple[float, Expectation, Expectation] | None = None
 
     def easier(self, value: float, magnitudes: float) -> float:
         """Return a value at which detection is easier, by some magnitudes or by the factor that they are."""
@@ -99,9 +97,6 @@ class LimitSearch:
 
     def scaled(self, value: float) -> tuple[Expectation, Expectation]:
         """Return `pair` by scaling one pair, since expectations are linear in light."""
-        if self._base is None:
-            at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
-            self._base = at, *self.pair(at)
         at, quiet, flare = self._base
         if self.of == "exposure":
             frames = max(round(value / self.frame_s), 1)
@@ -112,6 +107,12 @@ class LimitSearch:
         fainter = 10 ** (-0.4 * (value - at))
         quiet, flare = (replace(x, source_electrons=fainter * x.source_electrons) for x in (quiet, flare))
         return quiet, flare
+
+    @cached_property
+    def _base(self) -> tuple[float, Expectation, Expectation]:
+        """The value from which pairs are scaled, and its pair."""
+        at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
+        return at, *self.pair(at)
 
     def theory(self, value: float) -> float:
         """Return the detection probability for Gaussian noise; 0 if every pixel saturates."""
@@ -142,7 +143,7 @@ class LimitSearch:
             # Raises InputError where no threshold has the false-alarm probability.
             detection.threshold(self.fap, self.statistic)
             (probability,) = detection.detection_probability(self.fap, self.statistic)
-        self.points.append(Point(value, probability, seed))
+        self.points.append(Point(value, probability))
         self._report(len(self.points))
         return probability
 
@@ -550,7 +551,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     simulated = tuple(question.points)
     # Users are unlikely to choose a seed with this distance from another.
     fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
-    check = Point(value.value, question.simulated(value.value, fresh), fresh)
+    check = Point(value.value, question.simulated(value.value, fresh))
     quiet, flare = question.pair(value.value)
     known, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
     named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star

@@ -96,11 +96,6 @@ class SummedStare:
         start = self.survey.stare.start_s
         return np.column_stack([start, start + self.survey.stare.frame_s])
 
-    @property
-    def free(self) -> list[int]:
-        """Columns of fitted parameters."""
-        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.survey.templates.temperatures_k) > 1 else [])]
-
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
@@ -136,7 +131,7 @@ class SummedStare:
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.
-            star = self.survey.directions["light"][frames]
+            star = self.survey.components.directions(self.survey.coefficients[frames])["light"]
             both = star + light
             total += jitter**2 * (both[:, :, None] * both[:, None, :] - star[:, :, None] * star[:, None, :])
         return total
@@ -238,8 +233,7 @@ class Block:
     def fit(self, theta: Float, held: tuple[int, ProfiledQuantity, float] | None = None) -> BlendFit:
         """Fit all flares from a starting point, shape (n_flare, 4), with a quantity of a flare held at a value."""
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
-        moved = np.zeros(theta.shape, np.bool_)
-        moved[:, self.sums.free] = True
+        moved = np.ones(theta.shape, np.bool_)
         flare, quantity, value = held or (0, None, 0.0)
         if quantity is not None:
             moved[flare, quantity.column] = False
@@ -277,7 +271,7 @@ class Block:
 
         scale = np.ones(theta.shape)
         scale[:, PEAK] = np.exp(start[:, WIDTH])
-        dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
+        dof = self.data.size - self.basis.shape[1] - theta.size
         solution = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
             ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
@@ -287,13 +281,10 @@ class Block:
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
         jacobian = self.model(theta)[1]
-        n, free = len(theta), self.sums.free
-        rows = jacobian[:, :, free].reshape(len(jacobian), -1)
+        rows = jacobian.reshape(len(jacobian), -1)
         scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
         inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), hermitian=True) / np.outer(scale, scale)
-        covariance = np.zeros((n, 4, n, 4))
-        covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
-        return covariance
+        return np.asarray(inverse.reshape(theta.shape * 2))
 
     def interval(self, best: BlendFit, j: int, quantity: ProfiledQuantity, rises: float) -> tuple[float, float, bool]:
         """Return the interval of a flare's quantity from the profile likelihood, and whether the fit ends it.
