@@ -223,17 +223,13 @@ class Search:
         scaled = gram / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(n)
         scaled += np.where(np.einsum("nii->ni", gram) > 1e-9, 0.0, 1.0)[:, :, None] * np.eye(n)
         for phase, shape in enumerate(template.shapes):
-            power = over(0, 0, shape**2)
-            project = np.zeros((n, peaks.size))
-            left = power
-            if n:
-                shared = np.stack([over(0, a, shape * time**p) for p, a in self._terms], axis=1)
-                solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
-                project = solved.T
-                left = power - 2 * np.sum(solved * shared, 1) + np.einsum("ni,nij,nj->n", solved, gram, solved)
+            shared = np.reshape([over(0, a, shape * time**p) for p, a in self._terms], (n, peaks.size)).T
+            solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
+            left = over(0, 0, shape**2) - 2 * np.sum(solved * shared, axis=1)
+            left += np.einsum("ni,nij,nj->n", solved, gram, solved)
             without_gaps = template.detrended(phase, self.bank.baseline.powers)
             tried = left >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
-            yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
+            yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), solved.T)
 
 
 def largest_values(
