@@ -185,7 +185,7 @@ class _StareSearch:
         """Return new candidates from the residuals, at most one within the window of another."""
         sums, bank, candidates = self.sums, self.sums.survey.bank, list[tuple[float, Candidate]]()
         for excess, _, candidate_at in self._values(LEFT_BEHIND):
-            candidates += [(float(excess[k]), candidate_at(k)) for k in np.flatnonzero(excess >= self.threshold)]
+            candidates += [(float(excess[k]), candidate_at(int(k))) for k in np.flatnonzero(excess >= self.threshold)]
         candidates.sort(key=lambda pair: -pair[0])
         # An alarm near a larger one may be caused by it and waits for the next pass, as do the alarms near it.
         waiting = np.zeros(len(sums.net), np.bool_)

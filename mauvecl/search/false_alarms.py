@@ -390,18 +390,19 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, 
     of the draws, of sum 1; means of values, ascending, (n_shift,); and the shares of templates with each mean,
     (n_draw, n_shift).
     """
-    stare, unknown, rows = survey.stare, survey.unknowns, survey.bank.directions
-    at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
+    rows, at = survey.bank.directions, np.zeros(survey.stare.n_frames, np.bool_)
+    at[np.linspace(0, at.size - 1, POINTS).astype(int)] = True
+    here = replace(survey, stare=select_frames(survey.stare, at))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
-    n = len(unknown.of)
+    n = len(survey.stare.unknowns)
     z = rng.standard_normal((RATE_DRAWS, n))
     z[RATE_DRAWS // 2 :] *= WIDENING
     log = -np.sum(z**2, axis=1) / 2
     weights = np.exp(log - np.logaddexp(log, log / WIDENING**2 - n * np.log(WIDENING)))
-    coefficients = np.tile(survey.coefficients[at], (RATE_DRAWS, 1, 1))
-    coefficients[..., : len(STEADY)] *= np.moveaxis(unknown.part(at).factors(z), 0, 2)
-    covariance = survey.components.jittered_covariance(coefficients, stare)
-    variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
+    coefficients = np.tile(here.coefficients, (RATE_DRAWS, 1, 1))
+    coefficients[..., : len(STEADY)] *= np.moveaxis(here.unknowns.factors(z), 0, 2)
+    covariance = here.components.jittered_covariance(coefficients, here.stare)
+    variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / here.variance[:, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
     # Unknowns of several standard deviations may shift a template's value.
     if part.search.largest(part.unsubtracted(part.unknowns.extremes)).max() <= MIN_SHIFT:

@@ -287,7 +287,7 @@ class Trend:
         """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum), for amplitudes as of `factors`."""
         return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.known, optimize=True))
 
-    def part(self, part: slice | NDArray[np.int64]) -> Trend:
+    def part(self, part: slice) -> Trend:
         """Return the trend of some frames."""
         frames, variance = self.frames[part], self.variance[part]
         return replace(self, frames=frames, variance=variance, curves=self.curves[:, part], known=self.known[:, part])
@@ -417,10 +417,12 @@ class Survey:
     @cached_property
     def frames(self) -> SearchedFrames:
         """Frames of the stare with what the search knows of them."""
-        known, trend = self.components.means(self.coefficients), self.unknowns
-        power = np.sum(trend.nonlinear_effect(trend.extremes) ** 2 / trend.variance[:, None], axis=(1, 2))
-        significant = trend if (power > LEAST**2).any() else None
-        return SearchedFrames(self.stare, known, self.variance, self.curves, significant)
+        known, trend = self.components.means(self.coefficients), None
+        if self.stare.unknowns:
+            effect = self.unknowns.nonlinear_effect(self.unknowns.extremes)
+            power = np.sum(effect**2 / self.variance[:, None], axis=(1, 2))
+            trend = self.unknowns if (power > LEAST**2).any() else None
+        return SearchedFrames(self.stare, known, self.variance, self.curves, trend)
 
     @cached_property
     def search(self) -> Search:
