@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_counts
 from mauvecl.flares.frames import STEADY
 from mauvecl.flares.stare import select_frames
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search.search import Search, Survey
@@ -317,8 +317,7 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
             at = row.per_amplitude > 0
             c = along[:, None] * correlated[n_sum, at]
             r = directions @ correlated[:n_sum, at] - own * c
-            # Only for these G may be positive.
-            near = np.flatnonzero(_reach(r, c, LADDER[-1]) > LADDER[0] - BELOW / LADDER[0])
+            near = np.flatnonzero(_is_near(r, c, LADDER[0]))
             values.append(np.array([each.ravel()[near] for each in (r, c, np.broadcast_to(weight[:, None], r.shape))]))
         estimates[n] = _estimates(np.concatenate(values, axis=1))
     estimates *= shares[-1]
@@ -330,9 +329,10 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
 _X, _W = np.polynomial.laguerre.laggauss(NODES)
 
 
-def _reach(r: Float, c: Float, u: float) -> Float:
-    """Return the largest values at the nodes of the integral for a threshold u."""
-    return np.asarray(r + np.abs(c) * (u + _X[-1] / (u - BELOW / u)))
+def _is_near(r: Float, c: Float, u: float) -> Bool:
+    """Return whether G may be positive for values at a node of the integral for a threshold u, or for a higher one."""
+    least = u - BELOW / u
+    return np.asarray(r + np.abs(c) * (u + _X[-1] / least) > least)
 
 
 def _estimates(values: Float) -> Float:
@@ -340,11 +340,7 @@ def _estimates(values: Float) -> Float:
     estimates = np.zeros(len(LADDER))
     for k, u in enumerate(LADDER):
         least = u - BELOW / u
-        values = values[:, _reach(values[0], values[1], LADDER[-1]) > least]
-        near = values[:, _reach(values[0], values[1], u) > least]
-        if not near.size:
-            continue
-        r, c, w = near
+        r, c, w = values = values[:, _is_near(values[0], values[1], u)]
         # Value z at which each template exceeds the threshold; the chosen one (r = 0, c = 1) does at z = u.
         crossing = np.divide(u - r, c, out=np.full(r.size, u), where=c > MIN_CORRELATION)
         z = max(least, min(u, float(crossing.min())))
@@ -352,8 +348,7 @@ def _estimates(values: Float) -> Float:
             z = least
         nodes = z + _X / z
         rho = r + nodes[:, None] * c
-        counted = rho > least
-        total = np.where(counted, np.exp(np.where(counted, u * (rho - u), 0.0)), 0.0) @ w
+        total = (np.exp(u * (rho - u)) * (rho > least)) @ w
         # The tolerance allows for rounding of the crossing value.
         exceeds = rho.max(axis=1) > u * (1 - 1e-12)
         density = np.exp(-(nodes**2) / 2 + u * (nodes - u) + _X) / np.sqrt(2 * np.pi) / z
