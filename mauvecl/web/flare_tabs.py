@@ -41,8 +41,10 @@ MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
 STEPS = 9, 5
 #: Labelled contours, with the part of the line at which the label stands.
 LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}
-#: Number of points of a curve in closed form.
-POINTS = 25
+#: Initial number of points of a curve, number of times that steps are halved, and change above which they are halved.
+FIRST, HALVINGS, CHANGE = 9, 5, 0.1
+
+
 #: Fields on which a map does not depend; an upload is identified by its content.
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours"}
 
@@ -61,10 +63,19 @@ def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -
 
 
 def _curve(closed: ClosedForms) -> tuple[Float, Float]:
-    """Return magnitudes and probabilities, interpolated in the probit between closed forms."""
-    x, fine = np.linspace(*MAGNITUDES, POINTS), np.linspace(*MAGNITUDES, 241)
-    each = (closed.at(light, np.ones(1)) for light in 10 ** (-0.4 * (x - closed.question.magnitude)))
-    y = [forms[0].probability if forms else 0.0 for forms in each]
+    """Return magnitudes and probabilities, with more points where these change."""
+
+    def exact(magnitudes: Float) -> list[float]:
+        each = (closed.at(light, np.ones(1)) for light in 10 ** (-0.4 * (magnitudes - closed.question.magnitude)))
+        return [forms[0].probability if forms else 0.0 for forms in each]
+
+    x = np.linspace(*MAGNITUDES, FIRST)
+    y = np.array(exact(x))
+    for _ in range(HALVINGS):
+        steep = np.nonzero(np.abs(np.diff(y)) > CHANGE)[0]
+        new = (x[steep] + x[steep + 1]) / 2
+        x, y = np.insert(x, steep + 1, new), np.insert(y, steep + 1, exact(new))
+    fine = np.linspace(*MAGNITUDES, 241)
     # Probits are smooth; those of what rounds to 0 or 1 are not known.
     probits = special.ndtri(np.clip(y, 1e-15, 1 - 1e-15))
     return fine, np.asarray(special.ndtr(PchipInterpolator(x, probits)(fine)))
