@@ -61,8 +61,11 @@ class Completeness:
     def __post_init__(self) -> None:
         set_read_only(self, energy_erg=self.energy_erg, probability=self.probability)
         energy, p = self.energy_erg, self.probability
-        if not (energy.shape == p.shape == (p.size,) and p.size > 1 and (np.diff(energy, prepend=0.0) > 0).all()):
-            raise InputError("a completeness needs a probability for each of its ascending energies", key="energy_erg")
+        ascending = np.isfinite(energy).all() and (np.diff(energy, prepend=0.0) > 0).all()
+        if not (energy.shape == p.shape == (p.size,) and p.size > 1 and ascending):
+            raise InputError(
+                "a completeness needs a probability for each of at least 2 ascending energies above 0", key="energy_erg"
+            )
         if not ((p >= 0) & (p <= 1)).all():
             raise InputError.of("probability", (float(p.min()), float(p.max())), "between 0 and 1")
 

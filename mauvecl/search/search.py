@@ -259,9 +259,6 @@ REACH, LEAST = 4.0, 0.01
 class Trend:
     """Effect of a stare's unknowns on the sums of its frames."""
 
-    frames: NDArray[np.int64]  # frame numbers including gaps, shape (n_frame,)
-    frame_s: float
-    variance: Float  # of each frame's sums, shape (n_frame,)
     of: tuple[Changing, ...]  # quantity that each unknown changes
     curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
     known: Float  # means of the components in `STEADY`, shape (4, n_frame, n_sum)
@@ -287,15 +284,6 @@ class Trend:
         """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum), for amplitudes as of `factors`."""
         return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.known, optimize=True))
 
-    def part(self, part: slice) -> Trend:
-        """Return the trend of some frames."""
-        frames, variance = self.frames[part], self.variance[part]
-        return replace(self, frames=frames, variance=variance, curves=self.curves[:, part], known=self.known[:, part])
-
-    def subtracted(self, sums: NDArray[Any]) -> Float:
-        """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
-        return np.array([stare - self.nonlinear_effect(self.fitted(stare)[None])[0] for stare in sums.astype(float)])
-
     def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
         star, sky, dark, near = self.known.mean(axis=1)
@@ -304,35 +292,8 @@ class Trend:
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
 
-    def fitted(self, sums: Float) -> Float:
-        """Return the most likely amplitudes for the sums of a stare, in standard deviations, shape (n_unknown,)."""
-        blocks, weight, means = self._blocks
-        y = np.add.reduceat(sums / self.variance[:, None], blocks) / weight[:, None]
-        amplitudes = np.zeros(len(self.of))
-        steps = DIFFERENCE * np.eye(amplitudes.size + 1, amplitudes.size, -1)
-        for _ in range(STEPS):
-            here, *moved = means.effect(amplitudes + steps)
-            left, gradient = y - here, (np.array(moved) - here) / DIFFERENCE
-            size = np.sqrt(np.sum(left**2, axis=1) * weight)
-            trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
-            weighted = (gradient * trusted[:, None]).reshape(amplitudes.size, -1)
-            information = weighted @ gradient.reshape(weighted.shape).T + np.eye(amplitudes.size)
-            amplitudes = amplitudes + np.linalg.solve(information, weighted @ left.ravel() - amplitudes)
-        return amplitudes
 
-    @cached_property
-    def _blocks(self) -> tuple[NDArray[np.int64], Float, Trend]:
-        """The first frame of each block, its weight, and the trend of the blocks' means."""
-        number = self.frames // max(1, round(BLOCK_S / self.frame_s))
-        first = np.flatnonzero(np.diff(number, prepend=-1))
-        weight = np.add.reduceat(1.0 / self.variance, first)
-        curves = np.add.reduceat(self.curves / self.variance, first, axis=1) / weight
-        known = np.add.reduceat(self.known / self.variance[:, None], first, axis=1) / weight[:, None]
-        means = replace(self, frames=number[first], variance=1.0 / weight, curves=curves, known=known)
-        return first, weight, means
-
-
-#: Relative norm of a curve's residual below which it is a linear combination of others.
+#: Norm of curves of unit norm less their straight lines, below which they are linear combinations of others.
 MIN_CURVE = 1e-6
 
 
@@ -348,8 +309,9 @@ class SearchedFrames:
 
     def part(self, window: slice) -> SearchedFrames:
         """Return consecutive frames of these."""
-        curves = None if self.curves is None else self.curves[:, window]
-        trend = None if self.trend is None else self.trend.part(window)
+        curves, trend = None if self.curves is None else self.curves[:, window], self.trend
+        if trend is not None:
+            trend = replace(trend, curves=trend.curves[:, window], known=trend.known[:, window])
         stare = select_frames(self.stare, window)
         return SearchedFrames(stare, self.known[window], self.variance[window], curves, trend)
 
@@ -359,8 +321,39 @@ class SearchedFrames:
 
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
         """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
-        left = sums - self.known
-        return np.asarray(left if self.trend is None else self.trend.subtracted(left), np.float32)
+        return np.asarray(self.subtracted(sums - self.known), np.float32)
+
+    def subtracted(self, sums: NDArray[Any]) -> NDArray[Any]:
+        """Fit the trend, if there is one, to sums less their known mean, and subtract it beyond first order."""
+        if (trend := self.trend) is None:
+            return sums
+        return np.array([stare - trend.nonlinear_effect(self._fitted(trend, stare))[0] for stare in sums.astype(float)])
+
+    def _fitted(self, trend: Trend, sums: Float) -> Float:
+        """Return the most likely amplitudes for the sums of a stare, in standard deviations, shape (1, n_unknown)."""
+        first, weight, means = self._blocks
+        y, n = np.add.reduceat(sums / self.variance[:, None], first) / weight[:, None], len(trend.of)
+        amplitudes, steps = np.zeros((1, n)), DIFFERENCE * np.eye(n + 1, n, -1)
+        for _ in range(STEPS):
+            effect = means.effect(amplitudes + steps)
+            left, gradient = y - effect[0], (effect[1:] - effect[0]) / DIFFERENCE
+            size = np.sqrt(np.sum(left**2, axis=1) * weight)
+            trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
+            weighted = (gradient * trusted[:, None]).reshape(n, -1)
+            information = weighted @ gradient.reshape(n, -1).T + np.eye(n)
+            amplitudes = amplitudes + np.linalg.solve(information, weighted @ left.ravel() - amplitudes[0])
+        return amplitudes
+
+    @cached_property
+    def _blocks(self) -> tuple[NDArray[np.intp], Float, Trend]:
+        """The first frame of each block, its weight, and the trend of the blocks' means."""
+        assert self.trend is not None
+        number = self.stare.numbers // max(1, round(BLOCK_S / self.stare.frame_s))
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        weight = np.add.reduceat(1.0 / self.variance, first)
+        curves = np.add.reduceat(self.trend.curves / self.variance, first, axis=1) / weight
+        known = np.add.reduceat(self.trend.known / self.variance[:, None], first, axis=1) / weight[:, None]
+        return first, weight, replace(self.trend, curves=curves, known=known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,20 +392,14 @@ class Survey:
 
     @cached_property
     def curves(self) -> Float | None:
-        """Curves of the stare's unknowns that are not straight lines, shape (n_curve, n_frame)."""
+        """Independent curves in which the stare's unknowns are not straight lines, shape (n_curve, n_frame)."""
         if not self.bank.baseline.cycle:
             return None
-        every = [unknown.curve for unknown in self.stare.unknowns]
-        # Residual of each curve after a fit of a straight line and the previous curves.
-        basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
-        curves: list[Float] = []
-        for curve in every:
-            left = curve - basis @ (basis.T @ curve)
-            size = float(np.linalg.norm(left))
-            if size > MIN_CURVE * float(np.linalg.norm(curve)):
-                curves.append(left)
-                basis = np.column_stack([basis, left / size])
-        return np.array(curves).reshape(len(curves), self.stare.n_frames)
+        of_unit_norm = [unknown.curve / (np.linalg.norm(unknown.curve) or 1.0) for unknown in self.stare.unknowns]
+        every = np.reshape(of_unit_norm, (len(of_unit_norm), self.stare.n_frames))
+        line = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
+        curves, size, _ = np.linalg.svd((every - every @ line @ line.T).T, full_matrices=False)
+        return np.asarray(curves[:, size > MIN_CURVE].T)
 
     @cached_property
     def frames(self) -> SearchedFrames:
@@ -436,13 +423,11 @@ class Survey:
         known = self.coefficients.T[:steady, :, None] * self.components.component_means[:steady, None]
         unknown, slope = self.stare.unknowns, self.components.quiet.conditions["dark_slope_per_c"]
         curves = np.reshape([one.sd * one.curve for one in unknown], (len(unknown), self.stare.n_frames))
-        of = tuple(one.of for one in unknown)
-        return Trend(self.stare.numbers, self.stare.frame_s, self.variance, of, curves, known, slope)
+        return Trend(tuple(one.of for one in unknown), curves, known, slope)
 
     def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
-        moved = self.unknowns.effect(amplitudes)
-        return moved if self.frames.trend is None else self.frames.trend.subtracted(moved)
+        return self.frames.subtracted(self.unknowns.effect(amplitudes))
 
     def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
         """Return the request for the largest values of stares without a flare."""
