@@ -258,10 +258,7 @@ class _StareSearch:
         noise = self.sums.noise(_thetas(self.found), light)
         base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
-        loud = excess > 1.01
-        if not loud.any():
-            return left
-        evened = left.copy()
+        loud, evened = excess > 1.01, left.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
         for first, end in true_runs(loud):
