@@ -386,10 +386,8 @@ def budget_series(x: Expectation) -> dict[str, Any]:
 @picture_of("SnrAnswer", "noise-budget")
 def noise_budgets(answer: SnrAnswer) -> Picture:
     """Plot pixel noise by origin against wavelength, one panel per star and cell, as in the paper."""
-    each, observed = answer.study.sweep.size, list[tuple[str, Any]]()
-    for star in answer.stars:
-        x = star.result.expectation
-        observed.append((star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x))
+    each, seen = answer.study.sweep.size, [(star, star.result.expectation) for star in answer.stars]
+    observed = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in seen]
 
     def finish(axis: Any) -> None:
         # Zodiacal light can be far below everything else.

@@ -110,12 +110,6 @@ class SummedStare:
         start = self.survey.stare.start_s
         return np.searchsorted(start, first_s - self.survey.stare.frame_s), np.searchsorted(start, last_s)
 
-    def mean(self, flare: Float, frames: Any) -> Float:
-        """Return the mean of a flare's shape over frames, including throughput, shape (n_frame,)."""
-        shape = self.survey.bank.shape
-        mean = shape.mean_over(self.edges[frames], flare[PEAK], np.exp(flare[WIDTH]))
-        return np.asarray(self.survey.stare.light[frames] * mean)
-
     def light(self, theta: Float, frames: slice = slice(None)) -> Float:
         """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
         total = np.zeros_like(self.net)[frames]
@@ -139,11 +133,13 @@ class SummedStare:
     def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
         """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
         first, last, _ = frames.indices(len(self.net))
+        shape = self.survey.bank.shape
         peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
         starts, stops = self.overlapping(peak - REACH[0] * width, peak + REACH[1] * width)
         for flare, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
             if start < stop:
-                mean = np.exp(flare[AMPLITUDE]) * self.mean(flare, slice(start, stop))
+                mean = shape.mean_over(self.edges[start:stop], flare[PEAK], np.exp(flare[WIDTH]))
+                mean = np.exp(flare[AMPLITUDE]) * (self.survey.stare.light[start:stop] * mean)
                 yield flare, slice(start - first, stop - first), mean
 
     def window(self, flare: Float) -> tuple[float, float]:
@@ -179,8 +175,7 @@ class SummedStare:
             degree = max(baseline.powers)
             knots = np.concatenate([np.zeros(degree), np.arange(pieces + 1.0), np.full(degree, float(pieces))])
             terms += list(scipy.interpolate.BSpline.design_matrix(place, knots, degree).toarray().T)
-        if baseline.cycle and self.survey.curves is not None:
-            terms += list(self.survey.curves[:, used])
+        terms += list(self.survey.curves[:, used])
         design = np.reshape(terms, (len(terms), time.size)).T
         columns = np.einsum("tij,tp->tijp", whiten, design).reshape(data.size, -1)
         basis = scipy.linalg.orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), rcond=1e-9)
@@ -503,7 +498,7 @@ class SingleFlareFit:
 
     def _averaged(
         self, several: int, sums: NDArray[Any], frames: SearchedFrames
-    ) -> tuple[NDArray[Any], Float, Float, Float | None]:
+    ) -> tuple[NDArray[Any], Float, Float, Float]:
         """Average groups of consecutive frames; incomplete groups at gaps are dropped."""
         start_s, variance, curves = frames.stare.start_s, frames.variance, frames.curves
         if several == 1:
@@ -512,32 +507,27 @@ class SingleFlareFit:
         _, first, count = np.unique(number // several, return_index=True, return_counts=True)
         rows = first[count == several][:, None] + np.arange(several)
         mean = np.stack([values[rows].mean(axis=1) for values in sums])
-        return (
-            mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several,
-            None if curves is None else curves[:, rows].mean(axis=2),
-        )  # fmt: skip
+        return mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several, curves[:, rows].mean(axis=2)
 
     def _windows(
-        self, start_s: Float, peak: Float, width: Float, variance: Float, curves: Float | None
+        self, start_s: Float, peak: Float, width: Float, variance: Float, curves: Float
     ) -> tuple[Float, Float]:
         """Return weights of frames, zero outside the windows, (n, n_frame), and baseline terms, (n, n_frame, p)."""
         n, frame_s = peak.size, self.bank.frame_s
         weight = np.zeros((n, start_s.size))
-        terms = np.zeros((n, start_s.size, len(self.bank.baseline.powers) + (0 if curves is None else len(curves))))
+        terms = np.zeros((n, start_s.size, len(self.bank.baseline.powers) + len(curves)))
         for k in range(n):
             lead, tail = self.bank.window(float(width[k]))
             since = (start_s - peak[k]) / frame_s
             inside = (since >= -lead - 1) & (since <= tail)
             weight[k, inside] = 1.0 / variance[inside]
             time = since / (lead + tail)
-            rows = [time**power for power in self.bank.baseline.powers] + list([] if curves is None else curves)
+            rows = [*(time**power for power in self.bank.baseline.powers), *curves]
             terms[k] = np.reshape(rows, terms.shape[:0:-1]).T
-        if terms.shape[2]:
-            # Orthonormal in each window, so that a projection is a sum of products.
-            root = np.sqrt(weight)[:, :, None]
-            basis = np.linalg.qr(root * terms)[0]
-            terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
-        return weight, terms
+        # Orthonormal in each window, so that a projection is a sum of products.
+        root = np.sqrt(weight)[:, :, None]
+        basis = np.linalg.qr(root * terms)[0]
+        return weight, np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
 
     def _normal(self, products: Float, amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
         """Return information and gradient for log amplitude, peak in half-widths, log half-width, log temperature."""
@@ -559,7 +549,5 @@ class SingleFlareFit:
 
 def _remove_baseline(values: Float, weight: Float, level: Float) -> Float:
     """Subtract from values (n, n_frame, k) their weighted projection on orthonormal terms (n, n_frame, p)."""
-    if not level.shape[2]:
-        return values
     amounts = np.einsum("ntp,ntk->npk", level * weight[:, :, None], values, optimize=True)
     return np.asarray(values - np.einsum("ntp,npk->ntk", level, amounts, optimize=True))

@@ -304,16 +304,15 @@ class SearchedFrames:
     stare: Stare
     known: NDArray[Any]  # mean of each frame's sums without a flare, shape (n_frame, n_sum)
     variance: Float  # of each frame's sums, shape (n_frame,)
-    curves: Float | None  # of unknown amplitude, shape (n_curve, n_frame)
+    curves: Float  # of unknown amplitude, shape (n_curve, n_frame)
     trend: Trend | None  # effect of the stare's unknowns if it is significant beyond first order
 
     def part(self, window: slice) -> SearchedFrames:
         """Return consecutive frames of these."""
-        curves, trend = None if self.curves is None else self.curves[:, window], self.trend
+        stare, trend = select_frames(self.stare, window), self.trend
         if trend is not None:
             trend = replace(trend, curves=trend.curves[:, window], known=trend.known[:, window])
-        stare = select_frames(self.stare, window)
-        return SearchedFrames(stare, self.known[window], self.variance[window], curves, trend)
+        return SearchedFrames(stare, self.known[window], self.variance[window], self.curves[:, window], trend)
 
     def search(self, bank: Bank) -> Search:
         """Return the search of the frames with a bank."""
@@ -391,10 +390,10 @@ class Survey:
         return np.asarray(np.einsum("tkk->t", self.covariance) / self.covariance.shape[1])
 
     @cached_property
-    def curves(self) -> Float | None:
-        """Independent curves in which the stare's unknowns are not straight lines, shape (n_curve, n_frame)."""
+    def curves(self) -> Float:
+        """Independent curves of the baseline: the unknowns less straight lines, shape (n_curve, n_frame)."""
         if not self.bank.baseline.cycle:
-            return None
+            return np.zeros((0, self.stare.n_frames))
         of_unit_norm = [unknown.curve / (np.linalg.norm(unknown.curve) or 1.0) for unknown in self.stare.unknowns]
         every = np.reshape(of_unit_norm, (len(of_unit_norm), self.stare.n_frames))
         line = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
