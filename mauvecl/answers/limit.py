@@ -64,6 +64,7 @@ class Point:
 
     value: float
     probability: Interval
+    seed: int
 
 
 class LimitSearch:
@@ -143,7 +144,7 @@ class LimitSearch:
             # Raises InputError where no threshold has the false-alarm probability.
             detection.threshold(self.fap, self.statistic)
             (probability,) = detection.detection_probability(self.fap, self.statistic)
-        self.points.append(Point(value, probability))
+        self.points.append(Point(value, probability, seed))
         self._report(len(self.points))
         return probability
 
@@ -548,10 +549,9 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     theory = question.root(near=LimitSearch(case, statistic).root() if each else None)
     roots = np.array([draw.root_or_nan(theory) for draw in each])
     value = settle(question, theory)
-    simulated = tuple(question.points)
     # Users are unlikely to choose a seed with this distance from another.
-    fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
-    check = Point(value.value, question.simulated(value.value, fresh))
+    question.simulated(value.value, (study.run.seed + 0x9E3779B97F4A7C15) % 2**64)
+    *points, check = question.points
     quiet, flare = question.pair(value.value)
     known, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
     named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
@@ -562,7 +562,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     return Limit(
         star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
-        check=check, points=simulated, curve=question.curve(value.value),
+        check=check, points=tuple(points), curve=question.curve(value.value),
         unknown=UnknownEffect(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
         cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
