@@ -63,7 +63,7 @@ def survey_star(case: Case) -> Survey:
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
     survey = Survey(Components(quiet, own, templates.weights), stare, bank, templates)
-    if level.cycle and not len(survey.curves if survey.curves is not None else ()):
+    if level.cycle and not len(survey.curves):
         raise InputError("search.cycle needs an unknown cycle of the stare: stare.cycles", key="search.cycle")
     return survey
 

@@ -83,7 +83,6 @@ class LimitSearch:
         self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
         self.points: list[Point] = []
         self._report = report
-        self._base: tuple[float, Expectation, Expectation] | None = None
 
     def easier(self, value: float, magnitudes: float) -> float:
         """Return a value at which detection is easier, by some magnitudes or by the factor that they are."""
@@ -99,9 +98,6 @@ class LimitSearch:
 
     def scaled(self, value: float) -> tuple[Expectation, Expectation]:
         """Return `pair` by scaling one pair, since expectations are linear in light."""
-        if self._base is None:
-            at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
-            self._base = at, *self.pair(at)
         at, quiet, flare = self._base
         if self.of == "exposure":
             frames = max(round(value / self.frame_s), 1)
@@ -112,6 +108,12 @@ class LimitSearch:
         fainter = 10 ** (-0.4 * (value - at))
         quiet, flare = (replace(x, source_electrons=fainter * x.source_electrons) for x in (quiet, flare))
         return quiet, flare
+
+    @cached_property
+    def _base(self) -> tuple[float, Expectation, Expectation]:
+        """The value from which pairs are scaled, and its pair."""
+        at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
+        return at, *self.pair(at)
 
     def theory(self, value: float) -> float:
         """Return the detection probability for Gaussian noise; 0 if every pixel saturates."""
@@ -547,10 +549,9 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     theory = question.root(near=LimitSearch(case, statistic).root() if each else None)
     roots = np.array([draw.root_or_nan(theory) for draw in each])
     value = settle(question, theory)
-    simulated = tuple(question.points)
     # Users are unlikely to choose a seed with this distance from another.
-    fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
-    check = Point(value.value, question.simulated(value.value, fresh), fresh)
+    question.simulated(value.value, (study.run.seed + 0x9E3779B97F4A7C15) % 2**64)
+    *points, check = question.points
     quiet, flare = question.pair(value.value)
     known, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
     named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
@@ -561,7 +562,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     return Limit(
         star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
-        check=check, points=simulated, curve=question.curve(value.value),
+        check=check, points=tuple(points), curve=question.curve(value.value),
         unknown=UnknownEffect(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
         cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),

@@ -144,9 +144,8 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
     (case,) = cases(study, swept=False)
     if study.map.x is None:
-        question = study.map.model_copy(update={"x": magnitudes_of(case)})
-        study = study.model_copy(update={"map": question})
-        case = replace(case, study=case.study.model_copy(update={"map": question}))
+        study = study.model_copy(update={"map": study.map.model_copy(update={"x": magnitudes_of(case)})})
+        case = case.with_sections(map=study.map)
     unknown = forms.drawn(case.study) if study.unknowns.draws else None
     draws = [case] if unknown is None else [replace(case, study=draw) for draw in unknown.studies]
     x, y = study.map.axes
@@ -217,8 +216,7 @@ def magnitudes_of(case: Case) -> Axis:
     ends, saturating, faint = list[float](), list[float](), SEARCH["magnitude"][0]
     for value in values if isinstance(values[0], str) else (values[0], values[-1]):
         for power in (min(powers), max(powers)):
-            limit = LimitQuestion(of="magnitude", power=power)
-            one = replace(case, study=case.study.model_copy(update={"limit": limit}))
+            one = case.with_sections(limit=LimitQuestion(of="magnitude", power=power))
             search = LimitSearch(one.with_value(question.y.quantity, value), statistic)
             quiet = search.scaled(MIDDLE)[0]
             star = quiet.gain_dn_per_electron * quiet.source_electrons

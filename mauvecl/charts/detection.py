@@ -1,4 +1,4 @@
-"""Charts of detections and of the instrument's unknowns."""
+"""Charts of detections, limits and maps, S/N, and the instrument's unknowns."""
 
 from __future__ import annotations
 
@@ -11,21 +11,41 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Dots, Line, Panel, Picture, Rule, Series
+from mauvecl.charts.chart import (
+    WAVELENGTH,
+    Area,
+    Axis,
+    Chart,
+    Dots,
+    Levels,
+    Line,
+    Mesh,
+    Panel,
+    Picture,
+    Rule,
+    Series,
+    Strips,
+)
 from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.schema.columns import First, note_of, part_note
+from mauvecl.study.cases import full_label
 from mauvecl.study.questions import QUANTITIES
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.answers.detect import DetectAnswer, UnknownAnswer
+    from mauvecl.answers.gaussian import GaussianAnswer
+    from mauvecl.answers.limit import LimitAnswer
+    from mauvecl.answers.map import MapAnswer
+    from mauvecl.answers.signal import ExposureAnswer, SnrAnswer
     from mauvecl.detection.detection import Detection, Roc
     from mauvecl.detection.snr import SnrResult
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.study.study import Study
 
 #: Flares of a star in one picture.
 MOST_FLARES = 16
@@ -270,3 +290,191 @@ def unknowns(answer: UnknownAnswer) -> Picture:
         f"marginalised over each unknown; false-alarm probability {fap:g} per test"
     )
     return Picture([above, below], (2.6 * len(stars) + 1.6, 5.6), title, below=True)
+
+
+#: Markers of limits with the same colour.
+MARKS = "osD^vPX"
+
+
+def quantity_axis(study: Study, name: str, **how: Any) -> Axis:
+    """Return the axis of a quantity, with the band of magnitudes if all stars have the same."""
+    bands = {star.band for star in study.star}
+    band = f" ({bands.pop()})" if name == "magnitude" and len(bands) == 1 else ""
+    return Axis(QUANTITIES[name].label + band, **how)
+
+
+@picture_of("MapAnswer", "map")
+def detection_map(answer: MapAnswer) -> Picture:
+    """Plot the detection probability over two quantities, one panel per statistic."""
+    question, study, places, axes = answer.study.map, answer.study, list[Any](), list[Axis]()
+    for sweep, values in zip(question.axes, (answer.x, answer.y), strict=True):
+        named = isinstance(values[0], str)
+        places.append(np.arange(len(values)) if named else np.array(values, float))
+        ticks = (places[-1], values) if named else None
+        axes.append(quantity_axis(study, sweep.quantity, log=sweep.log and not named, ticks=ticks))
+    (x, y), (x_axis, y_axis) = places, axes
+    contoured, row = bool(question.contours) and min(x.size, y.size) > 1, []
+    for statistic, p in zip(answer.statistics, answer.probability, strict=True):
+        series: list[Series] = [Mesh("detection probability", at=(x, y, p))]
+        if contoured:
+            series.append(Levels("detected", levels=tuple(question.contours), at=(x, y, p)))
+        title = statistic_label(statistic).partition(" (")[0]
+        row.append(Panel(x_axis, y_axis, series, title))
+    names = {axis.quantity for axis in question.axes}
+    exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
+    flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
+    title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
+    empty = "grey: no answer" if np.isnan(answer.probability).any() else ""
+    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=contoured, share_y=True)
+
+
+@picture_of("LimitAnswer", "limit")
+def limits(answer: LimitAnswer) -> Picture:
+    """Plot the detection probability at every simulated value, and the limits."""
+    of, power = answer.study.limit.of, answer.study.limit.power
+    series, several = list[Series](), len({limit.statistic for limit in answer.limits}) > 1
+    for k, limit in enumerate(answer.limits):
+        colour, marker = COLOURS[k % len(COLOURS)], MARKS[k // len(COLOURS) % len(MARKS)]
+        points = sorted((*limit.points, limit.check), key=lambda p: p.value)
+        p, low, high = np.array([(q.value, q.low, q.high) for q in (point.probability for point in points)]).T
+        flare = "" if np.isnan(limit.amplitude) else f", flare {100 * limit.amplitude:g} %"
+        statistic = f", {limit.statistic}" if several else ""
+        value = f"{limit.value.value:.2f}" if of == "magnitude" else written(float(f"{limit.value.value:.3g}"))
+        text = f"{limit.label}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
+        at = [point.value for point in points], p, (p - low, high - p)
+        series += [
+            Dots(text, colour, marker=marker, size=6, at=at),
+            Line("", colour, width=1.2, at=tuple(zip(*sorted(limit.curve), strict=True))),
+            Strips("", colour, alpha=0.25, at=([limit.value.low], [limit.value.high])),
+        ]
+    series.append(Rule(colour="text", along="y", at=power))
+    exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
+    title = (
+        f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
+        f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
+    )
+    x, y = quantity_axis(answer.study, of, log=of != "magnitude"), Axis("detection probability", limits=(-0.02, 1.02))
+    return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, below=True)
+
+
+#: Panels of noise budgets in a picture.
+MOST_BUDGETS = 12
+#: Noise by origin, as on the page and in files.
+BUDGET = Chart(
+    "budget", "Noise of a pixel by origin", WAVELENGTH, Axis("noise (DN rms per pixel)", log=True),
+    (
+        # A broad pale line below the others does not hide the largest of them.
+        Line("all together", "total", "total", width=6, alpha=0.25, tips=("wavelength (nm)", "all together (DN)")),
+        Line("photons of the star", "star", "source_photon", width=2, tips=("photons of the star (DN)",)),
+        Line("photons of neighbours", "flare", "neighbour_photon", "if any", width=2,
+             tips=("photons of neighbours (DN)",)),
+        Line("photons of the sky", "sky", "zodiacal_photon", width=2, tips=("photons of the sky (DN)",)),
+        Line("dark current", "dark", "dark", width=2, dash="dashed", tips=("dark current (DN)",)),
+        Line("read noise", "read", "read", width=2, dash="dotted", tips=("read noise (DN)",)),
+    ),
+    logs=("Y",), pins="source_photon",
+)  # fmt: skip
+
+
+def budget_series(x: Expectation) -> dict[str, Any]:
+    """Return the data of `BUDGET`; logarithms show nothing of zero."""
+    table = x.noise_budget()
+    values = {name: np.asarray(table[name].value) for name in table.colnames if name != "wavelength"}
+    return {name: (x.wavelength_nm, np.where(v > 0, v, np.nan)) for name, v in values.items()}
+
+
+@picture_of("SnrAnswer", "noise-budget")
+def noise_budgets(answer: SnrAnswer) -> Picture:
+    """Plot pixel noise by origin against wavelength, one panel per star and cell, as in the paper."""
+    each, seen = answer.study.sweep.size, [(star, star.result.expectation) for star in answer.stars]
+    observed = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in seen]
+
+    def finish(axis: Any) -> None:
+        # Zodiacal light can be far below everything else.
+        axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
+
+    shown = First(observed, MOST_BUDGETS, "observations")
+    panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in shown]
+    # A column for each cell, unless these are too many.
+    across = len(observed) // each if each <= MAX_COLUMNS and len(shown) == len(observed) else 0
+    rows = [panels[k::across] for k in range(across)] or in_rows(panels, MAX_COLUMNS)
+    size = COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
+    title = "Noise budgets; nominal throughput, not a flight calibration"
+    return Picture(rows, size, title, (shown.note,), below=True, share_x=True, share_y="col" if across else True)
+
+
+@picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
+def snr_sweep(answer: SnrAnswer) -> Picture:
+    """Plot the S/N of some elements against the first swept quantity, a line per value of the others."""
+    from mauvecl.answers.signal import place_of
+
+    first, row = answer.study.sweep.axes[0].quantity, []
+    for wavelength in answer.stars[0].shown_nm:
+        lines: dict[str, list[Any]] = {}
+        for star in answer.stars:
+            name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
+            rest = full_label(name, {k: v for k, v in star.at.items() if k != first})
+            element = star.result.element[place_of(star.result.expectation, wavelength, "element")]
+            ends = (max(element[q], 1e-3) for q in ("q2.5", "q97.5"))
+            lines.setdefault(rest, []).append((star.at[first], element["expected"], *ends))
+        series: list[Series] = []
+        for (name, points), colour in zip(lines.items(), cycle(COLOURS), strict=False):
+            x, expected, low, high = zip(*points, strict=True)
+            lengths = np.maximum(np.subtract(expected, low), 0), np.maximum(np.subtract(high, expected), 0)
+            series += [Line(name, colour, at=(x, expected)), Dots("", colour, size=7, at=(x, expected, lengths))]
+        y_axis = Axis("S/N per 10.5 nm element", log=True, limits=(0.1, None))
+        x_axis = quantity_axis(answer.study, first, log=first == "exposure")
+        row.append(Panel(x_axis, y_axis, series, f"{wavelength:g} nm"))
+    title = "S/N in closed form; bars: 95 % of realisations; nominal throughput"
+    return Picture([row], (COLUMN if len(row) == 1 else 2.6 * len(row), 3.2), title, below=True, share_y=True)
+
+
+@picture_of("GaussianAnswer", "gaussian")
+def gaussian(answer: GaussianAnswer) -> Picture:
+    """Plot how well each prediction of the Gaussian formula holds in every cell."""
+    from matplotlib.ticker import MaxNLocator
+
+    cells, labels = answer.cells, [full_label(s.label, s.at) for s in answer.signal.stars]
+    rows = np.arange(len(cells))
+
+    def panel(text: str, predicted: float, least: float, series: Series) -> Panel:
+        """Return a panel whose x axis reaches at least so far on both sides of the prediction."""
+
+        def finish(axis: Any) -> None:
+            low, high = axis.get_xlim()
+            axis.set_xlim(min(low, predicted - 1.2 * least), max(high, predicted + 1.2 * least))
+            axis.xaxis.set_major_locator(MaxNLocator(3, steps=(1, 2, 5, 10)))
+            axis.grid(axis="y", linewidth=0.3)
+
+        y = Axis(limits=(len(rows) - 0.5, -0.5), ticks=(rows, labels))
+        return Panel(Axis(text), y, [series, Rule(dash="-", at=predicted)], finish=finish)
+
+    def dots(name: str) -> Dots:
+        return Dots("", "star", size=7, at=(np.asarray(cells[name]), rows))
+
+    low, high = (np.asarray(cells[f"coverage_{end}"]) for end in ("low", "high"))
+    coverage = Dots("", "star", marker="", width=5, at=((low + high) / 2, rows, 0 * low, (high - low) / 2))
+    row = [
+        panel("S/N: simulated\nless predicted", 0.0, 0.1, dots("snr_off_by")),
+        panel("coverage of\n1-sigma intervals", 0.6827, 0.03, coverage),
+        panel("5-sigma pixels\nover predicted", 1.0, 0.5, dots("five_sigma_above")),
+        panel("false alarms\nover predicted", 1.0, 0.2, dots("fap_ratio")),
+    ]
+    title = "Simulation and root-of-N formula; vertical lines: as the formula predicts; nominal throughput"
+    return Picture([row], (2 * COLUMN, 0.22 * len(cells) + 1.5), title, share_y=True)
+
+
+@picture_of("ExposureAnswer", "exposure")
+def exposures(answer: ExposureAnswer) -> Picture:
+    """Plot the S/N of each star against exposure."""
+    first, series = answer.exposures[0], list[Series]()
+    for e, colour in zip(answer.exposures, cycle(COLOURS), strict=False):
+        x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
+        text = f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s"
+        series.append(Line(text, colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))))
+        series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
+    series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))
+    per = "10.5 nm element" if first.per == "element" else first.per
+    panel = Panel(Axis("exposure (s)", log=True), Axis(f"S/N per {per}", log=True), series)
+    title = f"S/N at {first.wavelength_nm:g} nm against exposure; nominal throughput"
+    return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.exposures)), title, below=True)

@@ -1,8 +1,8 @@
-"""Charts of spectra: inputs of an expectation, fitted instruments, and changes between visits."""
+"""Charts of spectra: inputs of an expectation, fitted instruments, changes between visits, and fits of flares."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
@@ -10,13 +10,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.charts import chart
-from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Mesh, Panel, Picture, Rule, Strips, Targets
+from mauvecl.charts.chart import (
+    WAVELENGTH,
+    Area,
+    Axis,
+    Chart,
+    Dots,
+    Line,
+    Mesh,
+    Panel,
+    Picture,
+    Rule,
+    Series,
+    Strips,
+    Targets,
+)
 from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of, styled_picture
-from mauvecl.schema.columns import First, with_error
+from mauvecl.schema.columns import First, note_of, with_error
 
 if TYPE_CHECKING:
     from mauvecl.answers.calibrate import CalibrateAnswer
     from mauvecl.answers.change import ChangeAnswer
+    from mauvecl.answers.measure import JointFit, MeasureAnswer, MeasuredFlare, MeasuredStare
     from mauvecl.host.exposure.background import Sky
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
@@ -323,3 +338,172 @@ def line_indices(answer: ChangeAnswer) -> Picture:
         row.append(Panel(Axis("wavelength (nm)"), y, series, index.name))
     title = f"{title}: bands and continua of the line indices in the mean spectrum"
     return Picture([row], (1.0 + 2.3 * len(row), 3.1), title, below=True)
+
+
+#: Increases of chi-squared that enclose 68 and 95 % in two dimensions.
+RISES = {"68 %": 2.30, "95 %": 5.99}
+#: Factors on the amplitude over which errors are plotted.
+FACTORS = np.geomspace(0.1, 10.0, 25)
+#: Half-widths before and after the peak of a flare that are plotted.
+BEFORE, AFTER = 3.0, 15.0
+#: Largest number of flares in a picture.
+MOST_FLARES = 4
+#: Number of fits from which histograms of pulls have narrow bins.
+MANY_FITS = 1000
+
+
+def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
+    """Return the first flares."""
+    return (First(answer.flares, MOST_FLARES, "flares"),)
+
+
+def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
+    """Return the first flares whose model has a single temperature."""
+    return (First([flare for flare in answer.flares if flare.model != "two-temperatures"], MOST_FLARES, "flares"),)
+
+
+@picture_of("MeasureAnswer", "fit", given=_few)
+def fits(flares: Sequence[MeasuredFlare]) -> Picture:
+    """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
+    from mauvecl.fits.flare_model import usable_variance
+
+    above, below = list[Panel](), list[Panel]()
+    for flare in flares:
+        quiet, measurement = flare.quiet, flare.found
+        mean, unknown = flare.fitted_dn()
+        kelvin = " and ".join(f"{x:.0f} K" for x in np.atleast_1d(np.exp(measurement.log_k[0])))
+        variance, used = usable_variance(quiet, mean, flare.skipped_nm)
+        sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (flare.frame - unknown, mean, variance)]
+        # Resolution elements of which some pixels are not used are not shown.
+        pixels = quiet.per_element(np.ones(used.size))
+        whole = quiet.per_element(used.astype(np.float64)) == pixels
+        data, fit, variance = (np.where(whole, values, np.nan) for values in sums)
+        nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
+        x = Axis("wavelength (nm)")
+        # Elements differ in their number of pixels, means hardly.
+        dots = Dots("exposure less star and fitted unknowns", size=4, at=(nm, data / pixels, noise / pixels))
+        line = Line(f"fit: {kelvin}", "star", at=(nm, fit / pixels))
+        above.append(Panel(x, Axis("mean of an element (DN per pixel)"), [dots, line], flare.name))
+        residuals = Dots("", "star", size=4, at=(nm, (data - fit) / noise))
+        below.append(Panel(x, Axis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
+    size = 3.6 * len(flares), 4.6
+    return Picture([above, below], size, notes=(note_of(flares),), share_x=True, heights=(2, 1))
+
+
+def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
+    """Return a picture with a panel per flare."""
+    row = [panel(flare) for flare in flares]
+    return Picture([row], (3.4 * len(flares), 3.6), notes=(note_of(flares),), below=True)
+
+
+@picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
+def contours(flares: Sequence[MeasuredFlare]) -> Picture:
+    """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
+
+    def panel(flare: MeasuredFlare) -> Panel:
+        series: list[Series] = []
+        for (share, rise), dash in zip(RISES.items(), ("-", "dashed"), strict=True):
+            kelvin, low, high = flare.region(rise)
+            around = np.concatenate([kelvin, kelvin[::-1], kelvin[:1]]), np.concatenate([low, high[::-1], low[:1]])
+            series.append(Line(f"{share} of estimates", "star", dash=dash, at=around))
+        series.append(Dots("estimate without noise", "flare", marker="+", size=14, at=flare.perfect.estimates[0, :2]))
+        if np.isfinite(flare.truth[:2]).all():
+            series.append(Dots("simulated flare", "text", marker="x", size=8, at=flare.truth[:2]))
+        return Panel(Axis("flare temperature (K)"), Axis("flare amplitude"), series, flare.name)
+
+    return _each(flares, panel)
+
+
+@picture_of("MeasureAnswer", "pulls", given=_few)
+def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
+    """Plot the pulls of estimates, (estimate - truth) / standard error, and the standard normal."""
+    # Few fits need wide bins.
+    most = max(len(flare.found.estimates) for flare in flares)
+    x, edges = np.linspace(-5.0, 5.0, 201), np.linspace(-5.0, 5.0, 41 if most >= MANY_FITS else 21)
+
+    def panel(flare: MeasuredFlare) -> Panel:
+        series: list[Series] = []
+        # Temperature, amplitude and the next one; an observed flare has only fluxes.
+        for colour, q in zip(COLOURS, np.flatnonzero(np.isfinite(flare.truth))[:3], strict=False):
+            with np.errstate(invalid="ignore", divide="ignore"):
+                pull = (flare.found.estimates[:, q] - flare.truth[q]) / flare.found.errors[:, q]
+            density, _ = np.histogram(np.clip(pull[np.isfinite(pull)], -5, 5), edges, density=True)
+            series.append(Line(flare.found.names[q], colour, step=True, at=((edges[1:] + edges[:-1]) / 2, density)))
+        normal = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+        series.append(Line("standard normal", "text", dash="dashed", at=(x, normal)))
+        x_axis = Axis("(estimate \N{MINUS SIGN} truth) / standard error")
+        return Panel(x_axis, Axis("probability density"), series, flare.name)
+
+    return _each(flares, panel)
+
+
+@picture_of("MeasureAnswer", "errors", given=_few)
+def errors(flares: Sequence[MeasuredFlare]) -> Picture:
+    """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
+
+    def panel(flare: MeasuredFlare) -> Panel:
+        amplitudes, series = FACTORS * flare.perfect.estimates[0, 1], list[Series]()
+        for unknown, dash in {None: "dashed", flare.unknown: "-"}.items():
+            ahead = flare.forecasts(FACTORS, unknown)
+            whose = "everything else known" if unknown is None else "with unknowns"
+            for colour, q in zip(COLOURS, range(2), strict=False):
+                relative = [f.errors[q] / f.values[q] for f in ahead]
+                series.append(Line(f"{flare.fitted.names[q]}, {whose}", colour, dash=dash, at=(amplitudes, relative)))
+        x, y = Axis("flare amplitude", log=True), Axis("relative standard error", log=True)
+        return Panel(x, y, series, flare.name)
+
+    return _each(flares, panel)
+
+
+@picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(star,) for star in answer.stares if star.perfect])
+def temperatures(star: MeasuredStare) -> Picture:
+    """Plot temperature, size and light of the flares of a stare against time, with 95 % intervals.
+
+    Lines are the fits to the same frames without noise.
+    """
+    drawn, perfect, rows = star.drawn, star.perfect, list[list[Panel]]()
+    assert drawn is not None
+    assert perfect is not None
+    measurement = drawn.found
+    sized = "area" in measurement.names
+    size, light = ("area", "luminosity bolometric") if sized else ("amplitude", "flux bolometric")
+    middle, reach = (drawn.start_s + drawn.end_s) / 2, (drawn.end_s - drawn.start_s) / 2
+    for name in ("temperature", size, light):
+        q = measurement.column(name)
+        estimate, low, high = measurement.estimates[:, q], measurement.low[-1, :, q], measurement.high[-1, :, q]
+        ends = np.where(np.isfinite([low, high]), np.abs([estimate - low, high - estimate]), 0.0)
+        limits, true = ~np.isfinite(high), perfect.found.estimates[:, q]
+        series = [
+            Dots("fit, 95 %", "star", size=4, at=(middle, estimate, ends, reach)),
+            Line("fit to the same frames without noise", step=True, at=(middle, true)),
+        ]
+        if limits.any():
+            series.append(Dots("lower limit", "star", size=10, marker="^", at=(middle[limits], low[limits])))
+        positive = [value for value in (*estimate, *true) if value > 0]
+        unit = f" ({in_figure(measurement.units[q])})" if measurement.units[q] else ""
+        label = " ".join(name.split(" ")[::-1]) + unit
+        y = Axis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
+        rows.append([Panel(Axis("time from the start of the stare (s)"), y, series)])
+    title = f"{star.title}: one simulated stare; nominal throughput"
+    return Picture(rows, (7.2, 6.7), title, below=True, share_x=True)
+
+
+@picture_of("MeasureAnswer", "joint", each=lambda answer: [(star, star.joint) for star in answer.stares if star.joint])
+def joint(star: MeasuredStare, fit: JointFit) -> Picture:
+    """Plot the light of a flare in each frame, the joint fit of its shape and spectrum, residuals and temperature."""
+    stare, (event,), (drawn, mean) = star.staring.stare, star.events, (fit.fitted.drawn_dn, fit.fitted.mean_dn)
+    since = (stare.middle_s - event.peak_s) / event.half_width_s
+    near = (since > -BEFORE) & (since < AFTER)
+    x, time = Axis("time from the start of the stare (s)"), stare.middle_s[near]
+    dots = Dots("frames less star, sky, dark and unknowns", size=4, at=(time, drawn[near]))
+    off = Dots("", "star", size=4, at=(time, (drawn - mean)[near]))
+    true, fitted = fit.true.kelvin[near], fit.fitted.kelvin[near]
+    simulated = Line("simulated flare", "text", dash="dashed", at=(time, true))
+    kelvin = Axis("temperature (K)", limits=(0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max())))
+    rows = [
+        [Panel(x, Axis("light (DN per frame)"), [dots, Line("joint fit", "star", at=(time, mean[near]))])],
+        [Panel(x, Axis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],
+        [Panel(x, kelvin, [Line("joint fit", "star", at=(time, fitted)), simulated])],
+    ]
+    title = f"{star.title}: one simulated stare; nominal throughput"
+    return Picture(rows, (7.2, 6.7), title, below=True, share_x=True, heights=(2, 1, 1.5))

@@ -129,7 +129,7 @@ class Components:
         return sums[0], sums[1:]
 
     @cached_property
-    def _means(self) -> Float:
+    def component_means(self) -> Float:
         """Mean sums of each component at a coefficient of one, shape (4 + n_flare, n_statistic)."""
         return self.sum_cumulants(1)[1]
 
@@ -153,7 +153,7 @@ class Components:
         """Return the mean statistics, (..., n_statistic), for coefficients of shape (..., 4 + n_flare)."""
         reference = np.zeros(len(STEADY) + self.n_flares)
         reference[: len(STEADY)] = 1.0
-        return np.asarray((coefficients - reference) @ self._means)
+        return np.asarray((coefficients - reference) @ self.component_means)
 
     def covariance(self, coefficients: Float) -> Float:
         """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
@@ -173,7 +173,7 @@ class Components:
 
         They are with respect to relative changes of the star, of all light and of the sky, and to the temperature.
         """
-        mean = self._means
+        mean = self.component_means
         light = np.delete(coefficients, 2, axis=-1) @ np.delete(mean, 2, axis=0)
         slope = self.quiet.conditions["dark_slope_per_c"]
         return {

@@ -8,8 +8,9 @@ passes end when there are no more alarms.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,8 +151,8 @@ class _StareSearch:
         n = MAX_FLARES_PER_FIT
         return [block[k : k + n] for block in blocks for k in range(0, len(block), n)]
 
-    def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Float, NDArray[np.int64], Row]]:
-        """Yield per row the best value of each onset, its excess over fit residuals, peak time and temperature."""
+    def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Callable[[int], Candidate]]]:
+        """Yield per row the largest excess over fit residuals and the peak time of each onset, and its candidate."""
         theta, (low, high) = _thetas(self.found), self.sums.bounds
         light = self.sums.light(theta)
         # Flares at the bounds of the fit may remain in the residuals entirely.
@@ -168,13 +169,12 @@ class _StareSearch:
                 reach = TAIL * np.exp(candidate.theta[WIDTH]) + LEAD * row.template.half_width_s
                 near += np.where(np.abs(peaks - candidate.theta[PEAK]) < reach, candidate.rho, 0.0)
             excess = rho[0] - np.maximum(rests, near_share * near)
-            which = excess.argmax(axis=0)
-            onsets = np.arange(excess.shape[1])
-            yield rho[0, which, onsets], excess[which, onsets], peaks, which, row
+            yield excess.max(axis=0), peaks, partial(self._candidate, row, rho[0], excess.argmax(axis=0))
 
-    def _candidate(self, rho: float, peak: float, row: Row, onset: int, direction: int) -> Candidate:
-        """Return a candidate with the parameters of its template."""
-        templates, width = self.sums.survey.templates, row.template.half_width_s
+    def _candidate(self, row: Row, values: Float, directions: NDArray[np.int64], onset: int) -> Candidate:
+        """Return a candidate with the parameters of the best template at an onset."""
+        templates, width, direction = self.sums.survey.templates, row.template.half_width_s, int(directions[onset])
+        rho, peak = float(values[direction, onset]), float(self.sums.survey.search.peaks_s(row)[onset])
         size = float(np.linalg.norm(templates.directions[templates.chosen[direction]]))
         amplitude = max(rho / float(row.per_amplitude[onset]), 1e-3) / size
         kelvin = templates.temperatures_k[templates.chosen[direction]]
@@ -183,12 +183,9 @@ class _StareSearch:
 
     def searched(self) -> list[Candidate]:
         """Return new candidates from the residuals, at most one within the window of another."""
-        sums, bank = self.sums, self.sums.survey.bank
-        candidates = []
-        for rho, excess, peaks, which, row in self._values(LEFT_BEHIND):
-            for k in np.flatnonzero(excess >= self.threshold):
-                candidate = self._candidate(float(rho[k]), float(peaks[k]), row, int(k), int(which[k]))
-                candidates.append((float(excess[k]), candidate))
+        sums, bank, candidates = self.sums, self.sums.survey.bank, list[tuple[float, Candidate]]()
+        for excess, _, candidate_at in self._values(LEFT_BEHIND):
+            candidates += [(float(excess[k]), candidate_at(int(k))) for k in np.flatnonzero(excess >= self.threshold)]
         candidates.sort(key=lambda pair: -pair[0])
         # An alarm near a larger one may be caused by it and waits for the next pass, as do the alarms near it.
         waiting = np.zeros(len(sums.net), np.bool_)
@@ -213,13 +210,12 @@ class _StareSearch:
         overlaps = [[self.sums.overlap(candidate.theta) for candidate in block] for block in blocks]
         spans = [(min(a for a, _ in each), max(b for _, b in each)) for each in overlaps]
         best: list[list[tuple[float, Candidate]]] = [[] for _ in blocks]
-        for rho, excess, peaks, which, row in self._values():
+        for excess, peaks, candidate_at in self._values():
             for several, (first, last) in zip(best, spans, strict=True):
                 inside = np.flatnonzero((peaks >= first) & (peaks <= last) & np.isfinite(excess))
                 if inside.size:
                     k = int(inside[np.argmax(excess[inside])])
-                    candidate = self._candidate(float(rho[k]), float(peaks[k]), row, k, int(which[k]))
-                    several.append((float(excess[k]), candidate))
+                    several.append((float(excess[k]), candidate_at(k)))
         for block, several in zip(blocks, best, strict=True):
             several.sort(key=lambda pair: -pair[0])
             for _, candidate in several[:SPLITS]:
@@ -262,10 +258,7 @@ class _StareSearch:
         noise = self.sums.noise(_thetas(self.found), light)
         base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
-        loud = excess > 1.01
-        if not loud.any():
-            return left
-        evened = left.copy()
+        loud, evened = excess > 1.01, left.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
         for first, end in true_runs(loud):
@@ -337,8 +330,8 @@ def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Mea
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    area, coloured = sums.survey.bank.shape.equivalent_duration, KELVIN in sums.free
-    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured)
+    area = sums.survey.bank.shape.equivalent_duration
+    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=True)
     return fitted, *_intervals(rows, best, j, snr, covariance, energy)
 
 
@@ -350,9 +343,6 @@ def _intervals(
     quantities = QUANTITIES | ({} if energy is None else {"energy": ProfiledQuantity(AMPLITUDE, energy)})
     intervals, notes = {"energy": (np.nan, np.nan)}, []
     for name, quantity in quantities.items():
-        if quantity.column == KELVIN and KELVIN not in rows.sums.free:
-            intervals[name] = (np.nan, np.nan)
-            continue
         middle, slope = quantity.of(best.theta[j])
         sd = float(np.sqrt(slope @ covariance @ slope))
         low, high, is_open = middle - sd, middle + sd, False

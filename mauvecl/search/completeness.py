@@ -61,10 +61,11 @@ class Completeness:
     def __post_init__(self) -> None:
         set_read_only(self, energy_erg=self.energy_erg, probability=self.probability)
         energy, p = self.energy_erg, self.probability
-        if energy.ndim != 1 or energy.shape != p.shape or energy.size < 2:
-            raise InputError.of("probability", p.size, f"one for each of {energy.size} energies, at least 2")
-        if not ((energy > 0).all() and (np.diff(energy) > 0).all() and np.isfinite(energy).all()):
-            raise InputError("the energies of a completeness must be above 0 and ascend", key="energy_erg")
+        ascending = np.isfinite(energy).all() and (np.diff(energy, prepend=0.0) > 0).all()
+        if not (energy.shape == p.shape == (p.size,) and p.size > 1 and ascending):
+            raise InputError(
+                "a completeness needs a probability for each of at least 2 ascending energies above 0", key="energy_erg"
+            )
         if not ((p >= 0) & (p <= 1)).all():
             raise InputError.of("probability", (float(p.min()), float(p.max())), "between 0 and 1")
 
@@ -187,8 +188,6 @@ def frame_signal(
     `amplitude` is that of the flare in `flare`, and `added_variance_dn2`, (n_pixel,), additional variance such as that
     of particle hits. Pixels that saturate without a flare are excluded. `unknown` is marginalised over.
     """
-    if quiet.n_frames != 1 or flare.n_frames != 1:
-        raise InputError.of("n_frames", (quiet.n_frames, flare.n_frames), "one frame each")
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / amplitude
     variance = quiet.unsaturated_variance_dn2 + (0.0 if added_variance_dn2 is None else added_variance_dn2)
     light = np.where(quiet.saturated, 0.0, light)

@@ -39,11 +39,12 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.distributions import CONFIDENCE_SD, Interval, central_counts
+from mauvecl.flares.frames import STEADY
 from mauvecl.flares.stare import select_frames
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
-from mauvecl.search.search import BATCH, Search, Survey
+from mauvecl.search.search import Search, Survey
 from mauvecl.search.templates import Bank
 
 #: Smallest number of alarms for a counted threshold.
@@ -85,19 +86,19 @@ WEIGHTING_THRESHOLD = 5.0
 MAX_CORRELATION = 1 - 1e-12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TemplateGrid:
     """Correlations between neighbouring templates of a bank.
 
-    Each correlation tuple is ``(previous, next, between them)``, ``(only,)`` at the edge of the bank, or ``()`` if the
-    template has no neighbour along that axis.
+    Rows of correlations are those with both neighbours along an axis and that between these; the correlation with a
+    neighbour that does not exist is -1.
     """
 
     frame_s: float
     templates_per_frame: Float  # shape (n_row,); one row per half-width and sub-frame phase
-    onset_correlations: tuple[tuple[float, ...], ...]  # one per row
-    width_correlations: tuple[tuple[float, ...], ...]  # one per row
-    temperature_correlations: tuple[tuple[float, ...], ...]  # one per temperature
+    onset: Float  # shape (n_row, 3)
+    width: Float  # shape (n_row, 3)
+    temperature: Float  # shape (n_temperature, 3)
 
     @classmethod
     def from_bank(cls, bank: Bank) -> TemplateGrid:
@@ -127,39 +128,20 @@ class TemplateGrid:
                     aligned.append(np.roll(others[which], int(shift) - own.size + 1))
                 width.append(_neighbour_correlations(own, aligned))
         directions = list(bank.directions)
-        temperature = [
-            _neighbour_correlations(direction, _next_to(directions, k)) for k, direction in enumerate(directions)
-        ]
-        return cls(bank.frame_s, np.array(per_frame), tuple(onset), tuple(width), tuple(temperature))
+        temperature = [_neighbour_correlations(own, _next_to(directions, k)) for k, own in enumerate(directions)]
+        return cls(bank.frame_s, *map(np.array, (per_frame, onset, width, temperature)))
 
     def false_alarms_per_second(self, threshold: float) -> float:
         """Return the rate of local maxima above `threshold`, in standard deviations of the statistic."""
-        density, row_probabilities, temperature_probabilities = self._probabilities(threshold)
-        rate = self.templates_per_frame @ row_probabilities @ (density * sum(temperature_probabilities))
-        return float(rate) / self.frame_s
+        return float(np.sum(self.templates_per_frame @ self.peak_probabilities(threshold))) / self.frame_s
 
     def peak_probabilities(self, threshold: float) -> Float:
-        """Return each template's probability that a value above `threshold` is a local maximum.
-
-        The shape is (n_row, n_temperature).
-        """
-        density, row_probabilities, temperature_probabilities = self._probabilities(threshold)
-        weights = density / density.sum()
-        return np.asarray(np.einsum("z,rz,tz->rt", weights, row_probabilities, temperature_probabilities))
-
-    def _probabilities(self, threshold: float) -> tuple[Float, Float, Float]:
-        """Return the weighted density at nodes z, and the probabilities of rows and temperatures, (n, n_node)."""
+        """Return the probability that each template has a local maximum above `threshold`, (n_row, n_temperature)."""
         x, weights = np.polynomial.laguerre.laggauss(N_NODES)
         z = np.sqrt(threshold**2 + 2 * x)
         density = weights / z * np.exp(-(threshold**2) / 2) / np.sqrt(2 * np.pi)
-        rows = [
-            _probability_neighbours_below(z, onset) * _probability_neighbours_below(z, width)
-            for onset, width in zip(self.onset_correlations, self.width_correlations, strict=True)
-        ]
-        temperatures = [
-            _probability_neighbours_below(z, correlations) for correlations in self.temperature_correlations
-        ]
-        return density, np.array(rows), np.array(temperatures)
+        onset, width, temperature = (_below(z, each) for each in (self.onset, self.width, self.temperature))
+        return np.asarray(np.einsum("z,rz,tz->rt", density, onset * width, temperature))
 
 
 def _next_to(values: list[Float], k: int) -> list[Float]:
@@ -167,31 +149,21 @@ def _next_to(values: list[Float], k: int) -> list[Float]:
     return values[max(k - 1, 0) : k] + values[k + 1 : k + 2]
 
 
-def _neighbour_correlations(own: Float, neighbours: list[Float]) -> tuple[float, ...]:
-    """Return the correlations with the neighbours and, if there are two, between them."""
-    correlations = [float(own @ other) for other in neighbours]
-    if len(neighbours) == 2:
-        correlations.append(float(neighbours[0] @ neighbours[1]))
-    return tuple(correlations)
+def _neighbour_correlations(own: Float, neighbours: list[Float]) -> tuple[float, float, float]:
+    """Return the correlations with two neighbours and between them; without one, those with the opposite of `own`."""
+    before, after = [*neighbours, -own, -own][:2]
+    return float(own @ before), float(own @ after), float(before @ after)
 
 
-def _probability_neighbours_below(z: Float, correlations: tuple[float, ...]) -> Float:
-    """Return P(all neighbours < z | z), shape of `z`."""
-    if not correlations:
-        return np.ones_like(z)
+def _below(z: Float, correlations: Float) -> Float:
+    """Return P(both neighbours < z | z), shape (n, n_node), for correlations of shape (n, 3)."""
+    a, b, between = np.clip(correlations.T[:, :, None], -MAX_CORRELATION, MAX_CORRELATION)
     # A neighbour with correlation r is normal with mean r z and variance 1 - r^2.
-    correlations = tuple(float(np.clip(r, -MAX_CORRELATION, MAX_CORRELATION)) for r in correlations)
-    limits = [z * np.sqrt((1 - r) / (1 + r)) for r in correlations[:2]]
-    first = scipy.special.ndtr(limits[0])
-    if len(correlations) == 1:
-        return np.asarray(first)
-    a, b, between = correlations
-    scale = np.sqrt((1 - a * a) * (1 - b * b))
-    r = np.clip((between - a * b) / scale, -MAX_CORRELATION, MAX_CORRELATION)
+    h, k = (z * np.sqrt((1 - r) / (1 + r)) for r in (a, b))
+    r = np.clip((between - a * b) / np.sqrt((1 - a * a) * (1 - b * b)), -MAX_CORRELATION, MAX_CORRELATION)
     root = np.sqrt(1 - r * r)
-    h, k = limits
-    owen = scipy.special.owens_t
-    return np.asarray((first + scipy.special.ndtr(k)) / 2 - owen(h, (k / h - r) / root) - owen(k, (h / k - r) / root))
+    owen, ndtr = scipy.special.owens_t, scipy.special.ndtr
+    return np.asarray((ndtr(h) + ndtr(k)) / 2 - owen(h, (k / h - r) / root) - owen(k, (h / k - r) / root))
 
 
 #: Sampled thresholds; between them, the logarithm of the number of independent templates is a cubic polynomial.
@@ -259,13 +231,13 @@ class SampledRate:
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
         rates = np.exp(scipy.special.log_ndtr(-fine) + self._fit()(fine))
+        largest = np.where(shares > 0, shifts, -np.inf).max(axis=1)
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
             # Probability of an alarm in each draw of a stare.
-            per_day, largest = np.zeros((2, weights.size))
+            per_day = np.zeros(weights.size)
             for shift, share in zip(shifts, shares.T, strict=True):
                 per_day += share * np.interp((threshold - shift) / scales, fine, rates).mean(axis=1)
-                largest = np.where(share > 0, shift, largest)
             each = -np.expm1(-self.days * per_day)
             if shifted:
                 # A few templates with a large mean suffice for an alarm.
@@ -333,32 +305,21 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     shares = np.cumsum(weights * sizes[:, None])
     estimates = np.empty((draws, len(LADDER)))
     directions, noise_sd = search.bank.directions, np.sqrt(search.variance)
-    # Batches are small so that they fit into the processor's caches.
-    batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
-    for first in range(0, draws, batch):
-        count = min(batch, draws - first)
-        held, own, along = np.empty((count, search.stare.n_frames, n_sum + 1)), np.empty(count), []
-        for n in range(count):
-            which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
-            template = search.in_time(rows[which], np.array([int(rng.choice(tried[which]))]))[0]
-            noise = noise_sd[:, None] * rng.standard_normal((search.stare.n_frames, n_sum))
-            # One more sum holds the response that changes the chosen template's value by one, since it is proportional
-            # to the template in time.
-            held[n] = np.column_stack([noise, template * search.variance])
-            own[n] = template @ noise @ directions[direction]
-            along.append(directions @ directions[direction])
-        values: list[list[Float]] = [[] for _ in range(count)]
-        for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
+    for n in range(draws):
+        which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
+        template = search.in_time(rows[which], np.array([int(rng.choice(tried[which]))]))[0]
+        noise = noise_sd[:, None] * rng.standard_normal((search.stare.n_frames, n_sum))
+        own, along = template @ noise @ directions[direction], directions @ directions[direction]
+        # One more sum holds the response that changes the chosen template's value by one, since it is proportional to
+        # the template in time.
+        held, values = np.column_stack([noise, template * search.variance]), list[Float]()
+        for (row, (correlated,)), weight in zip(search.correlations(held[None]), weights, strict=True):
             at = row.per_amplitude > 0
-            for n, nearby in enumerate(values):
-                c = along[n][:, None] * correlated[n, n_sum, at]
-                r = directions @ correlated[n, :n_sum, at].T - own[n] * c
-                # Only for these G may be positive.
-                near = np.flatnonzero(_reach(r, c, LADDER[-1]) > LADDER[0] - BELOW / LADDER[0])
-                w = np.broadcast_to(weight[:, None], r.shape)
-                nearby.append(np.array([each.reshape(-1)[near] for each in (r, c, w)]))
-        for n, nearby in enumerate(values):
-            estimates[first + n] = _estimates(np.concatenate(nearby, axis=1))
+            c = along[:, None] * correlated[n_sum, at]
+            r = directions @ correlated[:n_sum, at] - own * c
+            near = np.flatnonzero(_is_near(r, c, LADDER[0]))
+            values.append(np.array([each.ravel()[near] for each in (r, c, np.broadcast_to(weight[:, None], r.shape))]))
+        estimates[n] = _estimates(np.concatenate(values, axis=1))
     estimates *= shares[-1]
     error = estimates.std(axis=0, ddof=1) / np.sqrt(draws)
     return SampledRate(np.array(LADDER), estimates.mean(axis=0), error, search.stare.observed_s / DAY_S)
@@ -368,9 +329,10 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
 _X, _W = np.polynomial.laguerre.laggauss(NODES)
 
 
-def _reach(r: Float, c: Float, u: float) -> Float:
-    """Return the largest values at the nodes of the integral for a threshold u."""
-    return np.asarray(r + np.abs(c) * (u + _X[-1] / (u - BELOW / u)))
+def _is_near(r: Float, c: Float, u: float) -> Bool:
+    """Return whether G may be positive for values at a node of the integral for a threshold u, or for a higher one."""
+    least = u - BELOW / u
+    return np.asarray(r + np.abs(c) * (u + _X[-1] / least) > least)
 
 
 def _estimates(values: Float) -> Float:
@@ -378,11 +340,7 @@ def _estimates(values: Float) -> Float:
     estimates = np.zeros(len(LADDER))
     for k, u in enumerate(LADDER):
         least = u - BELOW / u
-        values = values[:, _reach(values[0], values[1], LADDER[-1]) > least]
-        near = values[:, _reach(values[0], values[1], u) > least]
-        if not near.size:
-            continue
-        r, c, w = near
+        r, c, w = values = values[:, _is_near(values[0], values[1], u)]
         # Value z at which each template exceeds the threshold; the chosen one (r = 0, c = 1) does at z = u.
         crossing = np.divide(u - r, c, out=np.full(r.size, u), where=c > MIN_CORRELATION)
         z = max(least, min(u, float(crossing.min())))
@@ -390,8 +348,7 @@ def _estimates(values: Float) -> Float:
             z = least
         nodes = z + _X / z
         rho = r + nodes[:, None] * c
-        counted = rho > least
-        total = np.where(counted, np.exp(np.where(counted, u * (rho - u), 0.0)), 0.0) @ w
+        total = (np.exp(u * (rho - u)) * (rho > least)) @ w
         # The tolerance allows for rounding of the crossing value.
         exceeds = rho.max(axis=1) > u * (1 - 1e-12)
         density = np.exp(-(nodes**2) / 2 + u * (nodes - u) + _X) / np.sqrt(2 * np.pi) / z
@@ -428,29 +385,22 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, 
     of the draws, of sum 1; means of values, ascending, (n_shift,); and the shares of templates with each mean,
     (n_draw, n_shift).
     """
-    stare, components, rows = survey.stare, survey.components, survey.bank.directions
-    at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
+    rows, at = survey.bank.directions, np.zeros(survey.stare.n_frames, np.bool_)
+    at[np.linspace(0, at.size - 1, POINTS).astype(int)] = True
+    here = replace(survey, stare=select_frames(survey.stare, at))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
-    n = len(stare.unknowns)
+    n = len(survey.stare.unknowns)
     z = rng.standard_normal((RATE_DRAWS, n))
     z[RATE_DRAWS // 2 :] *= WIDENING
     log = -np.sum(z**2, axis=1) / 2
     weights = np.exp(log - np.logaddexp(log, log / WIDENING**2 - n * np.log(WIDENING)))
-    moved = {of: np.zeros((RATE_DRAWS, at.size)) for of in ("star", "light", "sky", "temperature")}
-    for amplitude, unknown in zip(z.T, stare.unknowns, strict=True):
-        moved[unknown.of] += amplitude[:, None] * unknown.sd * unknown.curve[at]
-    slope = components.quiet.conditions["dark_slope_per_c"]
-    coefficients = np.broadcast_to(survey.coefficients[at], (RATE_DRAWS, at.size, survey.coefficients.shape[1])).copy()
-    coefficients[..., 0] *= (1 + moved["light"]) * (1 + moved["star"])
-    coefficients[..., 1] *= (1 + moved["light"]) * (1 + moved["sky"])
-    coefficients[..., 2] *= np.exp(slope * moved["temperature"])
-    coefficients[..., 3] *= 1 + moved["light"]
-    covariance = components.jittered_covariance(coefficients, stare)
-    variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
+    coefficients = np.tile(here.coefficients, (RATE_DRAWS, 1, 1))
+    coefficients[..., : len(STEADY)] *= np.moveaxis(here.unknowns.factors(z), 0, 2)
+    covariance = here.components.jittered_covariance(coefficients, here.stare)
+    variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / here.variance[:, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
-    known = part.unknowns
     # Unknowns of several standard deviations may shift a template's value.
-    if known is None or part.search.largest(part.unsubtracted(known.extremes)).max() <= MIN_SHIFT:
+    if part.search.largest(part.unsubtracted(part.unknowns.extremes)).max() <= MIN_SHIFT:
         return scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1))
     # The same share of draws from both halves.
     some = slice(None, None, ONE_IN)

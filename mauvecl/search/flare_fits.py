@@ -96,11 +96,6 @@ class SummedStare:
         start = self.survey.stare.start_s
         return np.column_stack([start, start + self.survey.stare.frame_s])
 
-    @property
-    def free(self) -> list[int]:
-        """Columns of fitted parameters."""
-        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.survey.templates.temperatures_k) > 1 else [])]
-
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
@@ -114,12 +109,6 @@ class SummedStare:
         """Return the first frame that overlaps each time interval, and the first one after it."""
         start = self.survey.stare.start_s
         return np.searchsorted(start, first_s - self.survey.stare.frame_s), np.searchsorted(start, last_s)
-
-    def mean(self, flare: Float, frames: Any) -> Float:
-        """Return the mean of a flare's shape over frames, including throughput, shape (n_frame,)."""
-        shape = self.survey.bank.shape
-        mean = shape.mean_over(self.edges[frames], flare[PEAK], np.exp(flare[WIDTH]))
-        return np.asarray(self.survey.stare.light[frames] * mean)
 
     def light(self, theta: Float, frames: slice = slice(None)) -> Float:
         """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
@@ -136,7 +125,7 @@ class SummedStare:
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.
-            star = self.survey.directions["light"][frames]
+            star = self.survey.components.directions(self.survey.coefficients[frames])["light"]
             both = star + light
             total += jitter**2 * (both[:, :, None] * both[:, None, :] - star[:, :, None] * star[:, None, :])
         return total
@@ -144,11 +133,13 @@ class SummedStare:
     def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
         """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
         first, last, _ = frames.indices(len(self.net))
+        shape = self.survey.bank.shape
         peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
         starts, stops = self.overlapping(peak - REACH[0] * width, peak + REACH[1] * width)
         for flare, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
             if start < stop:
-                mean = np.exp(flare[AMPLITUDE]) * self.mean(flare, slice(start, stop))
+                mean = shape.mean_over(self.edges[start:stop], flare[PEAK], np.exp(flare[WIDTH]))
+                mean = np.exp(flare[AMPLITUDE]) * (self.survey.stare.light[start:stop] * mean)
                 yield flare, slice(start - first, stop - first), mean
 
     def window(self, flare: Float) -> tuple[float, float]:
@@ -184,8 +175,7 @@ class SummedStare:
             degree = max(baseline.powers)
             knots = np.concatenate([np.zeros(degree), np.arange(pieces + 1.0), np.full(degree, float(pieces))])
             terms += list(scipy.interpolate.BSpline.design_matrix(place, knots, degree).toarray().T)
-        if baseline.cycle and self.survey.curves is not None:
-            terms += list(self.survey.curves[:, used])
+        terms += list(self.survey.curves[:, used])
         design = np.reshape(terms, (len(terms), time.size)).T
         columns = np.einsum("tij,tp->tijp", whiten, design).reshape(data.size, -1)
         basis = scipy.linalg.orth(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), rcond=1e-9)
@@ -238,8 +228,7 @@ class Block:
     def fit(self, theta: Float, held: tuple[int, ProfiledQuantity, float] | None = None) -> BlendFit:
         """Fit all flares from a starting point, shape (n_flare, 4), with a quantity of a flare held at a value."""
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
-        moved = np.zeros(theta.shape, np.bool_)
-        moved[:, self.sums.free] = True
+        moved = np.ones(theta.shape, np.bool_)
         flare, quantity, value = held or (0, None, 0.0)
         if quantity is not None:
             moved[flare, quantity.column] = False
@@ -277,7 +266,7 @@ class Block:
 
         scale = np.ones(theta.shape)
         scale[:, PEAK] = np.exp(start[:, WIDTH])
-        dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
+        dof = self.data.size - self.basis.shape[1] - theta.size
         solution = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
             ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
@@ -287,13 +276,10 @@ class Block:
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
         jacobian = self.model(theta)[1]
-        n, free = len(theta), self.sums.free
-        rows = jacobian[:, :, free].reshape(len(jacobian), -1)
+        rows = jacobian.reshape(len(jacobian), -1)
         scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
         inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), hermitian=True) / np.outer(scale, scale)
-        covariance = np.zeros((n, 4, n, 4))
-        covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
-        return covariance
+        return np.asarray(inverse.reshape(theta.shape * 2))
 
     def interval(self, best: BlendFit, j: int, quantity: ProfiledQuantity, rises: float) -> tuple[float, float, bool]:
         """Return the interval of a flare's quantity from the profile likelihood, and whether the fit ends it.
@@ -512,7 +498,7 @@ class SingleFlareFit:
 
     def _averaged(
         self, several: int, sums: NDArray[Any], frames: SearchedFrames
-    ) -> tuple[NDArray[Any], Float, Float, Float | None]:
+    ) -> tuple[NDArray[Any], Float, Float, Float]:
         """Average groups of consecutive frames; incomplete groups at gaps are dropped."""
         start_s, variance, curves = frames.stare.start_s, frames.variance, frames.curves
         if several == 1:
@@ -521,20 +507,17 @@ class SingleFlareFit:
         _, first, count = np.unique(number // several, return_index=True, return_counts=True)
         rows = first[count == several][:, None] + np.arange(several)
         mean = np.stack([values[rows].mean(axis=1) for values in sums])
-        return (
-            mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several,
-            None if curves is None else curves[:, rows].mean(axis=2),
-        )  # fmt: skip
+        return mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several, curves[:, rows].mean(axis=2)
 
     def _windows(
-        self, start_s: Float, peak: Float, width: Float, variance: Float, curves: Float | None
+        self, start_s: Float, peak: Float, width: Float, variance: Float, curves: Float
     ) -> tuple[Float, Float]:
         """Return weights of frames, zero outside the windows, (n, n_frame), and baseline terms, (n, n_frame, p)."""
         lead, tail = np.transpose([self.bank.window(float(one)) for one in width])[:, :, None]
         since = (start_s - peak[:, None]) / self.bank.frame_s
         weight = np.where((since >= -lead - 1) & (since <= tail), 1.0 / variance, 0.0)
         rows = [(since / (lead + tail)) ** power for power in self.bank.baseline.powers]
-        rows += [np.broadcast_to(curve, since.shape) for curve in ([] if curves is None else curves)]
+        rows += [np.broadcast_to(curve, since.shape) for curve in curves]
         # Orthonormal in each window, so that a projection is a sum of products.
         root = np.sqrt(weight)[:, :, None]
         basis = np.linalg.qr(root * np.reshape(rows, (len(rows), *since.shape)).transpose(1, 2, 0))[0]

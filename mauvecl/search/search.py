@@ -30,7 +30,7 @@ from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.host.arrays import Float
-from mauvecl.noise.unknowns import CHANGED_PART, NONE, Changing, Processes
+from mauvecl.noise.unknowns import NONE, Changing, Processes
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
 
@@ -113,10 +113,9 @@ class Search:
             raise InputError(
                 f"sums must have the shape (n_stare, {expected[0]}, {expected[1]}), not {sums.shape}", key="sums"
             )
-        directions = self.bank.directions.astype(_precision(sums))
         for row, correlated in self.correlations(sums):
             tried = row.per_amplitude > 0
-            rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
+            rho = np.einsum("tk,skn->stn", self.bank.directions.astype(correlated.dtype), correlated, optimize=True)
             if not tried.all():
                 rho[:, :, ~tried] = -np.inf
             yield row, rho
@@ -126,7 +125,8 @@ class Search:
 
         The bank's directions times these values are the values of rho. There may be any number of sums.
         """
-        spectra, real = self._spectra(sums), _precision(sums)
+        real = np.result_type(sums, np.float32)
+        spectra = self._spectra(sums.astype(real, copy=False))
         window, level = (0, 0), []
         for row in self.grid:
             template, onsets = row.template, self._onsets(row.template)
@@ -174,14 +174,13 @@ class Search:
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
-        real = _precision(sums)
-        held = np.zeros((len(sums), sums.shape[2], self.n_grid), real)
+        held = np.zeros((len(sums), sums.shape[2], self.n_grid), sums.dtype)
         levelled = np.moveaxis(sums, 2, 1)
         if self._terms:
             # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
             levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
         held[:, :, self._at] = levelled * self._weight[self._at]
-        return [scipy.fft.rfft(held * series.astype(real), self._size) for series in self._series]
+        return [scipy.fft.rfft(held * series.astype(sums.dtype), self._size) for series in self._series]
 
     @cached_property
     def _level_span(self) -> Float:
@@ -192,8 +191,7 @@ class Search:
 
     def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
         """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
-        real = np.float32 if spectrum.dtype == np.complex64 else np.float64
-        held = np.zeros(self._size, real)
+        held = np.zeros(self._size, spectrum.real.dtype)
         met = slice(max(0, 1 - self.n_grid - first), max(0, self.n_grid - first))
         held[: kernel[met].size] = kernel[met]
         other = np.conj(scipy.fft.rfft(np.roll(held, first + met.start)))
@@ -225,17 +223,13 @@ class Search:
         scaled = gram / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(n)
         scaled += np.where(np.einsum("nii->ni", gram) > 1e-9, 0.0, 1.0)[:, :, None] * np.eye(n)
         for phase, shape in enumerate(template.shapes):
-            power = over(0, 0, shape**2)
-            project = np.zeros((n, peaks.size))
-            left = power
-            if n:
-                shared = np.stack([over(0, a, shape * time**p) for p, a in self._terms], axis=1)
-                solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
-                project = solved.T
-                left = power - 2 * np.sum(solved * shared, 1) + np.einsum("ni,nij,nj->n", solved, gram, solved)
+            shared = np.reshape([over(0, a, shape * time**p) for p, a in self._terms], (n, peaks.size)).T
+            solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
+            left = over(0, 0, shape**2) - 2 * np.sum(solved * shared, axis=1)
+            left += np.einsum("ni,nij,nj->n", solved, gram, solved)
             without_gaps = template.detrended(phase, self.bank.baseline.powers)
             tried = left >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
-            yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
+            yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), solved.T)
 
 
 def largest_values(
@@ -251,17 +245,12 @@ def largest_values(
     return best
 
 
-def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
-    """Return the type of computations: double precision for sums in double precision, else single."""
-    return np.float64 if sums.dtype == np.float64 else np.float32
-
-
 #: Averaging time of the fit, s; the curvature within it is neglected.
 BLOCK_S = 30.0
 #: Residual in standard deviations above which a mean has less weight.
 HUBER = 3.0
-#: Number of Gauss-Newton steps.
-STEPS = 6
+#: Number of Gauss-Newton steps, and difference of amplitudes from which derivatives follow.
+STEPS, DIFFERENCE = 6, 1e-6
 #: Standard deviations of an unknown at which its effect is evaluated, and smallest significant S/N of the effect.
 REACH, LEAST = 4.0, 0.01
 
@@ -270,12 +259,9 @@ REACH, LEAST = 4.0, 0.01
 class Trend:
     """Effect of a stare's unknowns on the sums of its frames."""
 
-    frames: NDArray[np.int64]  # frame numbers including gaps, shape (n_frame,)
-    frame_s: float
-    variance: Float  # of each frame's sums, shape (n_frame,)
     of: tuple[Changing, ...]  # quantity that each unknown changes
     curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
-    known: Float  # means of star, sky, neighbours and dark, shape (4, n_frame, n_sum)
+    known: Float  # means of the components in `STEADY`, shape (4, n_frame, n_sum)
     slope_per_c: float  # relative change of the dark current per deg C
 
     @cached_property
@@ -284,91 +270,30 @@ class Trend:
         rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
         return np.asarray(REACH * np.vstack([rows, -rows]))
 
-    def effect(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns, (n_stare, n_unknown) in standard deviations, on the sums.
+    def factors(self, amplitudes: Float) -> Float:
+        """Return the factors on the components in `STEADY`, shape (4, n_stare, n_frame).
 
-        The result has the shape (n_stare, n_frame, n_sum).
+        Amplitudes of unknowns are in standard deviations, (n_stare, n_unknown).
         """
-        changes = self._changes(amplitudes)
-        light = changes["light"] + 1
-        star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
-        warm = np.expm1(self.slope_per_c * changes["temperature"])
-        each = (change[..., None] for change in (star, sky, changes["light"], warm))
-        return np.asarray(sum(change * known for change, known in zip(each, self.known, strict=True)))
+        of, names = np.array(self.of), ("star", "sky", "light", "temperature")
+        star, sky, light, warmer = (amplitudes[:, of == name] @ self.curves[of == name] for name in names)
+        light = 1 + light
+        return np.stack([light * (1 + star), light * (1 + sky), np.exp(self.slope_per_c * warmer), light])
 
-    def part(self, part: slice) -> Trend:
-        """Return the trend of some frames."""
-        frames, variance = self.frames[part], self.variance[part]
-        return replace(self, frames=frames, variance=variance, curves=self.curves[:, part], known=self.known[:, part])
-
-    def subtracted(self, sums: NDArray[Any]) -> Float:
-        """Fit the unknowns to sums less their known mean, and subtract their effect beyond first order."""
-        left = np.array(sums, np.float64)
-        # One stare at a time, since the rounding of matrix products may depend on the number of stares.
-        for row in left:
-            row -= self.nonlinear_effect(self.fitted(row[None]))[0]
-        return left
+    def effect(self, amplitudes: Float) -> Float:
+        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum), for amplitudes as of `factors`."""
+        return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.known, optimize=True))
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
-        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, self._linear, optimize=True)
+        star, sky, dark, near = self.known.mean(axis=1)
+        each = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
+        linear = np.reshape([each[of] for of in self.of], (len(self.of), star.size))
+        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
 
-    def fitted(self, sums: Float) -> Float:
-        """Return the most likely amplitudes, shape (n_stare, n_unknown), in standard deviations."""
-        blocks, weight, means = self._blocks
-        y = np.add.reduceat(sums / self.variance[:, None], blocks, axis=1) / weight[:, None]
-        n, n_unknown = len(y), len(self.of)
-        amplitudes = np.zeros((n, n_unknown))
-        for _ in range(STEPS):
-            left = y - means.effect(amplitudes)
-            size = np.sqrt(np.sum(left**2, axis=2) * weight)
-            trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
-            gradient = means._gradient(amplitudes)
-            weighted = gradient * trusted[:, None, :, None]
-            information = np.einsum("nutk,nvtk->nuv", weighted, gradient, optimize=True) + np.eye(n_unknown)
-            pull = np.einsum("nutk,ntk->nu", weighted, left, optimize=True) - amplitudes
-            amplitudes = amplitudes + np.linalg.solve(information, pull[:, :, None])[:, :, 0]
-        return amplitudes
 
-    @cached_property
-    def _linear(self) -> Float:
-        """Mean response of the sums to the change of each unknown, shape (n_unknown, n_sum)."""
-        star, sky, near, dark = self.known.mean(axis=1)
-        each = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
-        return np.array([each[of] for of in self.of])
-
-    @cached_property
-    def _blocks(self) -> tuple[NDArray[np.int64], Float, Trend]:
-        """The first frame of each block, its weight, and the trend of the blocks' means."""
-        number = self.frames // max(1, round(BLOCK_S / self.frame_s))
-        first = np.flatnonzero(np.diff(number, prepend=-1))
-        weight = np.add.reduceat(1.0 / self.variance, first)
-        curves = np.add.reduceat(self.curves / self.variance, first, axis=1) / weight
-        known = np.add.reduceat(self.known / self.variance[:, None], first, axis=1) / weight[:, None]
-        means = replace(self, frames=number[first], variance=1.0 / weight, curves=curves, known=known)
-        return first, weight, means
-
-    def _changes(self, amplitudes: Float) -> dict[str, Float]:
-        """Return the relative changes of star, light and sky, and that of the temperature, (n_stare, n_frame)."""
-        of = np.array(self.of)
-        return {name: amplitudes[:, of == name] @ self.curves[of == name] for name in CHANGED_PART}
-
-    def _gradient(self, amplitudes: Float) -> Float:
-        """Return the derivatives of `effect` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
-        changes = self._changes(amplitudes)
-        light, star, sky = (1 + changes[of][..., None] for of in ("light", "star", "sky"))
-        warm = np.exp(self.slope_per_c * changes["temperature"])[..., None]
-        each = {
-            "star": light * self.known[0],
-            "light": star * self.known[0] + sky * self.known[1] + self.known[2],
-            "sky": light * self.known[1],
-            "temperature": self.slope_per_c * warm * self.known[3],
-        }
-        return np.stack([each[of] * curve[:, None] for of, curve in zip(self.of, self.curves, strict=True)], axis=1)
-
-
-#: Relative norm of a curve's residual below which it is a linear combination of others.
+#: Norm of curves of unit norm less their straight lines, below which they are linear combinations of others.
 MIN_CURVE = 1e-6
 
 
@@ -379,15 +304,15 @@ class SearchedFrames:
     stare: Stare
     known: NDArray[Any]  # mean of each frame's sums without a flare, shape (n_frame, n_sum)
     variance: Float  # of each frame's sums, shape (n_frame,)
-    curves: Float | None  # of unknown amplitude, shape (n_curve, n_frame)
+    curves: Float  # of unknown amplitude, shape (n_curve, n_frame)
     trend: Trend | None  # effect of the stare's unknowns if it is significant beyond first order
 
     def part(self, window: slice) -> SearchedFrames:
         """Return consecutive frames of these."""
-        curves = None if self.curves is None else self.curves[:, window]
-        trend = None if self.trend is None else self.trend.part(window)
-        stare = select_frames(self.stare, window)
-        return SearchedFrames(stare, self.known[window], self.variance[window], curves, trend)
+        stare, trend = select_frames(self.stare, window), self.trend
+        if trend is not None:
+            trend = replace(trend, curves=trend.curves[:, window], known=trend.known[:, window])
+        return SearchedFrames(stare, self.known[window], self.variance[window], self.curves[:, window], trend)
 
     def search(self, bank: Bank) -> Search:
         """Return the search of the frames with a bank."""
@@ -395,8 +320,39 @@ class SearchedFrames:
 
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
         """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
-        left = sums - self.known
-        return np.asarray(left if self.trend is None else self.trend.subtracted(left), np.float32)
+        return np.asarray(self.subtracted(sums - self.known), np.float32)
+
+    def subtracted(self, sums: NDArray[Any]) -> NDArray[Any]:
+        """Fit the trend, if there is one, to sums less their known mean, and subtract it beyond first order."""
+        if (trend := self.trend) is None:
+            return sums
+        return np.array([stare - trend.nonlinear_effect(self._fitted(trend, stare))[0] for stare in sums.astype(float)])
+
+    def _fitted(self, trend: Trend, sums: Float) -> Float:
+        """Return the most likely amplitudes for the sums of a stare, in standard deviations, shape (1, n_unknown)."""
+        first, weight, means = self._blocks
+        y, n = np.add.reduceat(sums / self.variance[:, None], first) / weight[:, None], len(trend.of)
+        amplitudes, steps = np.zeros((1, n)), DIFFERENCE * np.eye(n + 1, n, -1)
+        for _ in range(STEPS):
+            effect = means.effect(amplitudes + steps)
+            left, gradient = y - effect[0], (effect[1:] - effect[0]) / DIFFERENCE
+            size = np.sqrt(np.sum(left**2, axis=1) * weight)
+            trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
+            weighted = (gradient * trusted[:, None]).reshape(n, -1)
+            information = weighted @ gradient.reshape(n, -1).T + np.eye(n)
+            amplitudes = amplitudes + np.linalg.solve(information, weighted @ left.ravel() - amplitudes[0])
+        return amplitudes
+
+    @cached_property
+    def _blocks(self) -> tuple[NDArray[np.intp], Float, Trend]:
+        """The first frame of each block, its weight, and the trend of the blocks' means."""
+        assert self.trend is not None
+        number = self.stare.numbers // max(1, round(BLOCK_S / self.stare.frame_s))
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        weight = np.add.reduceat(1.0 / self.variance, first)
+        curves = np.add.reduceat(self.trend.curves / self.variance, first, axis=1) / weight
+        known = np.add.reduceat(self.trend.known / self.variance[:, None], first, axis=1) / weight[:, None]
+        return first, weight, replace(self.trend, curves=curves, known=known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,21 +370,9 @@ class Survey:
         return self.components.coefficients(self.stare)
 
     @cached_property
-    def known(self) -> Float:
-        """Known mean of each frame's sums without a flare, which the observer subtracts, shape (n_frame, n_sum)."""
-        return self.components.means(self.coefficients)
-
-    @cached_property
-    def directions(self) -> dict[str, Float]:
-        """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
-        return self.components.directions(self.coefficients)
-
-    @cached_property
     def response(self) -> Float:
         """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
-        unit = np.zeros(len(STEADY) + self.components.n_flares)
-        unit[: len(STEADY) + 1] = 1.0
-        return self.components.means(unit)
+        return np.asarray(self.components.component_means[len(STEADY)])
 
     @property
     def unit_snr(self) -> float:
@@ -446,26 +390,25 @@ class Survey:
         return np.asarray(np.einsum("tkk->t", self.covariance) / self.covariance.shape[1])
 
     @cached_property
-    def curves(self) -> Float | None:
-        """Curves of the stare's unknowns that are not straight lines, shape (n_curve, n_frame)."""
+    def curves(self) -> Float:
+        """Independent curves of the baseline: the unknowns less straight lines, shape (n_curve, n_frame)."""
         if not self.bank.baseline.cycle:
-            return None
-        every = [unknown.curve for unknown in self.stare.unknowns]
-        # Residual of each curve after a fit of a straight line and the previous curves.
-        basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
-        curves: list[Float] = []
-        for curve in every:
-            left = curve - basis @ (basis.T @ curve)
-            size = float(np.linalg.norm(left))
-            if size > MIN_CURVE * float(np.linalg.norm(curve)):
-                curves.append(left)
-                basis = np.column_stack([basis, left / size])
-        return np.array(curves).reshape(len(curves), self.stare.n_frames)
+            return np.zeros((0, self.stare.n_frames))
+        of_unit_norm = [unknown.curve / (np.linalg.norm(unknown.curve) or 1.0) for unknown in self.stare.unknowns]
+        every = np.reshape(of_unit_norm, (len(of_unit_norm), self.stare.n_frames))
+        line = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
+        curves, size, _ = np.linalg.svd((every - every @ line @ line.T).T, full_matrices=False)
+        return np.asarray(curves[:, size > MIN_CURVE].T)
 
     @cached_property
     def frames(self) -> SearchedFrames:
         """Frames of the stare with what the search knows of them."""
-        return SearchedFrames(self.stare, self.known, self.variance, self.curves, self.trend)
+        known, trend = self.components.means(self.coefficients), None
+        if self.stare.unknowns:
+            effect = self.unknowns.nonlinear_effect(self.unknowns.extremes)
+            power = np.sum(effect**2 / self.variance[:, None], axis=(1, 2))
+            trend = self.unknowns if (power > LEAST**2).any() else None
+        return SearchedFrames(self.stare, known, self.variance, self.curves, trend)
 
     @cached_property
     def search(self) -> Search:
@@ -473,32 +416,17 @@ class Survey:
         return self.frames.search(self.bank)
 
     @cached_property
-    def unknowns(self) -> Trend | None:
-        """Effect of the stare's unknowns, or None without unknowns."""
-        if not self.stare.unknowns:
-            return None
-        star, sky = self.directions["star"], self.directions["sky"]
-        slope = self.components.quiet.conditions["dark_slope_per_c"]
-        dark = self.directions["temperature"] / slope if slope else np.zeros_like(sky)
-        known = np.stack([star, sky, self.directions["light"] - star - sky, dark])
-        curves = np.array([unknown.sd * unknown.curve for unknown in self.stare.unknowns])
-        of = tuple(unknown.of for unknown in self.stare.unknowns)
-        return Trend(self.stare.numbers, self.stare.frame_s, self.variance, of, curves, known, slope)
-
-    @cached_property
-    def trend(self) -> Trend | None:
-        """Effect of the stare's unknowns if it is significant beyond first order, else None."""
-        if (known := self.unknowns) is None:
-            return None
-        power = np.sum(known.nonlinear_effect(known.extremes) ** 2 / known.variance[:, None], axis=(1, 2))
-        return known if (power > LEAST**2).any() else None
+    def unknowns(self) -> Trend:
+        """Effect of the stare's unknowns."""
+        steady = len(STEADY)
+        known = self.coefficients.T[:steady, :, None] * self.components.component_means[:steady, None]
+        unknown, slope = self.stare.unknowns, self.components.quiet.conditions["dark_slope_per_c"]
+        curves = np.reshape([one.sd * one.curve for one in unknown], (len(unknown), self.stare.n_frames))
+        return Trend(tuple(one.of for one in unknown), curves, known, slope)
 
     def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
-        if self.unknowns is None:
-            return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
-        moved = self.unknowns.effect(amplitudes)
-        return moved if self.trend is None else self.trend.subtracted(moved)
+        return self.frames.subtracted(self.unknowns.effect(amplitudes))
 
     def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
         """Return the request for the largest values of stares without a flare."""

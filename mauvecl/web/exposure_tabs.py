@@ -12,8 +12,7 @@ from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
 from mauvecl.answers.signal import simulate
 from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Bars, Chart, ChartData, Custom, Dots, Line, Listed, Own, Rule
-from mauvecl.charts.detection import roc_columns
-from mauvecl.charts.limits import BUDGET, budget_series
+from mauvecl.charts.detection import BUDGET, budget_series, roc_columns
 from mauvecl.detection.requests import statistic_label
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.columns import View, chance_text, stacked, with_error

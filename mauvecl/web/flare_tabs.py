@@ -15,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 
 from mauvecl.answers.measure import COLUMNS, expected_measurements, models_of
 from mauvecl.charts.chart import Area, Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
-from mauvecl.charts.limits import RISES
+from mauvecl.charts.spectra import FACTORS, RISES
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.host.arrays import Float
 from mauvecl.schema.columns import View, chance_text, records
@@ -255,8 +255,6 @@ ASSUMED = {
 }
 #: Names of the curves.
 NAMES = ("known", "usual", "free")
-#: Factors on the amplitude at which errors are computed.
-FACTORS = np.geomspace(0.1, 10.0, 9)
 #: Half-widths before and after the peak of a flare in a stare that are shown.
 NEAR = (2.0, 6.0)
 #: Largest number of simulated fits that are shown.
@@ -291,11 +289,11 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
 ).data()  # fmt: skip
 def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the relative error of the temperature against the amplitude of the flare."""
-    own = 100 * closed.case.study.flare.amplitudes[0]
-    series: dict[str, Any] = {}
+    # Fewer amplitudes than in files suffice.
+    own, factors, series = 100 * closed.case.study.flare.amplitudes[0], FACTORS[::3], dict[str, Any]()
     for name, measurement in zip(NAMES, expected(closed).values(), strict=True):
-        ahead = measurement.forecasts(FACTORS, measurement.unknown)
-        series[name] = own * FACTORS, [100 * f.errors[0] / f.values[0] for f in ahead]
+        ahead = measurement.forecasts(factors, measurement.unknown)
+        series[name] = own * factors, [100 * f.errors[0] / f.values[0] for f in ahead]
     all_known, *_, free = expected(closed).values()
     which = "temperature" if isinstance(all_known.fitted, FlareModel) else "lower temperature"
     series["own"] = [own], [100 * all_known.ahead.errors[0] / all_known.ahead.values[0]]
