@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import datetime
 import errno
@@ -20,8 +19,8 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from mauvecl.schema.columns import INTERVAL, View, without_empty
-from mauvecl.schema.errors import SUBJECT, InputError, printable
+from mauvecl.schema.columns import INTERVAL, View
+from mauvecl.schema.errors import REMEDY, SUBJECT, InputError, printable
 
 if TYPE_CHECKING:
     import typer
@@ -318,7 +317,7 @@ def show_view(view: View, *, wide: bool = True) -> bool:
 
 
 def _printed(view: View, hidden: Collection[str] = ()) -> list[Printed]:
-    headings, cells = without_empty(*view.texts(hidden))
+    headings, cells = view.texts(hidden, empty=False)
     return list(map(list, zip(headings, *cells, strict=True)))
 
 
@@ -351,10 +350,6 @@ def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
     return parts
 
 
-#: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
-_REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
-
-
 def _flags(name: str, *, off: bool = False) -> list[str]:
     """Return the flags that set a parameter or a key of the study, or turn it off, the long one first.
 
@@ -383,16 +378,13 @@ def with_flags(text: str) -> str:
     """Return a message with flags instead of the remedies in backticks."""
 
     def as_flag(match: re.Match[str]) -> str:
-        value: Any = match["value"]
-        off = value in ("false", "False")
-        flags = _flags(match["name"], off=off)
+        value, off = match["value"], match["value"] in ("false", "False")
+        flags = _flags(match["key"], off=off)
         if not flags:
             return match[0]
-        with contextlib.suppress(ValueError, SyntaxError):
-            value = None if value is None else ast.literal_eval(value)
-        return flags[0] if value is None or value is True or off else f"{flags[0]} {shlex.quote(str(value))}"
+        return flags[0] if off or value in (None, "True") else f"{flags[0]} {shlex.quote(value)}"
 
-    return _REMEDY.sub(as_flag, text)
+    return REMEDY.sub(as_flag, text)
 
 
 def name_flag(error: InputError) -> str:

@@ -25,21 +25,6 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
     from pydantic_core import CoreSchema
 
-#: Words for numbers in units in messages.
-WORDS = {
-    "": "a number",
-    "K": "a number in kelvin",
-    "deg_C": "a number in degrees Celsius",
-    "mag": "a number in magnitudes",
-    "mag / arcsec2": "a number in mag/arcsec2",
-    "s": "a number in seconds",
-    "h": "a number in hours",
-    "d": "a number in days",
-    "deg": "a number in degrees",
-    "1 / h": "a number per hour",
-    "1 / d": "a number per day",
-}
-
 
 def is_quantity(value: Any) -> bool:
     """Return whether a value is an astropy Quantity."""
@@ -100,11 +85,6 @@ def with_unit(text: str, unit: str) -> float | None:
     raise ValueError(text)
 
 
-def word_of(unit: str) -> str:
-    """Return the words for a number in a unit in a message."""
-    return WORDS.get(unit, f"a number in {unit}")
-
-
 Metadata = TypeVar("Metadata")
 
 #: Units as people write them, where they differ from astropy's notation.
@@ -115,6 +95,11 @@ WRITTEN = {
     "solMass": "solar masses",
     "1 / (cm2 s)": "cm^-2 s^-1",
 }
+
+
+def word_of(unit: str) -> str:
+    """Return the words for a number in a unit in a message."""
+    return f"a number in {WRITTEN.get(unit, unit)}" if unit else "a number"
 
 
 @dataclass(frozen=True)
@@ -497,7 +482,7 @@ Seed = Annotated[int, Range(0, 2**64 - 1)]
 #: Seed where none is given.
 DEFAULT_SEED = 1
 #: Number of realisations, and that of the first of them.
-Realisations = Annotated[int, Range(1)]
+Realisations = Annotated[int, Range(1, 2**63 - 1)]
 FirstRealisation = Annotated[int, Range(0, 2**63 - 1)]
 Positive = Annotated[float, Range(0, open_low=True)]
 NotNegative = Annotated[float, Range(0)]

@@ -313,13 +313,6 @@ def check_different(names: Sequence[str], what: str, key: str) -> None:
 # Readers of values that are written as text, as on the command line; each receives the value's name for messages.
 
 
-def refusal(name: str, text: str, expected: str) -> InputError:
-    """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
-    error = InputError.of(name, text, expected)
-    error.key = name.strip("-").replace("-", "_")
-    return error
-
-
 def number_or_text(text: str) -> float | str:
     """Return the finite number that a text states, or the text itself, which may have a unit."""
     with contextlib.suppress(ValueError):
@@ -345,9 +338,9 @@ def read_axis(text: str, name: str) -> dict[str, Any]:
         quantity, start, stop, steps, *rest = text.split(":")
         spaced = {"start": number_or_text(start), "stop": number_or_text(stop), "steps": int(steps)}
     except ValueError as error:
-        raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
+        raise InputError.of(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
     if rest not in ([], ["log"]):
-        raise refusal(name, text, "quantity:start:stop:steps with :log or nothing at its end")
+        raise InputError.of(name, text, "quantity:start:stop:steps with :log or nothing at its end")
     return {"quantity": quantity, "log": bool(rest)} | spaced
 
 
@@ -355,7 +348,7 @@ def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
     """Read a name and its value, with an equals sign between them."""
     key, _, value = (part.strip() for part in text.rpartition("="))
     if not (key and value):
-        raise refusal(name, text, expected)
+        raise InputError.of(name, text, expected)
     return key, value
 
 
@@ -386,7 +379,7 @@ def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]
         measures = ((part, fields.with_unit(part, unit)) for part in text.split(":"))
         low, high = (float(part) if value is None else value for part, value in measures)
     except ValueError as error:
-        raise refusal(name, text, expected) from error
+        raise InputError.of(name, text, expected) from error
     return low, high
 
 
@@ -397,4 +390,4 @@ def read_frames(text: str, name: str) -> str | list[int]:
     try:
         return [int(word) for word in text.split(",")]
     except ValueError as error:
-        raise refusal(name, text, "stack, all, or numbers such as 0,4,9") from error
+        raise InputError.of(name, text, "stack, all, or numbers such as 0,4,9") from error

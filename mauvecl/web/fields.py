@@ -17,7 +17,7 @@ from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, named_star, near_names
 from mauvecl.host.tables.text_tables import columns, text_table
-from mauvecl.schema.errors import SUBJECT, InputError, shortened
+from mauvecl.schema.errors import REMEDY, SUBJECT, InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
     Help,
@@ -386,8 +386,6 @@ PRESETS: dict[str, dict[str, str]] = {
 
 
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
-#: A remedy in a message, such as `magnitude=7.4`.
-_REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
 #: A flag of the command line.
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 #: A key within a message: words of prose hold no underscore.
@@ -424,12 +422,12 @@ def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
         return f"{label} {match['value']}" if match["value"] else f"“{label}”"
 
     text = _FLAG.sub(lambda match: f"“{FIELDS[name].label}”" if (name := field_of(match[0])) else match[0], text)
-    return _KEY.sub(lambda match: _label(match[0], keys), _REMEDY.sub(remedy, text))
+    return _KEY.sub(lambda match: _label(match[0], keys), REMEDY.sub(remedy, text))
 
 
 def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:
     """Return the values that a message proposes for fields, as pairs of field and text."""
-    each = _REMEDY.finditer(str(error))
+    each = REMEDY.finditer(str(error))
     named = ((field_of(keys.get(match["key"], match["key"])), match["value"]) for match in each)
     return [(name, value) for name, value in named if name is not None and value]
 
