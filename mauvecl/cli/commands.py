@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -93,11 +93,12 @@ def question_room(store: Store, *, insist: bool) -> None:
 
 @dataclass(eq=False)
 class Session(flags.Options):
-    """Session of one call of a verb; in its `with` block, only this process writes to the output folder."""
+    """Session of one call of a verb, during which only this process writes to the output folder."""
 
     verb: str
     study: Study
     given: Mapping[str, Any]  # values of the flags of keys, None where they are not given
+    held: ExitStack  # releases the output folder
     draws: bool  # whether a pool draws
     notes: Sequence[str] = ()  # what the flags did not state, which is printed with the messages of the answer
     files: list[Path] = field(default_factory=list)
@@ -106,15 +107,10 @@ class Session(flags.Options):
     _pool: Pool | None = None
     _checkpoint: Checkpoint | None = None
     _lost: list[InputError] = field(default_factory=list)
-    _held: ExitStack = field(default_factory=ExitStack)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Release the output folder; after the answer is printed, report files of it that could not be written."""
-        self._held.close()
-        if kind is None and self._lost:
+    def report_lost(self) -> None:
+        """Raise InputError if files of the answer could not be written."""
+        if self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
             raise reworded(self._lost[0], f"{self._lost[0]}{others}")
 
@@ -126,7 +122,7 @@ class Session(flags.Options):
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
         console.folder = folder
-        self._held.enter_context(locked(folder, "output folder"))
+        self.held.enter_context(locked(folder, "output folder"))
         return folder
 
     @contextmanager
@@ -367,8 +363,10 @@ class Command:
         study, messages = self.verb.study_of(given, keywords, own, "command line")
         detects = {"fap", "realisations"} <= keywords.keys()
         question_values(study, detects=detects, draws=self.draws, insist=how.get("insist", False))
-        with Session(self.verb.name, study, given, draws=self.draws, notes=messages, **how) as session:
+        with ExitStack() as held:
+            session = Session(self.verb.name, study, given, held, draws=self.draws, notes=messages, **how)
             self.run(session, **values)
+            session.report_lost()
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
         """Return the options of the session, with their defaults."""

@@ -172,9 +172,7 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
     def taken(name: str) -> Column:
         having = [table[name] for table in tables if name in table.colnames]
-        (unit, *others) = dict.fromkeys(str(column.unit or "") for column in having)
-        if others:
-            raise ValueError(f"column {name} has several units")
+        (unit,) = {str(column.unit or "") for column in having}
         kind = np.result_type(*(column.dtype for column in having)).type
         text = having[0].info.description or ""
         return Column(name, lambda part: values(part, name), unit, text, kind=kind)
@@ -238,11 +236,6 @@ def with_error(value: float, error: float) -> str:
     digits = max(1 - math.floor(math.log10(error)), 0)
     # The sum makes -0 a 0.
     return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.{digits}f}"
-
-
-def short(value: float | str) -> str:
-    """Format a number or a name without its unit."""
-    return value if isinstance(value, str) else f"{value:g}"
 
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ import difflib
 import math
 from collections.abc import Iterator, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args
+from typing import Any, Self, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -26,29 +26,20 @@ from pydantic_core import PydanticCustomError
 from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown, together
 
-if TYPE_CHECKING:
-    from pydantic._internal._model_construction import ModelMetaclass
-else:
-    ModelMetaclass = type(BaseModel)
 
-
-class _InputErrorMeta(ModelMetaclass):
-    """Metaclass that raises InputError for invalid arguments.
-
-    Validation of a nested record does not pass `__call__`, so the outer record names the full path of the value.
-    """
-
-    def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
-        try:
-            return super().__call__(*args, **values)
-        except ValidationError as error:
-            raise input_error(cls.__name__, cast(type[BaseModel], cls), error) from None
-
-
-class Record(BaseModel, metaclass=_InputErrorMeta):
+class Record(BaseModel):
     """Frozen pydantic model that rejects unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def __init__(self, /, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise input_error(type(self).__name__, type(self), error) from None
+
+    # Nested records are not built by this method, so that the outer one names the full path of a wrong value.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @field_validator("*", mode="wrap")
     @classmethod
