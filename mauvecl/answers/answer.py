@@ -94,7 +94,7 @@ class TableOf:
     def _made(self, answer: Answer) -> QTable:
         rows: Any = _of_answer(self.rows, answer)
         if hasattr(rows, "colnames"):
-            return rows  # type: ignore[no-any-return]
+            return rows
         if isinstance(rows, Mapping) or not isinstance(rows, Iterable):
             rows = [rows]
         about = self.about(answer) if callable(self.about) else metadata_of(answer, *self.about)
@@ -280,10 +280,9 @@ class Answer(Drawable, ContentEquality):
     @property
     def writers(self) -> dict[str, Callable[[Path], Path]]:
         """Functions that write the tables, the documents and the study to a path, by full file name."""
-        documents = self.documents | {"study.toml": self.study.toml().encode}
-        return {name: partial(write_table, table) for name, table in self.files.items()} | {
-            name: partial(write_document, content) for name, content in documents.items()
-        }
+        documents, writers = self.documents | {"study.toml": self.study.toml().encode}, dict[str, Any]()
+        writers |= {name: partial(write_table, table) for name, table in self.files.items()}
+        return writers | {name: partial(write_document, content) for name, content in documents.items()}
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
