@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import datetime
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from types import MappingProxyType
 from typing import Any, Literal, get_args, get_origin
 
@@ -57,35 +56,48 @@ MOST_TABLE = 3000
 MOST_POINTS = 4000
 
 
-def number(text: str, reach: Range, unit: str = "", *, whole: bool = False, scale: float = 1.0) -> float | int:
-    """Parse a number in a range, with or without a unit; `scale` is the factor from the unit to that of the page."""
-    kind, accepted = "a whole number" if whole else "a number", reach.words(unit, whole=whole)
-    form = r"[+-]?\d+" if whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
-    if not text.strip():
-        raise InputError(f"nothing is entered; {accepted} is needed")
-    try:
-        measure = None if whole else with_unit(text, unit)
-    except ValueError:
-        raise InputError(f"{shortened(text)} has another unit: enter {accepted}") from None
-    text = text if measure is None else repr(scale * measure)
-    if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
-        point = ", with a point for decimals" if "," in text else ""
-        raise InputError(f"{shortened(text)} is not {kind}: enter {accepted}{point}")
-    value = int(text) if whole else float(text)
-    if value not in reach:
-        raise InputError(f"{shortened(text.strip())} is out of range: enter {accepted}")
-    return value
+@dataclass(frozen=True)
+class Number:
+    """Number in a range, written with a decimal point, and with or without a unit."""
+
+    range: Range
+    whole: bool = False
+    unit: str = ""
+    scale: float = 1  # factor from the value in the unit to that of the page
+
+    def __call__(self, text: str) -> float | int:
+        """Parse the number; an error states what is accepted."""
+        kind = "a whole number" if self.whole else "a number"
+        accepted = self.range.words(self.unit, whole=self.whole)
+        form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
+        if not text.strip():
+            raise InputError(f"nothing is entered; {accepted} is needed")
+        try:
+            measure = None if self.whole else with_unit(text, self.unit)
+        except ValueError:
+            raise InputError(f"{shortened(text)} has another unit: enter {accepted}") from None
+        text = text if measure is None else repr(self.scale * measure)
+        if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
+            point = ", with a point for decimals" if "," in text else ""
+            raise InputError(f"{shortened(text)} is not {kind}: enter {accepted}{point}")
+        value = int(text) if self.whole else float(text)
+        if value not in self.range:
+            raise InputError(f"{shortened(text.strip())} is out of range: enter {accepted}")
+        return value
 
 
-def choice(options: tuple[str, ...], made: Callable[[str], Any] = str) -> Callable[[str], Any]:
-    """Return a reader of one of several words, from which it makes the value."""
+@dataclass(frozen=True)
+class Choice:
+    """One of several words."""
 
-    def read(text: str) -> Any:
-        if text not in options:
-            raise InputError(f"{shortened(text)} is not a choice: use one of {', '.join(options)}")
-        return made(text)
+    options: tuple[str, ...]
+    made: Callable[[str], Any] = str
 
-    return read
+    def __call__(self, text: str) -> Any:
+        """Parse the value; an error states what is accepted."""
+        if text not in self.options:
+            raise InputError(f"{shortened(text)} is not a choice: use one of {', '.join(self.options)}")
+        return self.made(text)
 
 
 def read_points(text: str, what: str) -> tuple[tuple[float, float], ...]:
@@ -109,8 +121,8 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     from mauvecl.host.stars.flare import EmissionLine
 
     pairs = [pair.partition("=") for pair in text.split(",") if text.strip()]
-    share = range_of(LineFraction)
-    fractions = tuple((EmissionLine.named(name).name, float(number(value, share))) for name, _, value in pairs)
+    share = Number(range_of(LineFraction))
+    fractions = tuple((EmissionLine.named(name).name, float(share(value))) for name, _, value in pairs)
     if len(dict(fractions)) < len(fractions):
         raise InputError(f"{shortened(text)} contains a line twice, but each must be given once")
     return fractions
@@ -130,20 +142,6 @@ def star_name(text: str) -> str:
         raise InputError("no star is chosen: give a name of the library, or upload a spectrum")
     named_star(text, own=False)
     return text.strip()
-
-
-def day(text: str) -> str:
-    """Parse a day such as 2027-01-31."""
-    from mauvecl.host.exposure.background import YEARS
-
-    remedy = f"give a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
-    try:
-        date = datetime.date.fromisoformat(text.strip())
-    except ValueError:
-        raise InputError(f"{shortened(text)} is not a day: {remedy}") from None
-    if not YEARS[0] <= date.year < YEARS[1]:
-        raise InputError(f"{date} is out of range: {remedy}")
-    return date.isoformat()
 
 
 def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
@@ -250,21 +248,21 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
 
 #: Readers of fields by the kind of their widget.
 READERS: dict[str, Callable[[str], Any]] = {
-    "day": day,
+    "day": str.strip,
     "table": neighbours,
     "library": lambda text: named_star(text, own=False).nearest if text.strip() else None,
-    **dict.fromkeys(("file", "upload"), choice(("", UPLOADED_FILE), lambda text: text or None)),
+    **dict.fromkeys(("file", "upload"), Choice(("", UPLOADED_FILE), lambda text: text or None)),
 }
 
 
 def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> Callable[[str], Any]:
     choices = widget.choices or (get_args(field.annotation) if get_origin(field.annotation) is Literal else ())
     if choices:
-        return choice(choices)
+        return Choice(choices)
     if widget.kind in READERS:
         return READERS[widget.kind]
     if field.annotation is bool:
-        return choice(("no", "yes"), lambda text: text == "yes")
+        return Choice(("no", "yes"), lambda text: text == "yes")
     flag = first(field, Flag)
     if flag is not None and flag.kind == list[str] and flag.read is not None:
         read = flag.read
@@ -274,8 +272,8 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         return (lambda text: text.strip() or None) if optional else str
     high = reach.high if widget.most is None else widget.most
     reach = replace(reach, low=widget.scale * reach.low, high=widget.scale * high)
-    read_number = partial(number, reach=reach, unit=unit, whole=field.annotation is int, scale=widget.scale)
-    return (lambda text: read_number(text) if text.strip() else None) if optional else read_number
+    number = Number(reach, whole=field.annotation is int, unit=unit, scale=widget.scale)
+    return (lambda text: number(text) if text.strip() else None) if optional else number
 
 
 #: Fields that do not stand for one key of the study.
@@ -292,16 +290,16 @@ _OWN_FIELDS = {
         "Balmer=0.1, or 280=0.03 for one at 280 nm.", group="Flare's spectrum", place=1, own_keys=("flare.spectrum",),
     ),
     "sky": Field(
-        label="Sky", first="brightness", read=choice(SKIES), hint="Zodiacal light behind the star.", group="Sky",
+        label="Sky", first="brightness", read=Choice(SKIES), hint="Zodiacal light behind the star.", group="Sky",
         own_keys=("sky",),
     ),
     "statistic": Field(
-        label="Detection statistic", first="matched", read=choice(tuple(STATISTICS)),
+        label="Detection statistic", first="matched", read=Choice(tuple(STATISTICS)),
         hint="; ".join(f"{name}: {statistic.definition}" for name, statistic in STATISTICS.items()) + ".",
         group="Detection", place=1, own_keys=("run.statistics",),
     ),
     "unknown": Field(
-        label="Kind of answer", first=REALISTIC, read=choice(UNKNOWN),
+        label="Kind of answer", first=REALISTIC, read=Choice(UNKNOWN),
         hint="Realistic: detector temperature, light lost and sky differ from exposure to exposure and are unknown; "
         "they are drawn, and the statistic is made blind to them. Ideal: everything but the noise is known. The card "
         "shows both chances; this is for the pictures, tables and simulations.", group="", place=3,
@@ -322,7 +320,7 @@ _OWN_FIELDS = {
     ),
     "realisations": Field(
         label="Realisations", first="100000",
-        read=choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
+        read=Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
         hint="How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
         "(importance sampling) needs fewer.", group="Detection", place=2, own_keys=("run.realisations", "run.tails"),
     ),

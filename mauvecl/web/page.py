@@ -25,7 +25,7 @@ from mauvecl.schema.fields import as_typed
 from mauvecl.study.plan import PlanTarget
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, ClosedForms, FieldValues, chances, short
 from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
-from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Field, choice, note, sentence, targets
+from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
 from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
 from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PLAN, VISIBILITY
 from mauvecl.web.tab import Tab
@@ -163,7 +163,7 @@ def _several(text: str) -> tuple[str, ...]:
 MOST_LINKED = 8192
 #: Entries of a link in addition to the question.
 SEEN = {
-    "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=choice(tuple(TABS))),
+    "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
     "simulated": Field(label="Simulated", hint="", first="", read=_several),
 }
 #: All entries of a link, and their values on a new page.
