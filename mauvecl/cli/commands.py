@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from importlib import import_module
@@ -205,12 +205,10 @@ class Session(flags.Options):
             else:
                 words = [] if self.device is None else self.device.split(",")
                 workers = LocalWorkers([word.strip() for word in words] or [None])
-            try:
+            with closing(workers):
                 pool = Pool(workers, progress=meter if counts == "realisations" else None, **how)
                 meter.standing = lambda: pool.standing
                 yield pool, meter
-            finally:
-                workers.close()
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""

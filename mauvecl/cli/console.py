@@ -273,10 +273,6 @@ def show(lines: Sequence[str]) -> None:
         console.print(line)
 
 
-#: A column of a printed table: its heading and its cells.
-Printed = list[str]
-
-
 def show_view(view: View, *, wide: bool = True) -> bool:
     """Print a table of an answer, or the sentence in its place, and return whether columns were left out.
 
@@ -316,19 +312,20 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     return left_out
 
 
-def _printed(view: View, hidden: Collection[str] = ()) -> list[Printed]:
+def _printed(view: View, hidden: Collection[str] = ()) -> list[list[str]]:
+    """Return the columns of a table, each with its heading and its cells."""
     headings, cells = view.texts(hidden, empty=False)
     return list(map(list, zip(headings, *cells, strict=True)))
 
 
-def _width(columns: Sequence[Printed]) -> int:
+def _width(columns: Sequence[list[str]]) -> int:
     """Return the width of a table: two blanks per column, and lines between columns and at both ends."""
     from rich.cells import cell_len
 
     return 1 + sum(3 + max(map(cell_len, column)) for column in columns)
 
 
-def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
+def _parts(columns: list[list[str]], room: int) -> list[list[list[str]]]:
     """Divide a table: each part has the first columns, which identify rows, and as many others as fit."""
     if _width(columns) <= room:
         return [columns]
@@ -336,7 +333,7 @@ def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
     n_lines = len(columns[0])
     apart = next((n for n in (1, 2, 3) if len(set(zip(*columns[:n], strict=True))) == n_lines), 3)
     first = columns[: next((n for n in range(apart, 1, -1) if _width(columns[:n]) <= room / 2), 1)]
-    together: list[list[Printed]] = []
+    together: list[list[list[str]]] = []
     for column in columns[len(first) :]:
         if together and column[0] == INTERVAL:
             together[-1].append(column)
