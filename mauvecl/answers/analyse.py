@@ -380,7 +380,7 @@ class AnalyseAnswer(Answer):
         **metadata_of(answer, "study"), **answer.analysis.frames.time_keywords, "star": answer.analysis.frames.name,
         **metadata_of(answer, "analysis.frames.unit", "analysis.threshold")})  # fmt: skip
     #: One row per frame: flux, level, noise, and why it is not searched.
-    frames = TableOf("frames", FRAMES, "analysis", cached=False, about=lambda answer: {
+    frames = TableOf("frames", FRAMES, "analysis", about=lambda answer: {
         "star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit,
         **answer.analysis.frames.time_keywords})  # fmt: skip
     #: One row per event and measured quantity, with intervals.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from html import escape
 from importlib import import_module
 from operator import attrgetter
@@ -74,7 +74,6 @@ class TableOf:
     when: str | Callable[[Any], object] = lambda answer: True
     # Metadata: paths of attributes of the answer, whose last names are the keys, or a function of the answer.
     about: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
-    cached: bool = True  # whether the answer keeps the table, which may be large
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -88,13 +87,11 @@ class TableOf:
     def __get__(self, answer: Answer | None, owner: type) -> TableOf | QTable:
         if answer is None:
             return self
-        table: QTable = self._made(answer)
-        if self.cached:
-            # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
-            vars(answer)[self.name] = table
+        # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
+        vars(answer)[self.name] = table = self._made(answer)
         return table
 
-    def _made(self, answer: Answer) -> Any:
+    def _made(self, answer: Answer) -> QTable:
         rows: Any = _of_answer(self.rows, answer)
         if hasattr(rows, "colnames"):
             return rows
@@ -278,11 +275,14 @@ class Answer(Drawable, ContentEquality):
         Raises InputError if a file cannot be written; an earlier file of that name is then unchanged.
         """
         place = make_folder(Path(folder))
-        return [
-            *(write_table(table, place / name) for name, table in self.files.items()),
-            *(write_document(content, place / name) for name, content in self.documents.items()),
-            write_document(self.study.toml().encode, place / "study.toml"),
-        ]
+        return [write(place / name) for name, write in self.writers.items()]
+
+    @property
+    def writers(self) -> dict[str, Callable[[Path], Path]]:
+        """Functions that write the tables, the documents and the study to a path, by full file name."""
+        documents, writers = self.documents | {"study.toml": self.study.toml().encode}, dict[str, Any]()
+        writers |= {name: partial(write_table, table) for name, table in self.files.items()}
+        return writers | {name: partial(write_document, content) for name, content in documents.items()}
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:

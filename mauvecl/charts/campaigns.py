@@ -19,7 +19,6 @@ import numpy as np
 from mauvecl.charts.chart import Area, Axis, Dots, Line, Mesh, Panel, Picture, Rule, Series, pictures_of, register
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
-from mauvecl.schema.columns import without_empty
 
 if TYPE_CHECKING:
     from mauvecl.answers.analyse import AnalyseAnswer
@@ -328,7 +327,7 @@ def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[Part]]:
     frames = answer.analysis.frames
     title = f"{frames.name}: {frames.n_frames} frames from {frames.date(float(frames.time_s[0]))[:19]}"
     parts = [Part(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
-    parts += [Part(view.title, (), *without_empty(*view.texts())) for view in answer.all_views]
+    parts += [Part(view.title, (), *view.texts(empty=False)) for view in answer.all_views]
     parts.append(Part(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
     return title, parts + [Part(picture=draw, seen=name) for name, draw in pictures_of(answer).items()]
 

@@ -12,6 +12,12 @@ from pkgutil import iter_modules
 from typing import Any, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
+#: Colours on light ground by name, after Okabe & Ito; `web.figures.INKS` has those on dark ground as well.
+INK = {
+    "text": "#1b2733", "grid": "#dde3ea", "ground": "#ffffff", "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73",
+    "drawn": "#6b7785", "dark": "#7b4ea3", "read": "#B8860B", "bias": "#A65082", "total": "#1b2733",
+    "threshold": "#1b2733", "own": "#C2185B", "shortest": "#E8801F", "middle": "#B34700", "longest": "#5C2200",
+}  # fmt: skip
 #: Largest number of curves of targets on the page; further targets are in the table alone.
 MOST_TARGETS = 8
 

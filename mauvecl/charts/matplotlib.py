@@ -12,19 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Area, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets, register
+from mauvecl.charts import chart
+from mauvecl.charts.chart import INK, Area, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
 
 #: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color); neighbours differ in
 #: lightness as well.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
-NULL = "#777777"
-#: Colours of files by their names in charts; `web.figures.INKS` has those of the page's themes.
-INK = {
-    "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73", "drawn": NULL, "dark": "#CC79A7", "read": "#E69F00",
-    "own": "#D55E00", "total": "#000000", "text": "#000000", "threshold": "#000000",
-}  # fmt: skip
+NULL = INK["drawn"]
 #: Wavelengths that are shown, nm.
 RANGE_NM = (200.0, 700.0)
 #: Cells of a mesh above which vector files hold it as pixels.
@@ -159,7 +155,9 @@ def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[..., Any]
     `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `how` is as for
     `chart.Entry`. A function that is a picture of several classes is decorated once.
     """
-    return lambda draw: register(kind, name, draw if hasattr(draw, "__wrapped__") else styled_picture(draw), **how)
+    return lambda draw: chart.register(
+        kind, name, draw if hasattr(draw, "__wrapped__") else styled_picture(draw), **how
+    )
 
 
 def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any:

@@ -10,13 +10,13 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 #: Drawn spectra above which a run is questioned: they take a year on a hundred cores at the best rate of
 #: `bench/results/rates.ecsv`, 6e9 pixels a second and core.
 MOST_SPECTRA = 1e16
-#: The engine's index of realisations has 63 bits: `Engine._check`.
-MOST_REALISATIONS = 2**63 - 1
 
 
 def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
@@ -67,8 +65,6 @@ def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -
         for name in run.statistics:
             check_statistic(name)
         check_fap(run.fap, count, run.tails)
-    if draws and count > MOST_REALISATIONS:
-        raise InputError.of("realisations", count, f"at most {MOST_REALISATIONS}: the index has 63 bits")
     spectra = count * len(study.star) * study.sweep.size * (1 + len(study.flare.amplitudes))
     if draws and spectra >= MOST_SPECTRA and not insist:
         raise InputError(
@@ -89,26 +85,20 @@ def question_room(store: Store, *, insist: bool) -> None:
     if store.n_bytes > free:
         rows = free // (store.n_bytes // store.rows)
         raise InputError(
-            f"realisations = {store.rows} need {_size(store.n_bytes)}, but {str(store.path)!r} has room for "
-            f"{_size(free)}; give at most {rows} or another place, or --insist to start anyway",
+            f"realisations = {store.rows} need {store.n_bytes / 2**20:,.0f} MiB, but {str(store.path)!r} has room for "
+            f"{free / 2**20:,.0f} MiB; give at most {rows} or another place, or --insist to start anyway",
             key="realisations",
         )
 
 
-def _size(size: float) -> str:
-    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
-        if size < 1024:
-            return f"{size:.3g} {unit}"
-        size /= 1024
-    return f"{size:.3g} PiB"
-
-
 @dataclass(eq=False)
 class Session(flags.Options):
-    """Session of one call of a verb; in its `with` block, only this process writes to the output folder."""
+    """Session of one call of a verb, during which only this process writes to the output folder."""
 
     verb: str
     study: Study
+    given: Mapping[str, Any]  # values of the flags of keys, None where they are not given
+    held: ExitStack  # releases the output folder
     draws: bool  # whether a pool draws
     notes: Sequence[str] = ()  # what the flags did not state, which is printed with the messages of the answer
     files: list[Path] = field(default_factory=list)
@@ -117,15 +107,10 @@ class Session(flags.Options):
     _pool: Pool | None = None
     _checkpoint: Checkpoint | None = None
     _lost: list[InputError] = field(default_factory=list)
-    _held: ExitStack = field(default_factory=ExitStack)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Release the output folder; after the answer is printed, report files of it that could not be written."""
-        self._held.close()
-        if kind is None and self._lost:
+    def report_lost(self) -> None:
+        """Raise InputError if files of the answer could not be written."""
+        if self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
             raise reworded(self._lost[0], f"{self._lost[0]}{others}")
 
@@ -137,7 +122,7 @@ class Session(flags.Options):
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
         console.folder = folder
-        self._held.enter_context(locked(folder, "output folder"))
+        self.held.enter_context(locked(folder, "output folder"))
         return folder
 
     @contextmanager
@@ -171,14 +156,12 @@ class Session(flags.Options):
         if lines and not self.as_json:
             show([with_flags(line) for line in lines])
 
-    def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
-        """Write files; failures are reported at the end, after the answer is printed."""
+    def leave(self, write: Callable[[], Path]) -> None:
+        """Write a file; failures are reported at the end, after the answer is printed."""
         try:
-            made = write()
+            self.files.append(write())
         except InputError as error:
             self._lost.append(error)
-            return
-        self.files += [made] if isinstance(made, Path) else made
 
     def ask(self) -> Any:
         """Return the answer of the session's verb to its study, with the progress of what the verb counts."""
@@ -222,15 +205,10 @@ class Session(flags.Options):
             else:
                 words = [] if self.device is None else self.device.split(",")
                 workers = LocalWorkers([word.strip() for word in words] or [None])
-            try:
+            with closing(workers):
                 pool = Pool(workers, progress=meter if counts == "realisations" else None, **how)
                 meter.standing = lambda: pool.standing
                 yield pool, meter
-            except BaseException:
-                workers.stop()
-                raise
-            finally:
-                workers.close()
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""
@@ -263,27 +241,21 @@ class Session(flags.Options):
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""
-        from mauvecl.answers.files import write_document, write_record, write_table
+        from mauvecl.answers.files import write_record
         from mauvecl.charts.matplotlib import available
 
-        for name, table in answer.files.items():
-            self.leave(partial(write_table, table, self.folder / name))
-        for name, content in answer.documents.items():
-            self.leave(partial(write_document, content, self.folder / name))
+        writers = answer.writers
         if self.pictures and available():
-            for name, draw in answer.pictures.items():
-                self.leave(partial(draw, self.folder / f"{name}.png"))
+            writers |= {f"{name}.png": draw for name, draw in answer.pictures.items()}
         elif self.pictures and not self.quiet:
             self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
-        study = answer.study
-        if self.folder / "study.toml" not in self.files:
-            self.leave(partial(write_document, study.toml().encode, self.folder / "study.toml"))
-        seconds, messages = time.perf_counter() - self.started, [*answer.messages, *answer.remarks]
-        how: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "seconds": seconds, "messages": messages}
+        for name, write in writers.items():
+            self.leave(partial(write, self.folder / name))
+        how: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "files": self.files}
+        how |= {"seconds": time.perf_counter() - self.started, "messages": [*answer.messages, *answer.remarks]}
+        data = answer.study.model_dump(mode="json", exclude_none=True)
         # Only a complete answer replaces another's files.
-        how |= {"files": self.files, "whole": not self._lost}
-        data = study.model_dump(mode="json", exclude_none=True)
-        self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, **how))
+        self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, whole=not self._lost, **how))
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
@@ -322,7 +294,7 @@ class Command:
     """Command with a study file and flags, which are built when it is called."""
 
     verb: Verb
-    run: Callable[..., None]  # receives the session of the study; `given` are the flags, others are options of its own
+    run: Callable[..., None]  # receives the session of the study, and options of its own
     draws: bool  # whether workers draw realisations
     resumes: bool = False  # whether a verb that draws no realisations can be resumed
     pictures: bool = True
@@ -348,7 +320,7 @@ class Command:
             **{name: (flags.study_option(keyword, verb.defaults or {}), None) for name, keyword in keywords.items()},
             "setting": (flags.SetFlag, None),
             **({"paper": (flags.PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
-            **{p.name: (kinds[p.name], p.default) for p in own if p.name != "given"},
+            **{p.name: (kinds[p.name], p.default) for p in own},
             **self._options(),
             "help_all": (Annotated[bool, flags.HELP_ALL], False),
         }
@@ -385,14 +357,14 @@ class Command:
                 given[key] = [str(study_file)] if applies is flags.is_star else study_file
                 study_file = None
         how = {name: values.pop(name, usual) for name, (_, usual) in self._options().items()}
-        if "given" in inspect.signature(self.run).parameters:
-            values["given"] = given
         own = None if study_file is None else Study.read(study_file)
         study, messages = self.verb.study_of(given, keywords, own, "command line")
         detects = {"fap", "realisations"} <= keywords.keys()
         question_values(study, detects=detects, draws=self.draws, insist=how.get("insist", False))
-        with Session(self.verb.name, study, draws=self.draws, notes=messages, **how) as session:
+        with ExitStack() as held:
+            session = Session(self.verb.name, study, given, held, draws=self.draws, notes=messages, **how)
             self.run(session, **values)
+            session.report_lost()
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
         """Return the options of the session, with their defaults."""
@@ -568,14 +540,13 @@ def limit(
 
 def simulate(
     session: Session,
-    given: dict[str, Any],
     realisation: Annotated[str, typer.Option(metavar="INTEGER", help="Which realisation to show.")] = "0",
 ) -> None:
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
 
     number = flags.whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
-    session.answer(compute(session.study, realisation=number, flaring=bool(given["amplitude"])))
+    session.answer(compute(session.study, realisation=number, flaring=bool(session.given["amplitude"])))
 
 
 def plan(session: Session) -> None:
@@ -589,11 +560,12 @@ def plan(session: Session) -> None:
     session.answer(session.ask())
 
 
-def stare(session: Session, given: dict[str, Any], device: flags.DeviceFlag = None) -> None:
+def stare(session: Session, device: flags.DeviceFlag = None) -> None:
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares
 
+    given = session.given
     if given["energy"] and (given["amplitude"] or given["flares"]):
         raise InputError("only one of --energy, --amplitude and --flares may be given", key="energy")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import datetime
 import errno
@@ -20,8 +19,8 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from mauvecl.schema.columns import INTERVAL, View, without_empty
-from mauvecl.schema.errors import SUBJECT, InputError, printable
+from mauvecl.schema.columns import INTERVAL, View
+from mauvecl.schema.errors import REMEDY, SUBJECT, InputError, printable
 
 if TYPE_CHECKING:
     import typer
@@ -274,10 +273,6 @@ def show(lines: Sequence[str]) -> None:
         console.print(line)
 
 
-#: A column of a printed table: its heading and its cells.
-Printed = list[str]
-
-
 def show_view(view: View, *, wide: bool = True) -> bool:
     """Print a table of an answer, or the sentence in its place, and return whether columns were left out.
 
@@ -317,19 +312,20 @@ def show_view(view: View, *, wide: bool = True) -> bool:
     return left_out
 
 
-def _printed(view: View, hidden: Collection[str] = ()) -> list[Printed]:
-    headings, cells = without_empty(*view.texts(hidden))
+def _printed(view: View, hidden: Collection[str] = ()) -> list[list[str]]:
+    """Return the columns of a table, each with its heading and its cells."""
+    headings, cells = view.texts(hidden, empty=False)
     return list(map(list, zip(headings, *cells, strict=True)))
 
 
-def _width(columns: Sequence[Printed]) -> int:
+def _width(columns: Sequence[list[str]]) -> int:
     """Return the width of a table: two blanks per column, and lines between columns and at both ends."""
     from rich.cells import cell_len
 
     return 1 + sum(3 + max(map(cell_len, column)) for column in columns)
 
 
-def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
+def _parts(columns: list[list[str]], room: int) -> list[list[list[str]]]:
     """Divide a table: each part has the first columns, which identify rows, and as many others as fit."""
     if _width(columns) <= room:
         return [columns]
@@ -337,7 +333,7 @@ def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
     n_lines = len(columns[0])
     apart = next((n for n in (1, 2, 3) if len(set(zip(*columns[:n], strict=True))) == n_lines), 3)
     first = columns[: next((n for n in range(apart, 1, -1) if _width(columns[:n]) <= room / 2), 1)]
-    together: list[list[Printed]] = []
+    together: list[list[list[str]]] = []
     for column in columns[len(first) :]:
         if together and column[0] == INTERVAL:
             together[-1].append(column)
@@ -349,10 +345,6 @@ def _parts(columns: list[Printed], room: int) -> list[list[Printed]]:
             parts.append([*first])
         parts[-1] += some
     return parts
-
-
-#: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
-_REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
 
 
 def _flags(name: str, *, off: bool = False) -> list[str]:
@@ -383,16 +375,13 @@ def with_flags(text: str) -> str:
     """Return a message with flags instead of the remedies in backticks."""
 
     def as_flag(match: re.Match[str]) -> str:
-        value: Any = match["value"]
-        off = value in ("false", "False")
-        flags = _flags(match["name"], off=off)
+        value, off = match["value"], match["value"] in ("false", "False")
+        flags = _flags(match["key"], off=off)
         if not flags:
             return match[0]
-        with contextlib.suppress(ValueError, SyntaxError):
-            value = None if value is None else ast.literal_eval(value)
-        return flags[0] if value is None or value is True or off else f"{flags[0]} {shlex.quote(str(value))}"
+        return flags[0] if off or value in (None, "True") else f"{flags[0]} {shlex.quote(value)}"
 
-    return _REMEDY.sub(as_flag, text)
+    return REMEDY.sub(as_flag, text)
 
 
 def name_flag(error: InputError) -> str:

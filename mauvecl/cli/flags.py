@@ -194,14 +194,14 @@ def numbers_of(keyword: Keyword, given: Any) -> Any:
 
 def whole_number(text: str, flag: str, reach: Range) -> int:
     """Read a whole number of a range."""
-    from mauvecl.schema.section import number_or_text, refusal
+    from mauvecl.schema.section import number_or_text
 
     try:
         value = whole(number_or_text(text))
     except ValueError:
         value = None
     if value is None or value not in reach:
-        raise refusal(flag, text, reach.words(whole=True))
+        raise InputError.of(flag, text, reach.words(whole=True))
     return value
 
 

@@ -178,20 +178,10 @@ DIGEST_BYTES = 32
 
 
 class Checkpoint:
-    """Context manager of the shards of one run in a folder.
+    """Context manager of the shards of one run in its output folder, which exists.
 
-    Parameters
-    ----------
-    folder : Path
-        Existing output folder of the run.
-    study : Study
-        Any object with a method `toml`; checkpoints do not know the sections of a study.
-    resume, restart : bool
-        Whether to continue an unfinished run, or to discard it.
-    patience_s : float
-        See `PATIENCE_S`.
-    held : bool
-        Whether the caller has locked the folder.
+    The study may be any object with a method `toml`. An unfinished run is continued if `resume` is true, and discarded
+    if `restart` is. `held` states that the caller has locked the folder.
     """
 
     def __init__(

@@ -51,21 +51,12 @@ class _Attempt:
 
 @validated
 class DaskWorkers:
-    """Workers of a Dask cluster, each with its own engine.
+    """Workers of a Dask cluster, each with its own engine of a device that is named as for `Engine`.
 
-    Parameters
-    ----------
-    where : str
-        ``local:N`` for N processes of this machine; the address of a scheduler, such as ``tcp://host:8786``; or a
-        scheduler file.
-    device : str, optional
-        Device of each worker, as for `Engine`.
-
-    Raises
-    ------
-    DeviceError
-        If no scheduler or worker answers, a worker has other code of mauvecl, or has no such device. Shards of workers
-        with other code that join later are refused and counted again by others.
+    The cluster is ``local:N`` for N processes of this machine; the address of a scheduler, such as
+    ``tcp://host:8786``; or a scheduler file. Raises DeviceError if no scheduler or worker answers, a worker has other
+    code of mauvecl, or has no such device. Shards of workers with other code that join later are refused and counted
+    again by others.
     """
 
     first: Engine | None = None
@@ -109,12 +100,18 @@ class DaskWorkers:
 
     @property
     def count(self) -> int:
-        """Recent number of workers."""
+        """Recent number of workers; attempts whose workers have all left end, since Dask gives them to no others."""
         if time.monotonic() > self._counted[1] + RECOUNT_S:
             try:
-                self._counted = max(len(self._client.nthreads()), 1), time.monotonic()
+                present = self._client.nthreads()
             except OSError as error:
                 raise self._gone() from error
+            self._counted = max(len(present), 1), time.monotonic()
+            with self._lock:
+                sent = [key for key, it in self._sent.items() if it.workers and not present.keys() & it.workers]
+                left = [self._sent.pop(key) for key in sent]
+            for attempt in left:
+                attempt.awaited.set_exception(ShardLost("its workers have left", failed=False))
         return self._counted[0]
 
     def _gone(self) -> DeviceError:
@@ -162,26 +159,9 @@ class DaskWorkers:
             worker for worker, code in answers.items() if not isinstance(code, OSError) and code != code_identity()
         }
         with self._lock:
-            new, is_first = not strangers <= self._strangers, not self._strangers
+            new = not strangers <= self._strangers
             self._strangers |= strangers
-        if new and is_first:
-            threading.Thread(target=self._watch, name="mauvecl-strangers", daemon=True).start()
         return new
-
-    def _watch(self) -> None:
-        """Give up attempts whose workers have all left, since Dask gives their shards to no others."""
-        while True:
-            time.sleep(RECOUNT_S)
-            try:
-                present = set(self._client.nthreads())
-            except (OSError, RuntimeError, AttributeError):
-                # The client is closed or has lost the scheduler.
-                return
-            with self._lock:
-                sent = [key for key, it in self._sent.items() if it.workers and present.isdisjoint(it.workers)]
-                left = [self._sent.pop(key) for key in sent]
-            for attempt in left:
-                attempt.awaited.set_exception(ShardLost("its workers have left", failed=False))
 
     def _came(self, attempt: _Attempt, sent: DaskFuture[Any]) -> None:
         with self._lock:
@@ -190,11 +170,10 @@ class DaskWorkers:
                 return
         try:
             attempt.awaited.set_result(self._sums(attempt, sent))
-        except OSError as broken:
-            # The connection may break between the end of a shard and the transfer of its counts.
-            attempt.awaited.set_exception(self._gone().with_traceback(broken.__traceback__))
         except BaseException as error:
-            attempt.awaited.set_exception(error)
+            # The connection may break between the end of a shard and the transfer of its counts.
+            broken = self._gone().with_traceback(error.__traceback__)
+            attempt.awaited.set_exception(broken if isinstance(error, OSError) else error)
 
     def _sums(self, attempt: _Attempt, sent: DaskFuture[Any]) -> Arrays:
         """Return the counts of a task that has ended, or raise why there are none."""
@@ -233,8 +212,9 @@ class DaskWorkers:
         # Set the exception here, because neither Dask nor a cancelled future wakes concurrent.futures.wait.
         for attempt in sent.values():
             attempt.awaited.set_exception(Stopped())
-        with contextlib.suppress(OSError, RuntimeError, TimeoutError):
-            self._client.cancel(list(sent))
+        if sent:
+            with contextlib.suppress(OSError, RuntimeError, TimeoutError):
+                self._client.cancel(list(sent))
         # Kill workers of this machine, since completing a shard takes seconds.
         for nanny in getattr(self._client.cluster, "workers", {}).values():
             nanny.auto_restart = False
@@ -243,8 +223,8 @@ class DaskWorkers:
                     os.kill(nanny.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Disconnect from the workers; those of this machine end."""
-        self._closing = True
+        """Stop work in progress, and disconnect from the workers; those of this machine end."""
+        self.stop()
         self._given.clear()
         self._open.close()
 

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 MAX_FAILURES = 8
 #: Submitted shards per worker: one being counted and one waiting.
 SHARDS_PER_WORKER = 2
+#: Time after which the workers are counted again even if no shard is counted, s.
+LOOK_S = 5.0
 #: Items of `map_in_order` in progress beyond the number of workers, which are prepared while devices count others.
 PREPARED = 1
 
@@ -45,14 +47,9 @@ Answer = TypeVar("Answer")
 
 @validated
 class LocalWorkers:
-    """OpenCL devices of this machine, each used by one thread.
+    """OpenCL devices of this machine, named as for `Engine`, each used by one thread.
 
-    Parameters
-    ----------
-    devices : sequence of str or None
-        Devices as for `Engine`.
-    make : callable, optional
-        Factory of engines from a device and a progress callback, for tests.
+    `make` is a factory of engines from a device and a progress callback, for tests.
     """
 
     def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
@@ -135,16 +132,9 @@ class PoolProgress:
 class Pool:
     """Several workers with the interface of an `Engine`, which return bit-identical results.
 
-    Parameters
-    ----------
-    workers : LocalWorkers or DaskWorkers, optional
-        The default is the default device of this machine.
-    checkpoint : Checkpoint, optional
-        Checkpoint from which shards are read and to which they are written.
-    progress : callable, optional
-        Called as ``progress(done, total)`` in realisations of all known requests; may raise to stop the work.
-    meanwhile : callable, optional
-        Function called once in a separate thread as soon as the devices are busy.
+    Without `workers` it is the default device of this machine. Shards are read from the checkpoint and written to it.
+    ``progress(done, total)`` is called in realisations of all known requests, and may raise to stop the work.
+    `meanwhile` is called once in a separate thread as soon as the devices are busy.
     """
 
     def __init__(
@@ -264,7 +254,8 @@ class Pool:
                 waiting[self.workers.submit(task)] = task
             if not waiting:
                 return
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            # Workers that are counted again meanwhile may have left.
+            for future in wait(waiting, LOOK_S, FIRST_COMPLETED).done:
                 task = waiting.pop(future)
                 try:
                     counted = future.result()

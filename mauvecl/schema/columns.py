@@ -94,12 +94,14 @@ class View:
     columns: Sequence[Column] = ()
     table: Table | Sequence[Mapping[str, Any]] | None = None
 
-    def texts(self, hidden: Collection[str] = ()) -> tuple[list[str], list[list[str]]]:
-        """Return headings and cells, without `hidden` columns."""
+    def texts(self, hidden: Collection[str] = (), *, empty: bool = True) -> tuple[list[str], list[list[str]]]:
+        """Return headings and cells, without `hidden` columns and, unless `empty`, those whose cells are all empty."""
         shown = [column for column in self.columns if column.heading and column.name not in hidden]
         table = [] if self.table is None else self.table
         rows = table if isinstance(table, Sequence) else records(table)
-        return [column.heading for column in shown], [[column.text(record) for column in shown] for record in rows]
+        cells = [[column.text(record) for column in shown] for record in rows]
+        kept = [k for k in range(len(shown)) if empty or not cells or any(row[k] for row in cells)]
+        return [shown[k].heading for k in kept], [[row[k] for k in kept] for row in cells]
 
     @property
     def details(self) -> set[str]:
@@ -110,7 +112,7 @@ class View:
         title = f"<p>{escape(self.title)}</p>"
         if self.table is None:
             return title
-        headings, cells = without_empty(*self.texts(self.details))
+        headings, cells = self.texts(self.details, empty=False)
         rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in cells]
         head = "".join(f"<th>{escape(heading)}</th>" for heading in headings)
         return f"{title}<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
@@ -118,17 +120,11 @@ class View:
     def __str__(self) -> str:
         if self.table is None:
             return self.title
-        headings, cells = without_empty(*self.texts(self.details))
+        headings, cells = self.texts(self.details, empty=False)
         widths = [max(map(len, column)) for column in zip(headings, *cells, strict=True)]
         rows = [headings, ["-" * width for width in widths], *cells]
         lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
         return "\n".join([self.title, *(f"  {line}" for line in lines)])
-
-
-def without_empty(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and cells without columns whose cells are all empty."""
-    filled = [k for k in range(len(headings)) if not cells or any(row[k] for row in cells)]
-    return [headings[k] for k in filled], [[row[k] for k in filled] for row in cells]
 
 
 def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) -> QTable:
@@ -176,9 +172,7 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
     def taken(name: str) -> Column:
         having = [table[name] for table in tables if name in table.colnames]
-        (unit, *others) = dict.fromkeys(str(column.unit or "") for column in having)
-        if others:
-            raise ValueError(f"column {name} has several units")
+        (unit,) = {str(column.unit or "") for column in having}
         kind = np.result_type(*(column.dtype for column in having)).type
         text = having[0].info.description or ""
         return Column(name, lambda part: values(part, name), unit, text, kind=kind)
@@ -242,11 +236,6 @@ def with_error(value: float, error: float) -> str:
     digits = max(1 - math.floor(math.log10(error)), 0)
     # The sum makes -0 a 0.
     return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.{digits}f}"
-
-
-def short(value: float | str) -> str:
-    """Format a number or a name without its unit."""
-    return value if isinstance(value, str) else f"{value:g}"
 
 
 T = TypeVar("T")

@@ -8,6 +8,8 @@ from typing import Any
 
 #: How a message on one value begins, as `InputError.of` writes it: its place and its key, and what follows them.
 SUBJECT = re.compile(r"^(?P<place>[^:=]*: )?(?P<key>[a-z][\w. ]*?) (?P<verb>= |must be )")
+#: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
+REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
 
 
 class Message(str):
@@ -68,23 +70,13 @@ class InputError(ValueError):
     The message is one sentence that names the input, its value and what is accepted. It names parameters of functions
     and keys of studies, with remedies in backticks, as in ```extend``` or ```resume=True```; the command line writes
     flags in their place and exits with code 2.
-
-    Parameters
-    ----------
-    sentence : str
-        What is wrong, with the value and what is accepted.
-    key : str, optional
-        The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
-
-    Attributes
-    ----------
-    parts : tuple of InputError
-        The errors of which this one consists, if several values are wrong; its key is that of the first.
     """
 
     def __init__(self, sentence: str = "", *, key: str | None = None) -> None:
         super().__init__(sentence)
+        #: The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
         self.key = key
+        #: The errors of which this one consists, if several values are wrong; its key is that of the first.
         self.parts: tuple[InputError, ...] = ()
 
     def within(self, place: str) -> InputError:
@@ -95,10 +87,12 @@ class InputError(ValueError):
     def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:
         """Return the error of one value: ``where: key must be expected, not value unit``.
 
-        Words such as "flare amplitude" name the parameter `flare_amplitude`; the value is shown on one line, shortened.
+        Words such as "flare amplitude", and a flag, name the parameter `flare_amplitude`; the value is shown on one
+        line, shortened.
         """
         place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
-        return cls(f"{place}{key} must be {expected}, not {shown(value)}{after}", key=key.replace(" ", "_"))
+        parameter = re.sub("[ -]", "_", key.strip("-"))
+        return cls(f"{place}{key} must be {expected}, not {shown(value)}{after}", key=parameter)
 
 
 def missing_package(package: str, purpose: str, extra: str) -> InputError:

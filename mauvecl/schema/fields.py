@@ -25,21 +25,6 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
     from pydantic_core import CoreSchema
 
-#: Words for numbers in units in messages.
-WORDS = {
-    "": "a number",
-    "K": "a number in kelvin",
-    "deg_C": "a number in degrees Celsius",
-    "mag": "a number in magnitudes",
-    "mag / arcsec2": "a number in mag/arcsec2",
-    "s": "a number in seconds",
-    "h": "a number in hours",
-    "d": "a number in days",
-    "deg": "a number in degrees",
-    "1 / h": "a number per hour",
-    "1 / d": "a number per day",
-}
-
 
 def is_quantity(value: Any) -> bool:
     """Return whether a value is an astropy Quantity."""
@@ -100,12 +85,8 @@ def with_unit(text: str, unit: str) -> float | None:
     raise ValueError(text)
 
 
-def word_of(unit: str) -> str:
-    """Return the words for a number in a unit in a message."""
-    return WORDS.get(unit, f"a number in {unit}")
-
-
 Metadata = TypeVar("Metadata")
+Convert = Callable[[Any], Any]
 
 #: Units as people write them, where they differ from astropy's notation.
 WRITTEN = {
@@ -115,6 +96,11 @@ WRITTEN = {
     "solMass": "solar masses",
     "1 / (cm2 s)": "cm^-2 s^-1",
 }
+
+
+def word_of(unit: str) -> str:
+    """Return the words for a number in a unit in a message."""
+    return f"a number in {WRITTEN.get(unit, unit)}" if unit else "a number"
 
 
 @dataclass(frozen=True)
@@ -129,10 +115,7 @@ class Unit:
         return WRITTEN.get(self.name, self.name)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        from pydantic_core import core_schema
-
-        schema = core_schema.no_info_before_validator_function(self.plain, handler(source))
-        return or_error(schema, word_of(self.name), unit=self.name)
+        return or_error(handler(source), word_of(self.name), before=self.plain, unit=self.name)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return _or_text(handler(schema))
@@ -158,17 +141,12 @@ class Range:
     open_high: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        from pydantic_core import core_schema
-
         inner = handler(source)
         unit = (inner.get("metadata") or {}).get("unit", "")
-        schema: CoreSchema = core_schema.no_info_after_validator_function(self._check, inner)
-        if not unit:
-            # A number without a unit may be written in per cent.
-            schema = core_schema.no_info_before_validator_function(
-                lambda value: Unit("").plain(value) if isinstance(value, str) else value, schema
-            )
-        return or_error(schema, self.words(unit, whole=int in (source, *get_args(source))), unit=unit)
+        words = self.words(unit, whole=int in (source, *get_args(source)))
+        # A number without a unit may be written in per cent.
+        before = None if unit else lambda value: Unit("").plain(value) if isinstance(value, str) else value
+        return or_error(inner, words, before=before, after=self._check, unit=unit)
 
     def __contains__(self, value: Any) -> bool:
         if not math.isfinite(value) or not self.low <= value <= self.high:
@@ -253,19 +231,11 @@ class AnyUnit:
         return core_schema.no_info_wrap_validator_function(keep, handler(source))
 
 
-@dataclass(frozen=True)
-class OneOrMore:
-    """Sequence that may be given as a single item, such as one name or one expectation."""
+def OneOrMore(item: tuple[type, ...]) -> Any:  # noqa: N802
+    """Return the metadata of a sequence that may be given as a single item, such as one name or one expectation."""
+    from pydantic import BeforeValidator
 
-    item: tuple[type, ...]
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        from pydantic_core import core_schema
-
-        def listed(value: Any) -> Any:
-            return (value,) if isinstance(value, self.item) else value
-
-        return core_schema.no_info_before_validator_function(listed, handler(source))
+    return BeforeValidator(lambda value: (value,) if isinstance(value, item) else value)
 
 
 def says_none(value: Any) -> bool:
@@ -277,12 +247,10 @@ class OrNone:
     """Number that may be None, for which study files and flags write ``none``."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        from pydantic_core import core_schema
-
         inner = handler(source)
-        schema = core_schema.no_info_before_validator_function(lambda value: None if says_none(value) else value, inner)
         expected = str(inner.get("custom_error_message", "")).removeprefix("Input should be ")
-        return or_error(schema, f"{expected or 'a number'}, or none")
+        words = f"{expected or 'a number'}, or none"
+        return or_error(inner, words, before=lambda value: None if says_none(value) else value)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         inner = handler(schema)
@@ -299,10 +267,16 @@ def _or_text(schema: dict[str, Any]) -> dict[str, Any]:
     return schema | items | several
 
 
-def or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
-    """Replace every error of a schema by a statement of the accepted values."""
+def or_error(
+    schema: CoreSchema, words: str, *, before: Convert | None = None, after: Convert | None = None, **metadata: str
+) -> CoreSchema:
+    """Replace every error of a schema, and of functions of the value before and after it, by the accepted values."""
     from pydantic_core import core_schema
 
+    if after is not None:
+        schema = core_schema.no_info_after_validator_function(after, schema)
+    if before is not None:
+        schema = core_schema.no_info_before_validator_function(before, schema)
     return core_schema.custom_error_schema(
         schema, "expected", custom_error_message=f"Input should be {words}", metadata=metadata
     )
@@ -399,7 +373,7 @@ class Widget:
     @property
     def scale(self) -> float:
         """Factor from the value of the key to that of the page."""
-        return 100.0 if self.unit == "%" else 1.0
+        return 100.0 if self.unit == "%" else 1
 
 
 def found(kind: Any, of: type[Metadata]) -> list[Metadata]:
@@ -497,7 +471,7 @@ Seed = Annotated[int, Range(0, 2**64 - 1)]
 #: Seed where none is given.
 DEFAULT_SEED = 1
 #: Number of realisations, and that of the first of them.
-Realisations = Annotated[int, Range(1)]
+Realisations = Annotated[int, Range(1, 2**63 - 1)]
 FirstRealisation = Annotated[int, Range(0, 2**63 - 1)]
 Positive = Annotated[float, Range(0, open_low=True)]
 NotNegative = Annotated[float, Range(0)]

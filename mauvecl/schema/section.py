@@ -8,7 +8,7 @@ import difflib
 import math
 from collections.abc import Iterator, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, get_args
+from typing import Any, Self, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -26,29 +26,20 @@ from pydantic_core import PydanticCustomError
 from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown, together
 
-if TYPE_CHECKING:
-    from pydantic._internal._model_construction import ModelMetaclass
-else:
-    ModelMetaclass = type(BaseModel)
 
-
-class _InputErrorMeta(ModelMetaclass):
-    """Metaclass that raises InputError for invalid arguments.
-
-    Validation of a nested record does not pass `__call__`, so the outer record names the full path of the value.
-    """
-
-    def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
-        try:
-            return super().__call__(*args, **values)
-        except ValidationError as error:
-            raise input_error(cls.__name__, cast(type[BaseModel], cls), error) from None
-
-
-class Record(BaseModel, metaclass=_InputErrorMeta):
+class Record(BaseModel):
     """Frozen pydantic model that rejects unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def __init__(self, /, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise input_error(type(self).__name__, type(self), error) from None
+
+    # Nested records are not built by this method, so that the outer one names the full path of a wrong value.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @field_validator("*", mode="wrap")
     @classmethod
@@ -313,13 +304,6 @@ def check_different(names: Sequence[str], what: str, key: str) -> None:
 # Readers of values that are written as text, as on the command line; each receives the value's name for messages.
 
 
-def refusal(name: str, text: str, expected: str) -> InputError:
-    """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
-    error = InputError.of(name, text, expected)
-    error.key = name.strip("-").replace("-", "_")
-    return error
-
-
 def number_or_text(text: str) -> float | str:
     """Return the finite number that a text states, or the text itself, which may have a unit."""
     with contextlib.suppress(ValueError):
@@ -345,9 +329,9 @@ def read_axis(text: str, name: str) -> dict[str, Any]:
         quantity, start, stop, steps, *rest = text.split(":")
         spaced = {"start": number_or_text(start), "stop": number_or_text(stop), "steps": int(steps)}
     except ValueError as error:
-        raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
+        raise InputError.of(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
     if rest not in ([], ["log"]):
-        raise refusal(name, text, "quantity:start:stop:steps with :log or nothing at its end")
+        raise InputError.of(name, text, "quantity:start:stop:steps with :log or nothing at its end")
     return {"quantity": quantity, "log": bool(rest)} | spaced
 
 
@@ -355,7 +339,7 @@ def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
     """Read a name and its value, with an equals sign between them."""
     key, _, value = (part.strip() for part in text.rpartition("="))
     if not (key and value):
-        raise refusal(name, text, expected)
+        raise InputError.of(name, text, expected)
     return key, value
 
 
@@ -386,7 +370,7 @@ def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]
         measures = ((part, fields.with_unit(part, unit)) for part in text.split(":"))
         low, high = (float(part) if value is None else value for part, value in measures)
     except ValueError as error:
-        raise refusal(name, text, expected) from error
+        raise InputError.of(name, text, expected) from error
     return low, high
 
 
@@ -397,4 +381,4 @@ def read_frames(text: str, name: str) -> str | list[int]:
     try:
         return [int(word) for word in text.split(",")]
     except ValueError as error:
-        raise refusal(name, text, "stack, all, or numbers such as 0,4,9") from error
+        raise InputError.of(name, text, "stack, all, or numbers such as 0,4,9") from error

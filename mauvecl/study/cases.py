@@ -12,8 +12,9 @@ import numpy as np
 
 from mauvecl.noise.drawing import Cumulants, stack_is_exact
 from mauvecl.noise.unknowns import COURSES, PROCESSES, Processes, default_processes
-from mauvecl.schema.columns import Column, percent, short
+from mauvecl.schema.columns import Column, percent
 from mauvecl.schema.errors import InputError, Message, of_kind
+from mauvecl.schema.fields import as_typed
 from mauvecl.study.questions import QUANTITIES, Sweep
 from mauvecl.study.star import Star
 from mauvecl.study.stare import KNOWN_CHANGES, EventChoice, stare_of
@@ -143,7 +144,7 @@ def quantity_column(name: str, get: str | Callable[[Any], Any] = "", description
     """Return the column of a quantity, by default of its value `at` a cell of the sweep."""
     quantity, cell = QUANTITIES[name], Column("at")
     get = get or (lambda row: cell.value(row)[name])
-    return Column(name, get, quantity.unit, description or quantity.description, name, short)
+    return Column(name, get, quantity.unit, description or quantity.description, name, as_typed)
 
 
 def amplitude_column(get: str | Callable[[Any], Any] = "amplitude", description: str = "") -> Column:

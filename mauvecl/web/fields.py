@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from mauvecl.detection.requests import STATISTICS
 from mauvecl.host.instrument import FORMER_NAMES, FORMERLY_MAUVE
 from mauvecl.host.stars.library import ModelStar, embedded, named_star, near_names
 from mauvecl.host.tables.text_tables import columns, text_table
-from mauvecl.schema.errors import SUBJECT, InputError, shortened
+from mauvecl.schema.errors import REMEDY, SUBJECT, InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
     Help,
@@ -64,7 +63,7 @@ class Number:
     range: Range
     whole: bool = False
     unit: str = ""
-    scale: float = 1.0  # factor from the value in the unit to that of the page
+    scale: float = 1  # factor from the value in the unit to that of the page
 
     def __call__(self, text: str) -> float | int:
         """Parse the number; an error states what is accepted."""
@@ -143,20 +142,6 @@ def star_name(text: str) -> str:
         raise InputError("no star is chosen: give a name of the library, or upload a spectrum")
     named_star(text, own=False)
     return text.strip()
-
-
-def day(text: str) -> str:
-    """Parse a day such as 2027-01-31."""
-    from mauvecl.host.exposure.background import YEARS
-
-    remedy = f"give a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
-    try:
-        date = datetime.date.fromisoformat(text.strip())
-    except ValueError:
-        raise InputError(f"{shortened(text)} is not a day: {remedy}") from None
-    if not YEARS[0] <= date.year < YEARS[1]:
-        raise InputError(f"{date} is out of range: {remedy}")
-    return date.isoformat()
 
 
 def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
@@ -263,7 +248,7 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
 
 #: Readers of fields by the kind of their widget.
 READERS: dict[str, Callable[[str], Any]] = {
-    "day": day,
+    "day": str.strip,
     "table": neighbours,
     "library": lambda text: named_star(text, own=False).nearest if text.strip() else None,
     **dict.fromkeys(("file", "upload"), Choice(("", UPLOADED_FILE), lambda text: text or None)),
@@ -285,10 +270,8 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     reach = first(field, Range)
     if reach is None:
         return (lambda text: text.strip() or None) if optional else str
-    if widget.most is not None:
-        reach = replace(reach, high=widget.most)
-    if widget.scale != 1.0:
-        reach = replace(reach, low=widget.scale * reach.low, high=widget.scale * reach.high)
+    high = reach.high if widget.most is None else widget.most
+    reach = replace(reach, low=widget.scale * reach.low, high=widget.scale * high)
     number = Number(reach, whole=field.annotation is int, unit=unit, scale=widget.scale)
     return (lambda text: number(text) if text.strip() else None) if optional else number
 
@@ -386,8 +369,6 @@ PRESETS: dict[str, dict[str, str]] = {
 
 
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
-#: A remedy in a message, such as `magnitude=7.4`.
-_REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
 #: A flag of the command line.
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 #: A key within a message: words of prose hold no underscore.
@@ -424,12 +405,12 @@ def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
         return f"{label} {match['value']}" if match["value"] else f"“{label}”"
 
     text = _FLAG.sub(lambda match: f"“{FIELDS[name].label}”" if (name := field_of(match[0])) else match[0], text)
-    return _KEY.sub(lambda match: _label(match[0], keys), _REMEDY.sub(remedy, text))
+    return _KEY.sub(lambda match: _label(match[0], keys), REMEDY.sub(remedy, text))
 
 
 def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:
     """Return the values that a message proposes for fields, as pairs of field and text."""
-    each = _REMEDY.finditer(str(error))
+    each = REMEDY.finditer(str(error))
     named = ((field_of(keys.get(match["key"], match["key"])), match["value"]) for match in each)
     return [(name, value) for name, value in named if name is not None and value]
 

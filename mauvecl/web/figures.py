@@ -10,7 +10,7 @@ from bokeh import models
 from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.plotting import figure
 
-from mauvecl.charts.chart import Area, Bars, Contours, Custom, Dots, Line, Listed, Own, Rule, Strips, Targets
+from mauvecl.charts.chart import INK, Area, Bars, Contours, Custom, Dots, Line, Listed, Own, Rule, Strips, Targets
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars.flare import EmissionLine
 
@@ -26,14 +26,9 @@ MARKS["Balmer jump"] = (364.7,)
 MORE_MARKS = ("H alpha",)
 
 
-#: Colours of the light and the dark theme by name, after Okabe & Ito, lighter on dark ground.
+#: Colours of the light and the dark theme by name, lighter on dark ground.
 INKS = {
-    "light": {
-        "text": "#1b2733", "grid": "#dde3ea", "ground": "#ffffff", "star": "#0072B2", "flare": "#D55E00",
-        "sky": "#009E73", "drawn": "#6b7785", "dark": "#7b4ea3", "read": "#B8860B", "bias": "#A65082",
-        "total": "#1b2733", "threshold": "#1b2733", "own": "#C2185B", "shortest": "#E8801F", "middle": "#B34700",
-        "longest": "#5C2200",
-    },
+    "light": INK,
     "dark": {
         "text": "#e6ebf1", "grid": "#34404d", "ground": "#182029", "star": "#56B4E9", "flare": "#FF8C42",
         "sky": "#2fc79a", "drawn": "#9aa7b5", "dark": "#b99be0", "read": "#F0C040", "bias": "#E39BC9",

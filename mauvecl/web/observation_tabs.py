@@ -344,10 +344,10 @@ def hours(closed: ClosedForms, answers: Answers) -> ChartData:
     table = answers["visible"].by_day
     lines, parts = [], []
     for name in names:
-        hours = np.asarray(table[np.asarray(table["target"]) == name]["hours"].to_value("h"))
+        rows = table[np.asarray(table["target"]) == name]
+        hours = np.asarray(rows["hours"].to_value("h"))
         # Milliseconds, as browsers count time.
-        days = (np.datetime64(question.start, "ms") + np.arange(hours.size) * np.timedelta64(1, "D")).astype(float)
-        lines.append((name, days, hours))
+        lines.append((name, np.asarray(rows["day"], "datetime64[ms]").astype(float), hours))
         parts.append(
             f"{name} on {np.count_nonzero(hours)} of {hours.size} days, {short(float(hours.sum()))} h in all and "
             f"{hours.max():.3g} h on its best day"

@@ -21,7 +21,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from mauvecl.answers.files import write_table
 from mauvecl.answers.verbs import VERBS, Progress
-from mauvecl.schema.columns import View, without_empty
+from mauvecl.schema.columns import View
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, found
 from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
@@ -192,7 +192,7 @@ class Tab:
         if self.own_view is None and self.answer not in answers:
             return self.rows_before(closed.question)
         shown = answers[self.answer].views[self.view] if self.own_view is None else self.own_view(closed, answers)
-        headings, cells = without_empty(*shown.texts(FIXED))
+        headings, cells = shown.texts(FIXED, empty=False)
         return [headings, *cells] if headings else []
 
 

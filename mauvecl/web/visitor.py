@@ -54,10 +54,6 @@ _per_thread = threading.local()
 READER = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
 
 
-class Cancelled(Exception):  # noqa: N818
-    """Cancellation by the visitor."""
-
-
 #: Sets the exception that a thread raises at its next bytecode, or with None clears a pending one.
 _set_pending = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
@@ -106,10 +102,8 @@ class Job:
             self._started = time.monotonic()
             self._pool = Pool(LocalWorkers(make=_engine))
             if self._cancelled:
-                raise Cancelled
+                raise Stopped
             return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
-        except Stopped as error:
-            raise Cancelled from error
         finally:
             # A pending interruption would otherwise reach the next work of this thread.
             with self._lock:
@@ -126,7 +120,7 @@ class Job:
         """Cancel between tiles, outside of draws, or before the start."""
         with self._lock:
             if self._thread is not None and not self._cancelled:
-                _set_pending(ctypes.c_ulong(self._thread), ctypes.py_object(Cancelled))
+                _set_pending(ctypes.c_ulong(self._thread), ctypes.py_object(Stopped))
             self._cancelled = True
         # Work that waits for fits in other threads is not interrupted: fits end between two of their draws.
         if self._pool is not None:
@@ -413,7 +407,7 @@ class Visitor(WebSocketHandler):
                 self.send(n=n, progress=share, message=words)
             RESULTS.keep(self, "answers", key, done.result(), MOST_ANSWERS)
             self.send(n=n, ended=f"Done: {job.progress[1]}.", kind=kind)
-        except (Cancelled, CancelledError, asyncio.CancelledError):
+        except (Stopped, CancelledError, asyncio.CancelledError):
             self.send(n=n, ended="Cancelled.")
         finally:
             self.job = None

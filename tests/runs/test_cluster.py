@@ -280,7 +280,6 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
     with by_hand(tmp_path) as (_, file):
         workers = DaskWorkers(file)
         workers._strangers.add("tcp://127.0.0.1:1")
-        threading.Thread(target=workers._watch, daemon=True).start()
         pool = Pool(workers)
         (pid,) = workers._client.run(os.getpid).values()
         kill_after(pool, 5, lambda: os.kill(pid, signal.SIGKILL))
