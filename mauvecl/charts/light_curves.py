@@ -130,7 +130,7 @@ def light_curves(star: StarStare) -> Picture:
 
     def finish(axis: Any) -> None:
         label = {"label": "found flare"} if peaks else {}
-        axis.plot(peaks, [1.03] * len(peaks), "v", color=figures.INK["flare"], transform=axis.get_xaxis_transform(),
+        axis.plot(peaks, [1.03] * len(peaks), "v", color=chart.INK["flare"], transform=axis.get_xaxis_transform(),
                   markersize=4, clip_on=False, **label)  # fmt: skip
 
     for k, band in enumerate(light.bands):
@@ -202,7 +202,7 @@ def spectra_panel(
 
     def finish(axis: Any) -> None:
         for ends, colour in marks:
-            axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=figures.INK[colour], linewidth=3,
+            axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=chart.INK[colour], linewidth=3,
                       clip_on=False, solid_capstyle="butt")  # fmt: skip
 
     x = Axis(f"time from the start of the stare ({unit})", limits=(time[0], time[-1]))
