@@ -371,7 +371,8 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     for stars within the fibre a magnitude and a spectral type, spectrum file, temperature or Gaia colour, are in
     columns of any of the names in this module, in any case. Files of spectra are relative to the table. The target is
     the name of the row that is the target itself, which is left out, or coordinates such as "290.68 +11.12". Positions
-    are measured from it; it is needed if there are no separations.
+    are measured from it; it is needed if there are no separations. Raises InputError if the table has no separations
+    and no positions, or a cell is invalid.
     """
     # Only questions with such a table load the readers of files.
     from mauvecl.host.tables.opening import read_table

@@ -373,11 +373,13 @@ def expect(
 ) -> Expectation:
     """Compute the expectation of an exposure: means and noise per pixel, without drawing anything.
 
+    Raises InputError if the source does not cover the output range, or its flux has no absolute scale.
+
     Parameters
     ----------
     source : Source or str
-        A source, which must cover the output range and have an absolute scale, and emits no light beyond its
-        wavelengths, or a name of the library. A well-known star, such as AU Mic, has the V of the embedded list.
+        A source, which emits no light beyond its wavelengths, or a name of the library. A well-known star,
+        such as AU Mic, has the V magnitude of the embedded list.
     instrument : Instrument, str or Path, optional
         An instrument, or a name or file for `Instrument.load`; "mauve" by default.
     exposure : Quantity or float

@@ -64,7 +64,8 @@ class SpectralCurve:
     def read(cls, path: str | Path) -> SpectralCurve:
         """Read an ECSV table of two columns with units: wavelength, and the value (A/W, per cent or dimensionless).
 
-        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`.
+        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
+        is missing or is not such a table.
         """
         with _opened(path, "curve file") as (table, source):
             if "wavelength" not in table.columns or len(table.columns) != 2:
@@ -177,7 +178,8 @@ class PixelMap(ContentEquality):
     ) -> PixelMap:
         """Draw a map with assumed scatter, to test pipelines; it describes no real detector.
 
-        Response and dark have a log-normal scatter. `hot_share` of the pixels have a dark current of `hot_dark` times.
+        Response and dark have a relative scatter, log-normal. `hot_share` is the fraction of hot pixels, and `hot_dark`
+        the factor on their dark current.
         """
         generator = np.random.default_rng(seed)
         response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)

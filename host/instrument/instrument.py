@@ -336,7 +336,8 @@ class Instrument(Section):
     def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
 
-        This is the paper's efficiency times (1 - pointing_loss), at wavelengths within the curves (`curves_nm`).
+        This is the paper's efficiency times (1 - pointing_loss), in the shape of the wavelengths, a Quantity or numbers
+        in nm. Raises InputError outside the curves (`curves_nm`).
         """
         return self._optics(self._within(wavelength_nm, *self.curves_nm))
 
@@ -360,13 +361,16 @@ class Instrument(Section):
     def quantum_efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the electrons per photon that reaches the detector.
 
-        This is the sensitivity in A/W times the photon's energy divided by the electron's charge.
+        This is the sensitivity in A/W times the photon's energy divided by the electron's charge. Parameters and errors
+        as for `efficiency`.
         """
         nm = self._within(wavelength_nm, *self.curves_nm)
         return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
 
     def throughput(self, wavelength_nm: Wavelengths) -> Float:
         """Return the end-to-end throughput, electrons per photon, including the quantum efficiency.
+
+        Wavelengths and errors as for `efficiency`.
 
         Examples
         --------
@@ -379,13 +383,17 @@ class Instrument(Section):
         return self.efficiency(wavelength_nm) * self.quantum_efficiency(wavelength_nm)
 
     def effective_area_cm2(self, wavelength_nm: Wavelengths) -> Float:
-        """Return the effective area, cm^2: collecting area times throughput."""
+        """Return the effective area, cm^2: collecting area times throughput.
+
+        Wavelengths and errors as for `efficiency`.
+        """
         return self.collecting_area_cm2 * self.throughput(wavelength_nm)
 
     def electrons_per_joule_cm2(self, wavelength_nm: Wavelengths, *, held: bool = False) -> Float:
         """Return the electrons per fluence at the telescope, e- / (J cm^-2): area * efficiency * QE[A/W] / e.
 
-        If `held`, curves keep their end values beyond their ends (an assumption) instead of raising InputError.
+        Wavelengths and errors as for `efficiency`; if `held`, curves keep their end values beyond their ends (an
+        assumption) instead of raising InputError.
         """
         nm = self._within(wavelength_nm, *((0.0, np.inf) if held else self.curves_nm))
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C

@@ -37,6 +37,8 @@ def add(
     """Keep a spectrum from a file, as `Source.read` reads it, under a name: by default that in its header or its own.
 
     Reports state its `origin`, by default the file name. With `replace`, a kept star of the same name is replaced.
+    Raises InputError if the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be
+    written.
     """
     from astropy.table import Table
 
@@ -162,7 +164,8 @@ def fetch(
     """Download a star from a public collection and keep it, as `add` does.
 
     A name such as ``"HD 37202"`` is searched for in all collections, ``"ngsl:HD 37202"`` in one, of whose files `base`
-    may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end.
+    may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end. Raises
+    InputError if the network fails, the star is unknown, or its file holds no usable spectrum.
     """
     word, colon, star = (part.strip() for part in name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)

@@ -208,7 +208,10 @@ class EmissionLine:
 
     @classmethod
     def named(cls, name: str) -> Self:
-        """Return a line or group of lines by name, or a line at a wavelength of 100 to 1000 nm."""
+        """Return a line or group of lines by name, or a line at a wavelength in nm.
+
+        Raises InputError for an unknown name, or a wavelength outside 100 to 1000 nm.
+        """
         names, wanted = (*LINE_GROUPS, *LINES_NM), name.strip().casefold().replace("_", " ")
         if (known := next((one for one in names if wanted == one.casefold()), None)) is not None:
             return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
@@ -370,7 +373,8 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         """Read the spectrum of a star with its flare, and subtract its quiescent one, on the same scale, from it.
 
         Without `quiescent` the file has the flare alone. Formats are those of `Source.read`; the units override what
-        both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends.
+        both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends. Raises
+        InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
         """
         from mauvecl.host.stars.formats import read_spectrum
 

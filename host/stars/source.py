@@ -131,7 +131,8 @@ class Source(Drawable, ContentEquality):
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
         `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
-        180-750 nm are continued at their level. At least a third of 200-700 nm must be in the file.
+        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or holds no usable
+        spectrum, or less than a third of 200-700 nm.
 
         Parameters
         ----------
@@ -301,7 +302,10 @@ class Source(Drawable, ContentEquality):
         return points.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
     def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: points.System = "catalogue") -> Self:
-        """Return the star scaled to a `magnitude`, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1)."""
+        """Return the star scaled to a magnitude, -30 to 40: F 10**(-0.4 (m - m0)) (the paper's equation 1).
+
+        Band and system are those of `magnitude`.
+        """
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         history = (*self.history, f"scaled to {library.known_band(band)} = {magnitude:g}")
         flux, scale = self.flux_flam * factor, points.scale(band, system)
@@ -345,7 +349,8 @@ class Source(Drawable, ContentEquality):
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
         """Return the star reddened by dust of a colour excess E(B-V), 0 to 10 mag (needs the extra ``extinction``).
 
-        The law is one of dust_extinction, which must cover 180-750 nm, and `rv` is A_V / E(B-V).
+        The law is one of dust_extinction, and `rv` is A_V / E(B-V). Raises InputError if the law does not cover
+        180-750 nm, or the extra is missing.
         """
         try:
             from dust_extinction import parameter_averages

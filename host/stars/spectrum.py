@@ -57,7 +57,10 @@ def scale(name: str, system: System = "catalogue") -> str:
 
 @array_cache(256)
 def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: System = "catalogue") -> float:
-    """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in a band that it must cover, by name or alias."""
+    """Return the synthetic magnitude of a flux, erg s-1 cm-2 A-1, in the band of a name or alias.
+
+    Raises InputError if the spectrum does not cover the band or has no light in it.
+    """
     chosen = _covered(wavelength_nm, name)
     grid = np.union1d(wavelength_nm, chosen["wavelength"]) * 10.0
     star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
@@ -379,7 +382,8 @@ def extended(
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
 
-    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue.
+    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
+    InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
     """
     longer, nm, others = other
     messages = []

@@ -174,7 +174,10 @@ class DrawnStudies:
 
 
 def drawn(study: Study) -> DrawnStudies:
-    """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed."""
+    """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed.
+
+    Raises InputError if a prior includes values that the instrument cannot have, or nothing is unknown.
+    """
     from scipy.stats import qmc
 
     asked, o = study.unknowns, study.observation
@@ -209,7 +212,8 @@ def drawn(study: Study) -> DrawnStudies:
 def throughput_cases(case: Case) -> list[Case]:
     """Return the case with each mode of its calibration at one standard deviation; empty if it has none.
 
-    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range.
+    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range. Raises InputError if
+    the wavelengths are not known well enough for that.
     """
     moved, pixels = [], case.instrument.read_pixels
     for mode in (row for row in values_of(case.instrument).values() if row.mode is not None):
@@ -225,7 +229,8 @@ def throughput_cases(case: Case) -> list[Case]:
 def average(values: Float, low: Float, high: Float) -> tuple[Float, Float, Float]:
     """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
 
-    The arguments have the shape (n_draw, ...). For a Latin hypercube the interval is conservative.
+    The arguments have the shape (n_draw, ...). The interval assumes independent draws and is therefore conservative for
+    a Latin hypercube.
     """
     n, mean = len(values), values.mean(axis=0)
     spread = values.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else 0.0

@@ -51,12 +51,21 @@ class _Attempt:
 
 @validated
 class DaskWorkers:
-    """Workers of a Dask cluster, each with its own engine of a device that is named as for `Engine`.
+    """Workers of a Dask cluster, each with its own engine.
 
-    The cluster is ``local:N`` for N processes of this machine; the address of a scheduler, such as
-    ``tcp://host:8786``; or a scheduler file. Raises DeviceError if no scheduler or worker answers, a worker has other
-    code of mauvecl, or has no such device. Shards of workers with other code that join later are refused and counted
-    again by others.
+    Parameters
+    ----------
+    where : str
+        ``local:N`` for N processes of this machine; the address of a scheduler, such as ``tcp://host:8786``; or a
+        scheduler file.
+    device : str, optional
+        Device of each worker, as for `Engine`.
+
+    Raises
+    ------
+    DeviceError
+        If no scheduler or worker answers, a worker has other code of mauvecl, or has no such device. Shards of workers
+        with other code that join later are refused and counted again by others.
     """
 
     first: Engine | None = None

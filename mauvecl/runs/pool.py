@@ -47,9 +47,14 @@ Answer = TypeVar("Answer")
 
 @validated
 class LocalWorkers:
-    """OpenCL devices of this machine, named as for `Engine`, each used by one thread.
+    """OpenCL devices of this machine, each used by one thread.
 
-    `make` is a factory of engines from a device and a progress callback, for tests.
+    Parameters
+    ----------
+    devices : sequence of str or None
+        Devices as for `Engine`.
+    make : callable, optional
+        Factory of engines from a device and a progress callback, for tests.
     """
 
     def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
@@ -132,9 +137,16 @@ class PoolProgress:
 class Pool:
     """Several workers with the interface of an `Engine`, which return bit-identical results.
 
-    Without `workers` it is the default device of this machine. Shards are read from the checkpoint and written to it.
-    ``progress(done, total)`` is called in realisations of all known requests, and may raise to stop the work.
-    `meanwhile` is called once in a separate thread as soon as the devices are busy.
+    Parameters
+    ----------
+    workers : LocalWorkers or DaskWorkers, optional
+        The default is the default device of this machine.
+    checkpoint : Checkpoint, optional
+        Checkpoint from which shards are read and to which they are written.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in realisations of all known requests; may raise to stop the work.
+    meanwhile : callable, optional
+        Function called once in a separate thread as soon as the devices are busy.
     """
 
     def __init__(

@@ -70,6 +70,18 @@ class InputError(ValueError):
     The message is one sentence that names the input, its value and what is accepted. It names parameters of functions
     and keys of studies, with remedies in backticks, as in ```extend``` or ```resume=True```; the command line writes
     flags in their place and exits with code 2.
+
+    Parameters
+    ----------
+    sentence : str
+        What is wrong, with the value and what is accepted.
+    key : str, optional
+        The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
+
+    Attributes
+    ----------
+    parts : tuple of InputError
+        The errors of which this one consists, if several values are wrong; its key is that of the first.
     """
 
     def __init__(self, sentence: str = "", *, key: str | None = None) -> None:

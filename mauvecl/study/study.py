@@ -379,7 +379,15 @@ class Study(Section):
         return self.model_copy(update={"observation": o.model_copy(update=update)})
 
     def at(self, quantity: str, value: Annotated[float, AnyUnit()] | str) -> Self:
-        """Return a copy with another value of one of `QUANTITIES`, for all stars; that of "star" is its name."""
+        """Return a copy with another value of one quantity, for all stars.
+
+        Parameters
+        ----------
+        quantity : str
+            A key of `QUANTITIES`.
+        value : float, Quantity or str
+            For "star", a name of the library.
+        """
         if quantity not in QUANTITIES:
             raise InputError.of("quantity", quantity, f"one of {', '.join(QUANTITIES)}")
         swept = QUANTITIES[quantity]
