@@ -233,14 +233,14 @@ class Frames:
         if not (np.isfinite(wavelength).all() and (wavelength > 0).all()):
             raise InputError.of("wavelength", float(wavelength.min()), "wavelengths above 0 nm", where=self.name)
         finite = np.isfinite(self.flux) if self.error is None else np.isfinite(self.flux) & np.isfinite(self.error)
-        live = live_pixels(finite.sum(axis=0), self.n_frames, self.name)
+        live, remarks = live_pixels(finite.sum(axis=0), self.n_frames, self.name)
         order = np.argsort(wavelength, kind="stable")
         chosen = order[live[order]]
         if np.array_equal(chosen, np.arange(wavelength.size)):
             return self
         error = None if self.error is None else self.error[:, chosen]
         made = replace(self, flux=self.flux[:, chosen], error=error, wavelength_nm=wavelength[chosen])
-        return made.with_remarks(dead_pixel_remarks(int((~live).sum()), self.name))
+        return made.with_remarks(remarks)
 
     @property
     def white_light(self) -> tuple[Float, Float | None]:
@@ -318,18 +318,14 @@ class Frames:
         return str(Time(self.reference_mjd, time_s / DAY_S, format="mjd", scale=scale).isot)
 
 
-def live_pixels(finite: NDArray[np.int64], n_frames: int, name: str) -> NDArray[np.bool_]:
-    """Return the pixels that are finite in most frames, from the number of frames in which each of them is."""
+def live_pixels(finite: NDArray[np.int64], n_frames: int, name: str) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+    """Return the pixels that are finite in most frames, from the frames in which each of them is, and a remark."""
     live = finite > LIVE_SHARE * n_frames
     if not live.any():
         raise InputError(f"{name}: at least one pixel must be finite in most frames, but none is", key="flux")
-    return np.asarray(live)
-
-
-def dead_pixel_remarks(number: int, name: str) -> tuple[str, ...]:
-    """Return the remark on pixels that are left out; none for no pixel."""
+    number = int((~live).sum())
     words = "1 pixel is" if number == 1 else f"{number} pixels are"
-    return (f"{words} not finite in most frames of {name} and left out",) if number else ()
+    return live, (f"{words} not finite in most frames of {name} and left out",) if number else ()
 
 
 #: Speed of light, km/s (exact).

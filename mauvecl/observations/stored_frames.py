@@ -19,7 +19,7 @@ from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import MemoryTable, TableFile, Values
-from mauvecl.observations.frames import MAX_FRAMES, dead_pixel_remarks, live_pixels
+from mauvecl.observations.frames import MAX_FRAMES, live_pixels
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError, missing_package
 
@@ -283,14 +283,14 @@ def weighted_sums(
     if given.shape[1] != n_pixel or not np.isfinite(given).all():
         raise InputError.of("weights", given.shape, f"finite numbers of shape (n_weight, {n_pixel})", where=flux.what)
     statistics, finite = _statistics(flux, error, quality)
-    live = live_pixels(finite, n, flux.what)
+    live, remarks = live_pixels(finite, n, flux.what)
     sums = np.empty((n, len(given)))
     errors = None if error is None else np.empty_like(sums)
     for part in flux.pieces:
         sums[part] = _piece(flux, quality, part)[:, live] @ given[:, live].T
         if error is not None and errors is not None:
             errors[part] = np.sqrt(error.rows(part.start, part.stop)[:, live] ** 2 @ given[:, live].T ** 2)
-    flags, remarks = _flags(quality), dead_pixel_remarks(int((~live).sum()), flux.what)
+    flags = _flags(quality)
     each: Any = errors.T if errors is not None else [None] * len(given)
     return [(light, sd, flags, remarks) for light, sd in zip(sums.T, each, strict=True)], statistics
 

@@ -182,11 +182,8 @@ def smallest_change(
     rest = float(scipy.stats.chi2.isf(power, dof))
     if power <= fap:
         return Smallest(0.0, 0.0)
-    # The non-centrality grows the probability from fap to 1.
-    high = 1.0
-    while scipy.stats.ncx2.sf(cut, dof, high) < power:
-        high *= 2.0
-    centre = scipy.optimize.brentq(lambda value: scipy.stats.ncx2.sf(cut, dof, value) - power, 1e-12, high, xtol=1e-10)
+    # Non-centrality with which the test exceeds its threshold with this probability.
+    centre = scipy.special.chndtrinc(cut, dof, 1.0 - power)
     return Smallest(float(error * np.sqrt(centre * visits / dof)), float(error * np.sqrt(cut / rest - 1.0)))
 
 
