@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from mauvecl.charts import matplotlib as figures
-from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.chart import INK, Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
 from mauvecl.host.arrays import Float
 from mauvecl.schema.columns import First, part_note
@@ -130,7 +130,7 @@ def light_curves(star: StarStare) -> Picture:
 
     def finish(axis: Any) -> None:
         label = {"label": "found flare"} if peaks else {}
-        axis.plot(peaks, [1.03] * len(peaks), "v", color=figures.INK["flare"], transform=axis.get_xaxis_transform(),
+        axis.plot(peaks, [1.03] * len(peaks), "v", color=INK["flare"], transform=axis.get_xaxis_transform(),
                   markersize=4, clip_on=False, **label)  # fmt: skip
 
     for k, band in enumerate(light.bands):
@@ -207,7 +207,7 @@ def spectra_panel(
 
     def finish(axis: Any) -> None:
         for ends, colour in marks:
-            axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=figures.INK[colour], linewidth=3,
+            axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=INK[colour], linewidth=3,
                       clip_on=False, solid_capstyle="butt")  # fmt: skip
 
     x = Axis(f"time from the start of the stare ({unit})", limits=(time[0], time[-1]))
