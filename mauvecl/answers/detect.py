@@ -24,6 +24,7 @@ from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
 from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
@@ -406,6 +407,7 @@ class UnknownAnswer(Answer):
     )  # fmt: skip
 
 
+@validated
 def unknown_table(study: Study) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`.
 
