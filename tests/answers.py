@@ -43,7 +43,7 @@ def same(ours: Detection, theirs: Detection) -> None:
     for key, found in ours._distributions.items():
         other = theirs._distributions[key]
         np.testing.assert_array_equal(found.counts, other.counts)
-        assert (found.first, found.second, found.n) == (other.first, other.second, other.n)
+        assert (found.sums, found.n) == (other.sums, other.n)
         assert (found.numbers.tolist(), found.filled.tolist()) == (other.numbers.tolist(), other.filled.tolist())
         assert found.undefined == other.undefined
     for key, kept in ours._samples.items():

@@ -2,7 +2,7 @@
 
 Values outside the fine bins are counted in bins of equal relative width over all of float32. Such a bin is a range of
 the float's ordered integer representation (sign, exponent, leading bits of the mantissa), so no value lies beyond the
-last bin. Sums over the fine bins are exact integers.
+last bin. Sums of values and of their squares are exact integers.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +28,10 @@ DROPPED_BITS = 10
 FAR = 1 << (32 - DROPPED_BITS)
 #: Number in place of a bin's for infinite values and NaN; all numbers have `NUMBER_BITS`.
 UNDEFINED, NUMBER_BITS = -2 * FAR, 34 - DROPPED_BITS
+#: Sums of far values are integer multiples of 2**-UNIT_BITS, the smallest float32, and of its square.
+UNIT_BITS = 149
+#: Number of squares below 2**48 whose sum has no more than 63 bits.
+CHUNK = 2**14
 #: Range of numbers up to which an array counts them; wider ranges are sorted.
 MAX_DENSE = 2**16
 
@@ -132,6 +137,19 @@ def _far_edges(numbers: NDArray[np.int64]) -> Float:
     return np.where(np.isinf(edges), 2.0**128, edges)
 
 
+def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
+    """Return the exact sums of finite values and of their squares, in units of 2**-149 and 2**-298."""
+    # Values are whole multiples of 2**(power - 149), below 2**24 of them; subnormal numbers have the smallest power.
+    powers = np.maximum(np.frexp(values)[1] + (UNIT_BITS - 24), 0)
+    first = second = 0
+    for power in np.flatnonzero(np.bincount(powers)).tolist():
+        whole = np.ldexp(values[powers == power].astype(np.float64), UNIT_BITS - power).astype(np.int64)
+        first += int(whole.sum()) << power
+        for part in np.split(whole, range(CHUNK, whole.size, CHUNK)):
+            second += int(part @ part) << 2 * power
+    return first, second
+
+
 def grids_of(channel: Sequence[int], centre: Sequence[float], sigma: Sequence[float]) -> NDArray[np.void]:
     """Return the histograms of channels, `layout.GRID`, with bins scaled to a standard deviation, shape (n_grid,)."""
     grids = np.zeros(len(channel), layout.GRID)
@@ -160,15 +178,16 @@ class Tally:
         self.grids, self.tails = grids, tails or {}
         # Bins of each grid, of which few are filled.
         self.counts = RowCounts(NUMBER_BITS)
-        # Sums of steps in fine bins and of their squares; Python integers, since squares may exceed 64 bits.
-        self.sums = np.zeros((len(grids), 2), object)
+        # Sums of steps in fine bins and of their squares, and those of `sums_of` of the values in far bins; Python
+        # integers, since squares may exceed 64 bits.
+        self.sums = np.zeros((len(grids), 4), object)
         self.n = 0
 
     def add(self, histogram: NDArray[np.integer], sums: NDArray[np.integer], n: int) -> None:
         """Add the counts of n realisations in fine bins, (n_grid, BINS), and sums of their steps, and squares."""
         grid, inner = np.nonzero(histogram[:, FIRST_BIN : LAST_BIN + 1])
         self.counts.add(grid, FIRST_BIN + inner, histogram[grid, FIRST_BIN + inner])
-        self.sums += sums.astype(object)
+        self.sums[:, :2] += sums.astype(object)
         self.n += n
 
     def add_far(self, index: int, values: NDArray[np.float32]) -> int:
@@ -179,12 +198,13 @@ class Tally:
         above = steps >= HIGH_STEP
         # The complement counts NaN as below.
         outside = above | ~(steps >= LOW_STEP)
+        self.sums[index, 2:] += sums_of(values[outside & np.isfinite(values)])
         self.counts.count(index, far_numbers(values[outside], above[outside]))
         return int(outside.sum())
 
     def pack(self) -> Arrays:
         """Return the counts, sums and extremes of a shard as arrays."""
-        packed = self.counts.pack("counts") | {"sums": self.sums.astype(np.int64), "n": np.array(self.n)}
+        packed = self.counts.pack("counts") | {"sums": self.sums.astype(str), "n": np.array(self.n)}
         for index, tail in self.tails.items():
             packed[f"values-{index}"], packed[f"realisations-{index}"] = tail.values, tail.realisations
         return packed
@@ -192,24 +212,24 @@ class Tally:
     def merge(self, packed: Arrays) -> None:
         """Add a packed shard of other realisations."""
         self.counts.merge("counts", packed)
-        self.sums += packed["sums"].astype(object)
+        self.sums += np.array([[int(value) for value in row] for row in packed["sums"]], object)
         self.n += int(packed["n"])
         for index, tail in self.tails.items():
             tail.merge(packed[f"values-{index}"], packed[f"realisations-{index}"])
 
     def distribution(self, index: int) -> Distribution:
         """Return the distribution of a grid."""
-        grid, (first, second), (numbers, counts) = self.grids[index], self.sums[index], self.counts.of(index)
+        grid, (numbers, counts) = self.grids[index], self.counts.of(index)
         defined = numbers != UNDEFINED
         return Distribution(
             float(grid["centre"]), 1.0 / float(grid["steps_per_unit"]), numbers[defined], counts[defined],
-            int(first), int(second), self.n, int(counts[~defined].sum()),
+            tuple(self.sums[index].tolist()), self.n, int(counts[~defined].sum()),
         )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """A histogram of unlimited range, with moments that are exact within its fine bins.
+    """A histogram of unlimited range with exact integer moments.
 
     Fine bins are 1/512 of a standard deviation wide within 32 standard deviations of the centre; far bins are 2**-13 of
     the value wide beyond.
@@ -219,8 +239,7 @@ class Distribution:
     step: float  # size of a fine step
     numbers: NDArray[np.int64]  # of bins with counts, ascending; negative or above BINS for far ones, shape (m,)
     filled: NDArray[np.int64]  # counts in these bins, shape (m,)
-    first: int  # sum of the fine steps
-    second: int  # sum of their squares
+    sums: tuple[int, ...]  # as of `Tally`
     n: int  # number of realisations
     undefined: int  # number of infinite values and NaN
 
@@ -242,17 +261,17 @@ class Distribution:
         return int(self.filled[~self.is_fine].sum())
 
     @cached_property
-    def _moments(self) -> tuple[float, float]:
-        """Mean and variance of all values, those in far bins taken as in their middle."""
-        lower, upper, counts = self.bins
-        far = ~self.is_fine
-        values, weights, squares = (lower + upper)[far] / 2, counts[far], 0.0
+    def _moments(self) -> tuple[Fraction, Fraction]:
+        """Exact mean and variance of all values."""
+        self.refuse_undefined()
+        first, second, *far = self.sums
+        total, squares = Fraction(far[0], 2**UNIT_BITS), Fraction(far[1], 2 ** (2 * UNIT_BITS))
         if inside := self.n - self.n_far:
-            values = np.append(values, self.centre + self.step * (self.first / inside))
-            weights = np.append(weights, inside)
-            squares = self.step**2 * ((inside * self.second - self.first**2) / inside)
-        mean = float(weights @ values) / self.n
-        return mean, (squares + float(weights @ (values - mean) ** 2)) / self.n
+            centre, step = Fraction(self.centre), Fraction(self.step)
+            total += inside * centre + step * first
+            squares += inside * centre**2 + 2 * centre * step * first + step**2 * second
+        mean = total / self.n
+        return mean, squares / self.n - mean**2
 
     def refuse_undefined(self, what: str = "the statistic") -> None:
         """Raise InputError if values are not finite."""
@@ -264,7 +283,7 @@ class Distribution:
 
     @property
     def mean(self) -> float:
-        return self._moments[0]
+        return float(self._moments[0])
 
     @property
     def std(self) -> float:

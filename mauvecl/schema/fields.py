@@ -131,12 +131,6 @@ class Unit:
         return without_unit(value, self.name) if is_quantity(value) else value
 
 
-def _whole(end: float) -> str:
-    """Return an end of a range of whole numbers as text; ends of 53 bits and more are powers of 2."""
-    bits = int(end).bit_length() if math.isfinite(end) else 0
-    return f"2**{bits} - 1" if bits >= 53 else f"{end}"
-
-
 @dataclass(frozen=True)
 class Range:
     """Closed range of a finite number; `open_low` and `open_high` exclude an end."""
@@ -174,7 +168,7 @@ class Range:
     def words(self, unit: str = "", *, whole: bool = False) -> str:
         """Describe the accepted values, for error messages."""
         noun = "a whole number" if whole else "a number"
-        low, high = (_whole(end) if whole else f"{end:g}" for end in (self.low, self.high))
+        low, high = (str(end) if whole else f"{end:g}" for end in (self.low, self.high))
         has_low, has_high = math.isfinite(self.low), math.isfinite(self.high)
         after = f" {WRITTEN.get(unit, unit)}" if unit else ""
         if has_low and has_high and not (self.open_low or self.open_high):

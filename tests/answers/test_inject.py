@@ -8,7 +8,7 @@ from answers import of_kind
 from refusals import refused
 from scipy import stats
 
-from mauvecl import Study, inject
+from mauvecl import EnergyScale, Event, Source, Study, inject
 
 SMALL = {
     "star": [{"library": "G2V", "magnitude": 7.4, "distance_pc": 14.0}],
@@ -42,7 +42,8 @@ def test_tables_are_consistent(found):
     assert (limits["e50"] < limits["e90"]).all()
     assert (limits["e50_low"] <= limits["e50"]).all()
     # Size and amplitude are the same flare.
-    scale = star.sizes.per_unit
+    scale = EnergyScale.of_star(Source.from_library("G2V").at_magnitude(7.4), 14.0)
+    scale = Event(0.0, 1.0, 1.0, shape=study().search.shape).energy(scale)
     assert cells["amplitude"] * cells["half_width"].value * scale == pytest.approx(cells["size"].value, rel=1e-12)
     ratio = star.fitted["energy_ratio"][:, -1]
     assert ratio == pytest.approx(np.ones(3), abs=0.25)

@@ -384,7 +384,9 @@ def test_flare_in_a_stare_with_a_drifting_detector_has_its_time_and_duration(see
             assert "limits" not in answer.tables
             continue
         model = frame_model(Study.of(**star), frames)
-        all_light = float(model.flares((1e4,)).sum() / model.star.sum())
+        quiet = model.quiet
+        star_dn = quiet.n_frames * quiet.gain_dn_per_electron * quiet.source_electrons
+        all_light = float(model.flares((1e4,)).sum() / (model.bins @ star_dn * model.per_dn).sum())
         truth_s = all_light * drawn.events["equivalent_duration"][0].to_value("s")
         assert flare["ed_low_95"].to_value("s") < truth_s < flare["ed_high_95"].to_value("s")
         assert flare["ed_high_95"] < 1.3 * flare["ed_low_95"]
