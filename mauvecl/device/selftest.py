@@ -313,7 +313,7 @@ def histograms_of(counts: Counts) -> NDArray[np.int64]:
 
 def tally_of(distribution: Distribution) -> NDArray[np.int64]:
     """Return all counts and sums of a tally as one array."""
-    moments, far = np.array([distribution.first, distribution.second]), ~distribution.is_fine
+    moments, far = np.array(distribution.sums[:2]), ~distribution.is_fine
     keys, counts = distribution.numbers[far], distribution.filled[far]
     # The known answers number the bins below the fine ones without an offset.
     keys = np.where(keys < 0, keys + FAR, keys)
