@@ -289,10 +289,7 @@ def intervals(
                 known[alike] = [end / size for end in ends_of_sum(spline)]
             ends = size * known[alike][0], size * known[alike][1]
         else:
-            # The first fixed component over the blackbody.
-            factors, falls = np.zeros((2, len(model.linear), *x.shape))
-            factors[1], falls[0] = spline(x), -1.0
-            lowest, highest = _linear_ends(faces, factors, least, FactorAt(np.zeros(()), falls, 0.0))
+            lowest, highest = _ratio_ends(faces, spline(x), len(model.linear), least)
             ends = derived.offset + lowest, derived.offset + highest
         # Light that contradicts every factor above zero limits nothing.
         none = ends[0] > ends[1]
@@ -300,6 +297,13 @@ def intervals(
     lows, highs = (np.column_stack(side) for side in zip(*columns, strict=True))
     # A parabola through the outermost samples may exceed a bound.
     return np.maximum(lows, model.bounds) if profile.bounded else lows, highs
+
+
+def _ratio_ends(faces: list[Face], per: Float, n_linear: int, least: Float) -> tuple[Float, Float]:
+    """Return the ends of `per` times the ratio of the first fixed component to the blackbody."""
+    factors, falls = np.zeros((2, n_linear, *per.shape))
+    factors[1], falls[0] = per, -1.0
+    return _linear_ends(faces, factors, least, FactorAt(np.zeros(()), falls, 0.0))
 
 
 def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:

@@ -13,14 +13,21 @@ from numpy.typing import NDArray
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK
 from mauvecl.flares.shapes import shape_of
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.events import LONG_S, Kind, ObservedEvent, detect_events, measure_events, most_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import UNREPORTED, Steps
-from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey, SimulatedRate, innovations, simulated_rates
+from mauvecl.observations.search import (
+    NO_COLOUR_K,
+    DetectedEvent,
+    SeriesSurvey,
+    SimulatedRate,
+    innovations,
+    simulated_rates,
+)
 from mauvecl.observations.spectra import (
     CAUSES,
     EventSpectrum,
@@ -341,13 +348,10 @@ def analyse_frames(
     detected, taken = detect_events(survey, candidates, search_steps)
     seen = [None if series is None else event_spectrum(survey, series, taken, one) for one in detected]
     causes: list[Kind] = ["flare" if one is None else one.cause for one in seen]
-    events, fitted = measure_events(survey, taken, detected, causes, event_steps), list[Measurement | str]()
-    for event, one in zip(events, detected, strict=True):
-        if series is None:
-            fitted.append("no spectra of the instrument are given")
-        else:
-            reason = "" if event.kind == "flare" else f"its kind is {event.kind}"
-            fitted.append(reason or measure_flare(survey, series, taken, one))
+    events = measure_events(survey, taken, detected, causes, event_steps)
+    fitted = [
+        _fitted(survey, series, taken, event.kind, one) for event, one in zip(events, detected, strict=True)
+    ]  # fmt: skip
     quiet = ~taken
     residual = innovations(survey, quiet)
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
@@ -359,6 +363,15 @@ def analyse_frames(
         scatter=binned_scatter(numbers, residual @ middle), residual=residual, quiet=quiet,
         likeness=likeness(numbers, residual), spectra=series, found=seen, fitted=fitted,
     )  # fmt: skip
+
+
+def _fitted(
+    survey: SeriesSurvey, series: SpectralSeries | None, taken: Bool, kind: Kind, event: DetectedEvent
+) -> Measurement | str:
+    """Return the flare that is fitted to the spectrum of an event, or the reason why none is."""
+    if series is None:
+        return "no spectra of the instrument are given"
+    return measure_flare(survey, series, taken, event) if kind == "flare" else f"its kind is {kind}"
 
 
 def _thresholds(

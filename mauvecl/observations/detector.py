@@ -301,9 +301,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     bias, level = (nominal.per_pixel(*of) for of in (("bias_dn", nominal.bias_dn), ("dark", nominal.dark_dn_per_s)))
     covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)
     if not dark:
-        shared = np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0])
-        return DarkFit(nominal.temperature_c, level, bias, covariance, shared, nominal.dark_slope_per_c, change, error,
-                       ("dark current", "dark slope", "bias"))  # fmt: skip
+        return _assumed_dark(nominal, level, bias)
     raw = np.concatenate([one.raw_dn for one in dark])
     temperature = np.concatenate([one.temperature_c for one in dark])
     exposure = np.concatenate([np.full(one.n_frames, one.exposure_s) for one in dark])
@@ -316,8 +314,7 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     # The mean pixel gives what all pixels share: bias, slope, and their errors.
     free = np.array([fits_bias, True, fits_slope])
     common, shared, typical = _mean_dark(raw, exposure, offset, free, nominal, noise)
-    slope = float(common[2])
-    bias = np.full(n_pixel, common[0]) if shares_bias else bias
+    slope, bias = float(common[2]), np.full(n_pixel, common[0]) if shares_bias else bias
 
     # With the slope known, each pixel is linear in its level and bias.
     seconds = exposure * np.exp(slope * offset)
@@ -344,6 +341,17 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         slopes_p_value=float(scipy.stats.chi2.sf(np.sum((change / error) ** 2), n_pixel - 1)),
         assumed=(*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))),
     )
+
+
+def _assumed_dark(nominal: Instrument, level: Float, bias: Float) -> DarkFit:
+    """Return the instrument's dark current, with an assumed error of its level."""
+    shared = np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0])
+    unknown = np.full(level.size, np.nan)
+    return DarkFit(
+        nominal.temperature_c, level, bias, covariance=np.zeros((level.size, 2, 2)), shared=shared,
+        slope_per_c=nominal.dark_slope_per_c, pixel_slope_per_c=unknown, pixel_slope_error=unknown,
+        assumed=("dark current", "dark slope", "bias"),
+    )  # fmt: skip
 
 
 def _mean_dark(
