@@ -34,7 +34,9 @@ def found(stares) -> Any:
 
 def test_spectra_summed_over_frames_equal_exposures_of_the_engine(stares):
     # Frames of a stare have the addresses of an exposure's: the same draws, to the last DN.
-    study = SHORT.with_settings(["stare.gaps=[]", "stare.duration_s=50", "flare.amplitudes=[0]", "run.seed=5"])
+    near = Path(__file__).parents[1] / "data" / "studies" / "near.csv"
+    study = SHORT.with_settings(["stare.gaps=[]", "stare.duration_s=50", "flare.amplitudes=[0]", "run.seed=5",
+                                 f"star.0.neighbours='{near}'", "star.0.neighbour_share=0.5"])  # fmt: skip
     study = study.model_copy(update={"stare": study.stare.model_copy(update={"thermal": None, "number": 3})})
     one = stare(study, stares).stares[0]
     exposure, *_ = expectations(study.with_settings(["observation.exposure_s=50"]))
