@@ -83,6 +83,14 @@ MUTATIONS: dict[str, Mutation] = {
         "test_components_have_correct_sum_and_moments[mauve-apart]",
         ("counted) - source - sky - neighbours", "counted) - source - sky"),
     ),
+    "estimated variances of less light": (
+        "test_sampled_tail_agrees_with_brute_force[estimated from light]",
+        ('+ known["net_offset"] for one', '- known["net_offset"] for one'),
+    ),
+    "neighbours taken off the light of a stare": (
+        "test_spectra_summed_over_frames_equal_exposures_of_the_engine",
+        ("drawn + first[0] + first[1] + first[3]", "drawn + first[0] + first[1] - first[3]"),
+    ),
     "unknowns marginalised without their prior": (
         "test_cost_equals_that_of_the_methods[nuisances1-5.65-5.91-the dark level (+-0.003 deg C)]",
         ("np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),
