@@ -265,9 +265,9 @@ def light_curve_series(
     frames: Frames, answer: AnalyseAnswer | None = None, unit_s: float = 60.0, most: int | None = None, *,
     in_noise: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the data of `LIGHT_CURVE`, at most so many points of each series, without or with an analysis.
+    """Return the data of `LIGHT_CURVE`, with at most `most` points in each series.
 
-    The flux may be that above the level in units of the noise.
+    Only an analysis has events and a level. With `in_noise` the flux is that above the level, in units of the noise.
     """
     time, series = (frames.time_s - frames.time_s[0]) / unit_s, dict[str, Any]()
     flux, used = frames.white_light[0], frames.faults == 0

@@ -245,7 +245,7 @@ class Distribution:
 
     @property
     def is_fine(self) -> NDArray[np.bool_]:
-        """Whether each filled bin is a fine one."""
+        """Mask of the filled bins that are fine ones, shape (m,)."""
         return (self.numbers >= 0) & (self.numbers < layout.BINS)
 
     @property
