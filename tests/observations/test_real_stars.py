@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from marks import long_but
 from scenes import PER_CENTURY, PER_MONTH, analysed, detected, flare, noisy
 from scipy import stats
 from scipy.linalg import null_space
@@ -61,8 +62,8 @@ def test_covariance_is_that_of_dense_matrices() -> None:
 
 @pytest.mark.parametrize("taken", [False, True], ids=["at-once", "after-an-event"])
 @pytest.mark.parametrize(("process", "n", "spread", "tolerance", "apart"), [
-    (ROTATOR, 300, 0.05, 0.02, 0), (ROTATOR, 2500, 0.05, 0.02, 0), (LASTING, 2500, 0.0, 0.01, 0),
-    (ROTATOR, 1000, 0.05, 0.02, 5 * 10**7),
+    (ROTATOR, 300, 0.05, 0.02, 0), pytest.param(ROTATOR, 2500, 0.05, 0.02, 0, marks=pytest.mark.long),
+    (LASTING, 2500, 0.0, 0.01, 0), (ROTATOR, 1000, 0.05, 0.02, 5 * 10**7),
 ])  # fmt: skip
 def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
     process: processes.Process, n: int, spread: float, tolerance: float, apart: int, taken: bool
@@ -155,7 +156,10 @@ def test_probability_of_an_event_is_that_of_the_larger_rate() -> None:
     np.testing.assert_allclose(events["probability"], -np.expm1(-rates.max(axis=0) * analysis.days), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("peak_s", "half_width_s", "snr"), [(699.0, 338.0, 3800.0), (617.0, 307.0, 8500.0)])
+@pytest.mark.parametrize(
+    ("peak_s", "half_width_s", "snr"),
+    long_but([(699.0, 338.0, 3800.0), (617.0, 307.0, 8500.0)], (699.0, 338.0, 3800.0)),
+)
 def test_beginning_of_a_bright_flare_is_no_flare_of_its_own(peak_s: float, half_width_s: float, snr: float) -> None:
     """The window ends within a half-width after the peak, so that the best template is shorter than the flare."""
     time, noise = (np.arange(195) + 0.5) * 5.0, 5e-3
@@ -258,7 +262,7 @@ def test_files_that_once_failed_have_an_answer() -> None:
     assert np.isfinite([event.fitted_s, *event.low_s, *event.high_s]).all()
 
 
-@pytest.mark.parametrize("decay", [10, 20])
+@pytest.mark.parametrize("decay", long_but([10, 20], 10))
 def test_light_that_settles_after_a_gap_is_no_detected_flare(decay: int) -> None:
     """As Kepler's light after its safe mode of July 2009; a flare of the same light whose peak is seen is detected."""
     number = np.arange(700)

@@ -111,7 +111,8 @@ def test_bumps_of_every_orbit_are_no_flares() -> None:
     assert "detected" not in set(answer.events["verdict"])
 
 
-@pytest.mark.parametrize("seed", long_but([4, 5], 4))
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [4, 5])
 def test_flares_on_sharp_rotation_in_long_frames_are_detected(seed: int) -> None:
     """Find all bright of 16 flares and nothing else on three harmonics, where three frames of ten are flagged."""
     rng, frame_s, n, noise = np.random.default_rng([520, seed]), 1765.0, 500, 2e-4

@@ -284,7 +284,8 @@ async def test_curve_and_map_show_the_closed_form(talk: Talk, statistic: str) ->
             assert min(np.abs(level - one).max() for one in wanted) < 0.03
 
 
-@pytest.mark.parametrize("of", long_but(["amplitude", "magnitude"], "magnitude"))
+@pytest.mark.long
+@pytest.mark.parametrize("of", ["amplitude", "magnitude"])
 async def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(talk: Talk, of: str) -> None:
     asked = link(**M_DWARF, realisations="10000", fap="0.05", of=of)
     assert re.fullmatch(r"Done: 300 of 300 steps, \d+ s\.", await talk.simulate("limit", asked))
