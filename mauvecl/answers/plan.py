@@ -15,7 +15,7 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_co
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
+from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible_targets
 from mauvecl.device.stares import Stares
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
 from mauvecl.flares.settings import Curve
@@ -42,7 +42,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.search.completeness import DurationLaw
 
 
 def two_digits(value: float) -> str:
@@ -199,12 +198,11 @@ def rates_of(observation: TargetObservation) -> tuple[Rates | None, str]:
     return rates.of_light(erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
 
 
-def star_of(text: PlanTarget, simbad: bool) -> Star:
-    """Return the library star that represents a target.
+def star_of(text: PlanTarget, target: Target) -> Star:
+    """Return the library star that represents a target, which is looked up.
 
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """
-    target = text.target(simbad)
     given: dict[str, Any] = {name: getattr(target, name) for name in ("spectral_type", "magnitude", "distance_pc")}
     missing = [name for name, value in given.items() if value is None]
     if missing:
@@ -279,13 +277,16 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
     )  # fmt: skip
     stare, search = study.stare.model_copy(update=changes), study.search.model_copy(update={"nulls": 0})
     question = observation.case.with_sections(stare=stare, search=search, injections=injections).study
-    energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
+    energy_erg = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
 
     def computed() -> Arrays:
         star = inject(question, engine).stars[0]
-        widths = np.array(star.injected.half_widths_s)
-        found = found_by_energy(star.injected.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
-        return {"probability": found, "threshold": np.array(star.threshold.value), "shifted": np.array(star.shifted)}
+        probability = star.injected.by_energy(energy_erg, study.plan.law())
+        return {
+            "probability": probability,
+            "threshold": np.array(star.threshold.value),
+            "shifted": np.array(star.shifted),
+        }
 
     depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
     arrays = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
@@ -295,26 +296,7 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
         + (", allowing for unknowns that the search leaves in" if arrays["shifted"] else "")
     )
-    return Completeness(energy, arrays["probability"], BOLOMETRIC, how)
-
-
-def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
-    """Return the completeness by energy, averaged over the half-widths of an energy, shape (n_energy,).
-
-    `critical_erg` holds the smallest detected energy of each injection, shape (n_half_width, n_draw). It is zero if
-    there is an alarm without the flare; these injections are ignored, since false alarms are counted separately.
-    """
-    of_width = np.empty((half_widths_s.size, energy_erg.size))
-    for row, energies in zip(of_width, critical_erg, strict=True):
-        counted = np.sort(energies[energies > 0])
-        row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
-    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
-    half = np.log(law.half_width(energy_erg)[:, None] * 10 ** (law.scatter_dex * nodes))
-    place = np.interp(half, np.log(half_widths_s), np.arange(half_widths_s.size))
-    i = np.minimum(place.astype(int), half_widths_s.size - 2)
-    part, column = place - i, np.arange(energy_erg.size)[:, None]
-    p = (1 - part) * of_width[i, column] + part * of_width[i + 1, column]
-    return np.asarray(np.clip(p @ (weights / weights.sum()), 0.0, 1.0))
+    return Completeness(energy_erg, arrays["probability"], BOLOMETRIC, how)
 
 
 def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
@@ -576,11 +558,11 @@ def plan(
                 f"processes.{name} needs plan.completeness = 'injections', since 'closed form' takes the stare for "
                 "known", key=f"processes.{name}",
             )  # fmt: skip
-    stars: list[Star] = []
-    errors: list[InputError] = []
-    for text in study.plan.targets:
+    targets, stars, errors = list[Target](), list[Star](), list[InputError]()
+    for row in study.plan.targets:
         try:
-            stars.append(star_of(text, study.orbit.simbad))
+            targets.append(row.target(study.orbit.simbad))
+            stars.append(star_of(row, targets[-1]))
         except InputError as error:
             errors.append(error)
     if errors:
@@ -588,7 +570,7 @@ def plan(
         raise together(errors)
     if progress is not None:
         progress(0, len(stars))
-    seen, base, along = visible(study), Case(study), None
+    seen, base, along = visible_targets(study, targets), Case(study), None
     if study.plan.along_orbit:
         track = seen.visibility.track
         along = Thermal().temperature_c(track.sunlight, track.times.step_s), Particles().rate_per_cm2_s(track)

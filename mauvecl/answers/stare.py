@@ -33,8 +33,8 @@ from mauvecl.runs.checkpoint import Checkpoint, kept
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import DAY_S
+from mauvecl.search import false_alarms
 from mauvecl.search.alarms import Alarm, alarms
-from mauvecl.search.false_alarms import sampled_rate
 from mauvecl.study.cases import Case, cases, collect_messages, place_columns
 from mauvecl.study.questions import check_sweep
 from mauvecl.study.stare import orbit_lines, threshold_line
@@ -449,7 +449,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
         survey = replace(survey, components=staring.components(survey.templates.weights))
 
         def computed() -> Arrays:
-            tail = sampled_rate(survey, study.run.seed)
+            tail = false_alarms.sampled_rate(survey, study.run.seed)
             return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
 
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
@@ -298,9 +298,14 @@ def visible(study: Study, engine: Engine | Pool | None = None, progress: Progres
     >>> seen.months["month"].tolist()
     ['2027-01']
     """
-    o, targets = study.orbit, tuple(targets_of(study.orbit, study.plan))
-    directions = np.array([target.direction for target in targets])
-    answer = VisibleAnswer(study, targets, Visibility.of(o.orbit().track(o.times()), directions, o.limits))
+    targets = targets_of(study.orbit, study.plan)
+    answer = visible_targets(study, targets)
     if progress is not None:
         progress(len(targets), len(targets))
     return answer
+
+
+def visible_targets(study: Study, targets: Sequence[Target]) -> VisibleAnswer:
+    """Return when targets that are already looked up are visible."""
+    o, directions = study.orbit, np.array([target.direction for target in targets])
+    return VisibleAnswer(study, tuple(targets), Visibility.of(o.orbit().track(o.times()), directions, o.limits))
