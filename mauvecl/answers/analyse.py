@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -485,6 +485,10 @@ class AnalyseAnswer(Answer):
             f"candidates above {analysis.candidates:.2f}"
         )
         return [AnalyseAnswer.events.view(self, title), *super().views]
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        return self.report("analyse", self.study.data.report)
 
     @property
     def remarks(self) -> list[str]:

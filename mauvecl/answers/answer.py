@@ -287,8 +287,11 @@ class Answer(Drawable, ContentEquality):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Functions that make the content of documents, by full file name."""
-        documents: dict[str, Callable[[], bytes]] = import_module("mauvecl.charts.chart").made_of(self, document=True)
-        return documents
+        return {}
+
+    def report(self, name: str, form: str) -> dict[str, Callable[[], bytes]]:
+        """Return the document with the answer's report, which is "html" or "pdf"; pictures are imported for it."""
+        return {f"{name}.{form}": lambda: import_module("mauvecl.charts.campaigns").report(self, form)}
 
     @property
     def files(self) -> dict[str, Table]:

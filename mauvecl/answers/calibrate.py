@@ -393,8 +393,8 @@ class CalibrateAnswer(Answer):
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
-        """The instrument file, alone and with the tables that it names, in addition to those of every answer."""
-        return super().documents | {"instrument.toml": self.instrument_toml, "instrument.zip": self.instrument_zip}
+        """The instrument file, alone and with the tables that it names."""
+        return {"instrument.toml": self.instrument_toml, "instrument.zip": self.instrument_zip}
 
     def instrument_zip(self) -> bytes:
         """Return an archive of the instrument file and of the tables that it names."""

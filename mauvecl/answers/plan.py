@@ -476,6 +476,10 @@ class PlanAnswer(Answer):
         return [target.observation.case for target in self.planned]
 
     @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        return self.report("plan", self.study.plan.report)
+
+    @property
     def inputs(self) -> list[Expectation]:
         """One frame of each star."""
         return [target.observation.quiet for target in self.planned]

@@ -10,13 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Area, Axis, Dots, Line, Mesh, Panel, Picture, Rule, Series, pictures_of, register
+from mauvecl.charts.chart import Area, Axis, Dots, Line, Mesh, Panel, Picture, Rule, Series, pictures_of
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 
@@ -332,13 +331,7 @@ def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[Part]]:
     return title, parts + [Part(picture=draw, seen=name) for name, draw in pictures_of(answer).items()]
 
 
-# Each report as HTML and as PDF; the study chooses one of them, or none.
-for kind, name, report, chosen in (
-    ("PlanAnswer", "plan", plan_report, "study.plan.report"),
-    ("AnalyseAnswer", "analyse", analysis_report, "study.data.report"),
-):
-    for ending, write in (("html", html_bytes), ("pdf", pdf_bytes)):
-        register(
-            kind, f"{name}.{ending}", lambda answer, write=write, report=report: write(*report(answer)), document=True,
-            when=lambda answer, chosen=chosen, ending=ending: attrgetter(chosen)(answer) == ending,
-        )  # fmt: skip
+def report(answer: PlanAnswer | AnalyseAnswer, form: str) -> bytes:
+    """Return the report of an answer as "html" or "pdf"."""
+    title, parts = plan_report(answer) if hasattr(answer, "planned") else analysis_report(answer)
+    return (html_bytes if form == "html" else pdf_bytes)(title, parts)

@@ -11,21 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Area,
-    Axis,
-    Chart,
-    Dots,
-    Levels,
-    Line,
-    Mesh,
-    Panel,
-    Picture,
-    Rule,
-    Series,
-    Strips,
-)
+from mauvecl.charts import chart
+from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.requests import statistic_label
@@ -315,9 +302,9 @@ def detection_map(answer: MapAnswer) -> Picture:
     (x, y), (x_axis, y_axis) = places, axes
     contoured, row = bool(question.contours) and min(x.size, y.size) > 1, []
     for statistic, p in zip(answer.statistics, answer.probability, strict=True):
-        series: list[Series] = [Mesh("detection probability", at=(x, y, p))]
+        series: list[Series] = [chart.Mesh("detection probability", at=(x, y, p))]
         if contoured:
-            series.append(Levels("detected", levels=tuple(question.contours), at=(x, y, p)))
+            series.append(chart.Levels("detected", levels=tuple(question.contours), at=(x, y, p)))
         title = statistic_label(statistic).partition(" (")[0]
         row.append(Panel(x_axis, y_axis, series, title))
     names = {axis.quantity for axis in question.axes}

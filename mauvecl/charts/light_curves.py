@@ -14,7 +14,7 @@ from scipy.special import ndtri
 from mauvecl.charts import chart
 from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
+from mauvecl.charts.matplotlib import COLOURS, picture_of
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.events import GAP_FRAMES
 from mauvecl.schema.columns import First, part_note
@@ -22,7 +22,7 @@ from mauvecl.schema.columns import First, part_note
 if TYPE_CHECKING:
     from mauvecl.answers.analyse import AnalyseAnswer
     from mauvecl.answers.inject import InjectAnswer
-    from mauvecl.answers.stare import StareAnswer, StarStare
+    from mauvecl.answers.stare import StarStare
     from mauvecl.flares.stare import Stare
     from mauvecl.observations.frames import Frames
 
@@ -169,21 +169,6 @@ def with_gaps(at: NDArray[np.int64], after: NDArray[np.int64]) -> tuple[NDArray[
     ends = np.column_stack([at[after - 1], at[after]]).ravel()
     places = np.repeat(after, 2)
     return np.insert(at, places, ends), np.insert(np.zeros(at.size, np.bool_), places, True)
-
-
-@styled_picture
-def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Picture:
-    """Plot light curves of titled answers, a row per star and a column per answer; band 0 is the whole range."""
-    rows: list[list[Panel]] = [[] for _ in answers[0][1].stares]
-    for title, answer in answers:
-        for row, star in zip(rows, answer.stares, strict=True):
-            frames, mean = _stare_points(star, band)
-            series = [Dots("", "star", size=1.3, at=frames), Line("", width=1.1, at=mean)]
-            above = f"{title}\n" if row is rows[0] else ""
-            heading = f"{above}{star.title}, {star.light.bands[band]}"
-            unit = time_unit(star.staring.stare.duration_s)[1]
-            row.append(Panel(Axis(f"time ({unit})"), Axis("flux / quiescent"), series, heading))
-    return Picture(rows, (3.7 * len(answers), 1.5 * len(rows) + 0.8), share_x=True, share_y="row")
 
 
 @picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(star,) for star in answer.stares])
