@@ -9,7 +9,7 @@ from html import escape
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from mauvecl.answers.files import make_folder, write_document, write_table
 from mauvecl.host.arrays import ContentEquality
@@ -54,7 +54,7 @@ IF_KNOWN = "if everything but the noise were known"
 
 
 @dataclass(eq=False)
-class TableOf:
+class TableOf(cached_property["QTable"]):
     """A table that an answer declares once: its file, its printed view and its part of the JSON.
 
     It is an attribute of the answer, and made when it is read. What depends on the answer is given as a function of it.
@@ -75,23 +75,10 @@ class TableOf:
     # Metadata: paths of attributes of the answer, whose last names are the keys, or a function of the answer.
     about: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
+    def __post_init__(self) -> None:
+        super().__init__(self._table)
 
-    @overload
-    def __get__(self, answer: None, owner: type) -> TableOf: ...
-
-    @overload
-    def __get__(self, answer: Answer, owner: type) -> QTable: ...
-
-    def __get__(self, answer: Answer | None, owner: type) -> TableOf | QTable:
-        if answer is None:
-            return self
-        # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
-        vars(answer)[self.name] = table = self._made(answer)
-        return table
-
-    def _made(self, answer: Answer) -> QTable:
+    def _table(self, answer: Answer) -> QTable:
         rows: Any = _of_answer(self.rows, answer)
         if hasattr(rows, "colnames"):
             return rows
@@ -100,20 +87,20 @@ class TableOf:
         about = self.about(answer) if callable(self.about) else metadata_of(answer, *self.about)
         if self.of is None:
             return table_of(self.columns_of(answer), rows, **about)
-        parts = [(row, self.of(answer, row)) for row in rows]
-        names = {name for _, table in parts for name in table.colnames}
-        return stacked([column for column in self.columns_of(answer) if column.name not in names], parts, **about)
+        tables = [(row, self.of(answer, row)) for row in rows]
+        names = {name for _, table in tables for name in table.colnames}
+        return stacked([column for column in self.columns_of(answer) if column.name not in names], tables, **about)
 
     def columns_of(self, answer: Answer) -> tuple[Column, ...]:
         """Return the columns for an answer."""
-        every = self.columns(answer) if callable(self.columns) else self.columns
-        columns = tuple(column for column in every if column.when is None or column.when(answer))
+        declared = self.columns(answer) if callable(self.columns) else self.columns
+        columns = tuple(column for column in declared if column.when is None or column.when(answer))
         return answer.placed(columns) if self.place else columns
 
     def view(self, answer: Answer, title: str = "", table: Table | None = None) -> View:
         """Return the printed view for an answer, under another title or of other rows if they are given."""
         title = title or (self.title(answer) if callable(self.title) else self.title)
-        return View(title, self.columns_of(answer), self.shown(getattr(answer, self.name)) if table is None else table)
+        return View(title, self.columns_of(answer), self.shown(self.__get__(answer)) if table is None else table)
 
 
 def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
@@ -167,7 +154,7 @@ class Answer(Drawable, ContentEquality):
     @property
     def tables(self) -> dict[str, Table]:
         """All tables by file name."""
-        return {table.file: getattr(self, table.name) for table in self._declared() if table.file}
+        return {table.file: table.__get__(self) for table in self._declared() if table.file}
 
     @property
     def views(self) -> list[View]:
@@ -178,7 +165,7 @@ class Answer(Drawable, ContentEquality):
     @property
     def json_tables(self) -> dict[str, Table]:
         """Tables in JSON by key; "rows" is the first table unless others are declared."""
-        keyed = {table.key: getattr(self, table.name) for table in self._declared() if table.key}
+        keyed = {table.key: table.__get__(self) for table in self._declared() if table.key}
         return keyed or {"rows": next(iter(self.tables.values()))}
 
     @property
@@ -258,8 +245,8 @@ class Answer(Drawable, ContentEquality):
 
     def __str__(self) -> str:
         """Return what the command prints, without details."""
-        parts = [self.headline, *map(str, self.all_views), "Assumed:", *(f"  {clause}" for clause in self.premises)]
-        return "\n".join(part for part in (*parts, *self.messages, *self.remarks) if part)
+        lines = [self.headline, *map(str, self.all_views), "Assumed:", *(f"  {clause}" for clause in self.premises)]
+        return "\n".join(line for line in (*lines, *self.messages, *self.remarks) if line)
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(self.headline)}</p>{''.join(view._repr_html_() for view in self.all_views)}"
@@ -330,10 +317,10 @@ def reported(items: Iterable[Item], total: int, progress: Progress) -> Iterator[
     If that raises, a generator of items is closed at once, while the workers that it uses are still open.
     """
     try:
-        for done, item in enumerate(items, 1):
+        for number, item in enumerate(items, 1):
             yield item
             if progress is not None:
-                progress(done, total)
+                progress(number, total)
     finally:
         if isinstance(items, Generator):
             items.close()

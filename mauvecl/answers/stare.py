@@ -316,10 +316,10 @@ class StareAnswer(Answer):
         drawn = f"flare{'' if flares == 1 else 's'} in {frames} frames of {stare.title}"
         if np.isnan(stare.threshold):
             return f"The stare has {flares} {drawn}, which are not searched for{least}."
-        found = len({flare.event for flare in stare.found if flare.event})
+        number_found = len({flare.event for flare in stare.found if flare.event})
         false = sum(not flare.event for flare in stare.found)
         alarms = f"{false or 'no'} false alarm{'' if false == 1 else 's'}"
-        return f"The search finds {found} of {flares} {drawn} and raises {alarms}{least}."
+        return f"The search finds {number_found} of {flares} {drawn} and raises {alarms}{least}."
 
     @property
     def views(self) -> list[View]:
@@ -425,8 +425,8 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     staring = case.stare_expectation
 
     def draw(components: Any) -> Any:
-        what = components, staring.stare, 1, seed, staring.flare
-        request = StaresRequest(*what, start=q.number, method="pixels", processes=processes)
+        arguments = components, staring.stare, 1, seed, staring.flare
+        request = StaresRequest(*arguments, start=q.number, method="pixels", processes=processes)
         return kept(checkpoint, ("frames", request), lambda: stares.reduced(request))["values"][0]
 
     light = draw_light_curves(staring, q.bands_nm, draw)
@@ -436,8 +436,8 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     kelvin, flares = temperatures_of(case.events), list[StareFlare]()
     for event in case.events:
         band, bolometric = (case.energy(event, kind, kelvin) for kind in ("band", "bolometric"))
-        own = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
-        flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
+        of_flare = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
+        flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(of_flare)))
     return StarStare(case.label, case.at, staring, flares, light, lost, **searched)
 
 
@@ -458,8 +458,8 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
     threshold = float(tail["threshold"])
     scale = log_energy(case, survey.templates.temperatures_k)
     raised = alarms(survey, draw(survey.components), threshold, scale)
-    found = [_found_flare(case, alarm) for alarm in raised]
-    return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": found}
+    flares = [_found_flare(case, alarm) for alarm in raised]
+    return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": flares}
 
 
 def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
@@ -471,7 +471,7 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
     event = Event(*values, kelvin, case.study.search.shape)
     reach = 2 * case.stare_expectation.stare.frame_s
-    away = {k: abs(other.peak_s - event.peak_s) for k, other in enumerate(case.events, 1)}
+    away = {k: abs(injected.peak_s - event.peak_s) for k, injected in enumerate(case.events, 1)}
     nearest = min(away, key=lambda k: away[k], default=0)
     near = nearest > 0 and away[nearest] <= case.events[nearest - 1].half_width_s + reach
     return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest if near else 0)

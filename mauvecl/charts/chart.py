@@ -283,11 +283,15 @@ class Entry:
 ENTRIES: defaultdict[str, list[Entry]] = defaultdict(list)
 
 
+def load() -> None:
+    """Import all modules of pictures, so that they register their functions."""
+    for module in iter_modules([str(Path(__file__).parent)]):
+        import_module(f"{__package__}.{module.name}")
+
+
 def pictures_of(instance: Any) -> dict[str, Callable[..., Any]]:
     """Return every picture of an object by file name, numbered ones by number, as functions of `path` and `ax`."""
-    for module in iter_modules([str(Path(__file__).parent)]):
-        # Modules register their functions when they are imported.
-        import_module(f"{__package__}.{module.name}")
+    load()
     entries = next((ENTRIES[kind.__name__] for kind in type(instance).__mro__ if kind.__name__ in ENTRIES), [])
     numbered = list[tuple[int, str, Callable[..., Any]]]()
     for entry in filter(lambda entry: entry.when(instance), entries):

@@ -290,8 +290,8 @@ def light_curve_series(
         # In a gap the band has no width, since pages cannot interrupt an area.
         x, y, off = time[at], middle[at], np.where(is_gap, 0.0, off[at])
         series |= {"range": (x, y - off, y + off), "level": (x, np.where(is_gap, np.nan, y))}
-    for name, which in (("searched", used), ("left out", ~used & np.isfinite(flux))):
-        at = np.flatnonzero(which)
+    for name, chosen in (("searched", used), ("left out", ~used & np.isfinite(flux))):
+        at = np.flatnonzero(chosen)
         at = at[thinned(flux[at], most)]
         series[name] = time[at], flux[at]
     return series
@@ -311,7 +311,7 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     around = float(np.min((flux - error)[used])), float(np.max((flux + error)[used]))
     # Frames that are left out may be far off.
     reach = around[1] - around[0]
-    beside = [one for one in flux[~used & np.isfinite(flux)] if around[0] - reach < one < around[1] + reach]
+    beside = [value for value in flux[~used & np.isfinite(flux)] if around[0] - reach < value < around[1] + reach]
     shown = [(Axis(label, limits=(min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach)), False)]
     if ((flux - analysis.level.level) / error)[used].max() > BRIGHT:
         shown.append((Axis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2)), True))
@@ -349,9 +349,9 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     noise = spectra.noise
     nm, series = noise.wavelength_nm, list[Series]()
     series.append(Area("95 % of normal noise", at=(nm, noise.low / noise.stated, noise.high / noise.stated)))
-    for name, which, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
-        if which.any():
-            series.append(Dots(name, colour, size=4, at=(nm[which], (noise.measured / noise.stated)[which])))
+    for name, chosen, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
+        if chosen.any():
+            series.append(Dots(name, colour, size=4, at=(nm[chosen], (noise.measured / noise.stated)[chosen])))
     panel = Panel(Axis("wavelength (nm)"), Axis("measured / stated noise"), series)
     return Picture([[panel]], (4.6, 3.5), f"{answer.analysis.frames.name}: noise of quiescent frames", below=True)
 

@@ -153,10 +153,10 @@ def dark_current(answer: CalibrateAnswer) -> Picture:
         mean.append(Dots("" if number else "means of frames", "star", at=at))
     mean.append(Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))))
     mean.append(Line("nominal", dash="dashed", at=(kelvin, usual)))
-    left = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
-    right = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
+    pixel_panel = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
+    mean_panel = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
     title = f"Dark current: slope {with_error(d.slope_per_c, d.slope_error)} per °C"
-    return Picture([[left, right]], (7.2, 2.9), title)
+    return Picture([[pixel_panel, mean_panel]], (7.2, 2.9), title)
 
 
 #: Changes whose periods are drawn, at most.
@@ -172,8 +172,8 @@ def along_magnitude(answer: ChangeAnswer, scales: Mapping[str, float]) -> list[t
     lines = list[tuple[str, Any, Any]]()
     for name, unit in dict.fromkeys((row.change.name, row.change.unit) for row in answer.along):
         if unit in scales:
-            own = [row for row in answer.along if row.change.name == name][: MAGNITUDES.size]
-            x, y = np.array([(row.magnitude, row.smallest.one) for row in own]).T
+            changes = [row for row in answer.along if row.change.name == name][: MAGNITUDES.size]
+            x, y = np.array([(row.magnitude, row.smallest.one) for row in changes]).T
             lines.append((shown_name(name), x[np.isfinite(y)], scales[unit] * y[np.isfinite(y)]))
     return lines
 
@@ -190,14 +190,14 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     (title,), star, row = titles, answer.study.star[0], []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
-        here = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
+        rules = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
         values, limits = [value for _, _, column in lines for value in column], None
         if lines:
             # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
             limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
         y = Axis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
-        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [chart.Targets(at=lines), *here]))
+        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [chart.Targets(at=lines), *rules]))
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
     title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
     return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
@@ -263,8 +263,8 @@ def fits(answer: MeasureAnswer) -> Picture:
         sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (flare.frame - unknown, mean, variance)]
         # Resolution elements of which some pixels are not used are not shown.
         pixels = quiet.per_element(np.ones(used.size))
-        whole = quiet.per_element(used.astype(np.float64)) == pixels
-        data, fit, variance = (np.where(whole, values, np.nan) for values in sums)
+        complete = quiet.per_element(used.astype(np.float64)) == pixels
+        data, fit, variance = (np.where(complete, values, np.nan) for values in sums)
         nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
         x = Axis("wavelength (nm)")
         # Elements differ in their number of pixels, means hardly.

@@ -149,16 +149,16 @@ def test_stare_without_found_flares_has_a_layout_and_gaps() -> None:
 
 def test_level_of_observed_frames_is_not_drawn_in_long_gaps() -> None:
     """Two days are missing, where the level has no line and its range no width, and single frames, where it has."""
-    time, rng = np.arange(600) * 120.0, np.random.default_rng(1)
-    time = np.delete(np.where(time < 36_000, time, time + 172_800.0), [50, 51])
+    time, rng = np.arange(200) * 120.0, np.random.default_rng(1)
+    time = np.delete(np.where(time < 12_000, time, time + 172_800.0), [50, 51])
     frames = mauvecl.Frames.of(time, rng.normal(100.0, 1.0, time.size), np.ones(time.size), name="star")
     figure = mauvecl.analyse(Study().paper(), frames=frames).pictures["light-curve"]()
     (level,) = labelled(figure, "quiescent level")
-    assert np.flatnonzero(np.isnan(level)).tolist() == [298, 299]
+    assert np.flatnonzero(np.isnan(level)).tolist() == [98, 99]
     (area,) = (part for part in figure.axes[0].collections if part.get_label() == "95 % of the level")
     path, hours = area.get_paths()[0].vertices, (time - time[0]) / 3600
     # Both ends of the range and, once more, the level between them.
-    assert [np.unique(path[path[:, 0] == hour][:, 1]).size for hour in hours[296:300]] == [2, 3, 3, 2]
+    assert [np.unique(path[path[:, 0] == hour][:, 1]).size for hour in hours[96:100]] == [2, 3, 3, 2]
 
 
 def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:
