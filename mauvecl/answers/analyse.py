@@ -282,7 +282,7 @@ EVENTS = (
            "the event's spectrum if star, dark current and sky changed by any amount"),
     Column("kind", "event.kind", "", "flare, or what resembles one: step of the level, edge of a dip, change of "
            "throughput, dark current or sky, cosmic ray", "kind", kind=str, detail=True),
-    Column("note", "note", "", "what is special", kind=str),
+    Column("note", "note", "", "remarks on the event", kind=str),
 )  # fmt: skip
 #: Columns of the table of frames, one row for all frames of an analysis.
 FRAMES = (

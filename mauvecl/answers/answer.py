@@ -40,7 +40,7 @@ class InCell:
 
 
 def name_of_instrument(study: Study) -> str:
-    """Return the instrument as sentences name it."""
+    """Return the name of the instrument in sentences."""
     return "Mauve" if study.observation.instrument in shipped_names() else Path(study.observation.instrument).stem
 
 
@@ -57,7 +57,8 @@ IF_KNOWN = "if everything but the noise were known"
 class TableOf(cached_property["QTable"]):
     """A table that an answer declares once: its file, its printed view and its part of the JSON.
 
-    It is an attribute of the answer, and made when it is read. What depends on the answer is given as a function of it.
+    It is an attribute of the answer that is computed when it is first read. Functions of the answer replace values that
+    depend on it.
     """
 
     file: str  # name of the file without its ending; empty for a table that is only printed or part of the JSON
@@ -170,7 +171,7 @@ class Answer(Drawable, ContentEquality):
 
     @property
     def instrument_name(self) -> str:
-        """The instrument as sentences name it."""
+        """Name of the instrument in sentences."""
         return name_of_instrument(self.study)
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:

@@ -195,7 +195,7 @@ class ChangeAnswer(Answer):
 
     @property
     def visits(self) -> str:
-        """Number and exposure of the visits, as sentences say them."""
+        """Number and exposure of the visits, in words."""
         visits = self.study.change.visits
         return f"{'two' if visits == 2 else visits} visits of {self.study.observation.exposure_s:g} s"
 

@@ -334,7 +334,7 @@ PAPER_G2V = {0.24: (6159.88, 3.75), 0.081: (1078.36, 0.66)}
 WHY = (
     "The paper's values are no calibrated chi-squared: with 1643 points a reduced value scatters by 0.035 about one, "
     "so 0.66 lies ten standard deviations below. Divided by the smoothed flare spectrum in DN/s instead of the noise's "
-    "variance they are reproduced; what such a number means, only its simulated null can tell (`statistic='paper'`)."
+    "variance they are reproduced; only its simulated null tells what such a number means (`statistic='paper'`)."
 )
 
 

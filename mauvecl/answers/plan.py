@@ -199,7 +199,7 @@ def rates_of(observation: TargetObservation) -> tuple[Rates | None, str]:
 
 
 def star_of(row: PlanTarget, target: Target) -> Star:
-    """Return the library star that represents a target, which is looked up.
+    """Return the library star that represents a target of a plan, which has been looked up.
 
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """
@@ -312,7 +312,7 @@ def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
     Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f", detail=True),
-    Column("hours", "", "h", "of it observed", "observed (h)", ".0f"),
+    Column("hours", "", "h", "part of it that is observed", "observed (h)", ".0f"),
     Column("E50", lambda row: row.energy_at(0.5), "erg",
            "bolometric energy from which on half of the flares are recovered", "E50 (erg)", energy),
     Column("E90", lambda row: row.energy_at(0.9), "erg",
@@ -327,12 +327,12 @@ COLUMNS = (
                       lambda low, high: "" if low is None else f"{low} to {high}", kind=int),
     Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f"), detail=True),
-    Column("false_alarms", lambda row: row.observation.case.study.search.rate * row.hours / 24, "", "expected of noise",
-           "false alarms", two_digits, detail=True),
+    Column("false_alarms", lambda row: row.observation.case.study.search.rate * row.hours / 24, "",
+           "expected from noise", "false alarms", two_digits, detail=True),
     share_column("observation.quiet.target_share"),
     _throughput_column("E50_error", 0, "E50", "E50 by throughput"),
     _throughput_column("expected_error", 1, "the recovered flares", "flares by throughput"),
-    Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months",
+    Column("best_months", lambda row: " ".join(row.best_months), "", "months with the most hours", "best months",
            months, detail=True),
 )  # fmt: skip
 #: Columns of the table of inputs.
@@ -340,7 +340,7 @@ STAR_COLUMNS = (
     Column("target", "name", "", "name of the target"),
     Column("ra", "observation.target.ra_deg", "deg", "right ascension"),
     Column("dec", "observation.target.dec_deg", "deg", "declination"),
-    Column("position", "observation.target.source", "", "who says so"),
+    Column("position", "observation.target.source", "", "source of the position"),
     Column("spectral_type", lambda row: row.observation.target.spectral_type or ""),
     Column("spectrum", lambda row: row.observation.case.star.library or "", "",
            "embedded spectrum that stands for the star"),
@@ -359,7 +359,7 @@ STAR_COLUMNS = (
     Column("saturated", lambda row: int(row.observation.quiet.saturated.sum()), "",
            "pixels left out since they saturate"),
     Column("rates", lambda row: row.no_rates if row.rates is None else row.rates.source, "",
-           "where its flare rates are from, or why there are none"),
+           "source of its flare rates, or the reason why there are none"),
     Column("recovered_per_day",
            lambda row: np.nan if row.rates is None or row.completeness is None
            else recovered_per_day(row.rates, row.completeness), "", "flares recovered in a day of exposure"),
@@ -438,7 +438,7 @@ class PlanAnswer(Answer):
             ("duration of flares", half_width, "assumption; exponent of Maehara et al. 2015"),
             ("shape of flares", study.search.shape, "every flare alike, no bursts"),
             ("light of flares", light,
-             "assumption; energies are those of all its light, spread alike in all directions"),
+             "assumption; energies are those of all its light, emitted equally in all directions"),
             ("noise of a stare", "white", "in addition to the study's unknowns of a stare; see completeness"),
             *self._along_orbit,
             ("false alarms", alarms, "sets the threshold; of noise, not of hits by particles that look like flares"),

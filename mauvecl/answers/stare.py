@@ -185,7 +185,7 @@ COLUMNS = (
            "median net light of a frame, sky included, without bias and dark", "light (DN/s)", ".4g"),
     Column("frame_noise", lambda row: float(np.median(row.light.sd[:, 0] / row.light.mean[:, 0])), "",
            "standard deviation of a frame's own noise, relative to its light", "noise of a frame", percent(".3g")),
-    Column("flares", lambda row: len(row.flares), "", "flares put into it"),
+    Column("flares", lambda row: len(row.flares), "", "flares that it contains"),
     Column("threshold", "", "", "value of the search's statistic from which on it alarms",
            when=lambda answer: answer.study.stare.search),
     Column("found", lambda row: -1 if np.isnan(row.threshold) else len(row.found), "",
@@ -207,7 +207,7 @@ EVENT_COLUMNS = (
     Column("equivalent_duration", "event.equivalent_duration_s", "s", "in the flare's band", "ED (s)", ".4g"),
     Column("energy_band", "band_erg", "erg", "in the flare's band; nan: star of unknown size"),
     Column("energy_bolometric", "bolometric_erg", "erg", "of all of its light", "bolometric (erg)", number(".3g")),
-    Column("snr", "snr", "", "of one who knows all but whether the flare is there", "S/N", ".3g"),
+    Column("snr", "snr", "", "if everything but the presence of the flare is known", "S/N", ".3g"),
     Column("shape", "event.form.name", kind=str),
 )  # fmt: skip
 
@@ -249,7 +249,7 @@ FOUND_COLUMNS = (
     Column("dof", "alarm.dof", "", "degrees of freedom of this fit", kind=int),
     Column("p_value", "alarm.p_value", "", "probability of a chi-squared at least as large where the model is right"),
     Column("note", "alarm.note", "",
-           "what is special: a flare that is not measured, an interval that ends where the fit does", kind=str),
+           "remarks: a flare that is not measured, an interval that ends where the fit does", kind=str),
 )  # fmt: skip
 #: Columns of a light curve for every frame; those of the light follow for each band.
 FRAME_COLUMNS = (
@@ -293,8 +293,8 @@ class StareAnswer(Answer):
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
-        place=True, title="Flares in them; S/N of one who knows all but whether the flare is there", key="events",
-        about=SEED,
+        place=True, title="Flares in them; S/N if everything but the presence of the flare is known",
+        key="events", about=SEED,
     )  # fmt: skip
     #: One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
     #: Values are NaN where the fit does not measure the flare: `note` says why.

@@ -97,7 +97,7 @@ WINDOW_COLUMNS = (
     Column("start", description="UTC", kind=str),
     Column("stop", description="UTC", kind=str),
     Column("length", "", "min"),
-    Column("in_shadow", "", "min", "of it, in the Earth's shadow"),
+    Column("in_shadow", "", "min", "part of it in the Earth's shadow"),
     Column("orbit", description="ascending nodes since the start of the plan", kind=int),
 )
 

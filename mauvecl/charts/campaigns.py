@@ -289,7 +289,7 @@ LEGEND = (
     "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
     "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
     "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
-    "P(>= 1): probability of recovering any. False alarms: expected of noise. Numbers are those of plan.ecsv."
+    "P(>= 1): probability of recovering any. False alarms: expected from noise. Numbers are those of plan.ecsv."
 )
 
 
