@@ -9,7 +9,7 @@ from html import escape
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, overload
 
 from mauvecl.answers.files import make_folder, write_document, write_table
 from mauvecl.host.arrays import ContentEquality
@@ -54,7 +54,7 @@ IF_KNOWN = "if everything but the noise were known"
 
 
 @dataclass(eq=False)
-class TableOf(cached_property["QTable"]):
+class TableOf:
     """A table that an answer declares once: its file, its printed view and its part of the JSON.
 
     It is an attribute of the answer that is computed when it is first read. Functions of the answer replace values that
@@ -76,8 +76,21 @@ class TableOf(cached_property["QTable"]):
     # Metadata: paths of attributes of the answer, whose last names are the keys, or a function of the answer.
     about: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
 
-    def __post_init__(self) -> None:
-        super().__init__(self._table)
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, answer: None, owner: type) -> TableOf: ...
+
+    @overload
+    def __get__(self, answer: Answer, owner: type) -> QTable: ...
+
+    def __get__(self, answer: Answer | None, owner: type) -> TableOf | QTable:
+        if answer is None:
+            return self
+        # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
+        vars(answer)[self.name] = table = self._table(answer)
+        return table
 
     def _table(self, answer: Answer) -> QTable:
         rows: Any = _of_answer(self.rows, answer)
@@ -101,7 +114,7 @@ class TableOf(cached_property["QTable"]):
     def view(self, answer: Answer, title: str = "", table: Table | None = None) -> View:
         """Return the printed view for an answer, under another title or of other rows if they are given."""
         title = title or (self.title(answer) if callable(self.title) else self.title)
-        return View(title, self.columns_of(answer), self.shown(self.__get__(answer)) if table is None else table)
+        return View(title, self.columns_of(answer), self.shown(getattr(answer, self.name)) if table is None else table)
 
 
 def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
@@ -155,7 +168,7 @@ class Answer(Drawable, ContentEquality):
     @property
     def tables(self) -> dict[str, Table]:
         """All tables by file name."""
-        return {table.file: table.__get__(self) for table in self._declared() if table.file}
+        return {table.file: getattr(self, table.name) for table in self._declared() if table.file}
 
     @property
     def views(self) -> list[View]:
@@ -166,7 +179,7 @@ class Answer(Drawable, ContentEquality):
     @property
     def json_tables(self) -> dict[str, Table]:
         """Tables in JSON by key; "rows" is the first table unless others are declared."""
-        keyed = {table.key: table.__get__(self) for table in self._declared() if table.key}
+        keyed = {table.key: getattr(self, table.name) for table in self._declared() if table.key}
         return keyed or {"rows": next(iter(self.tables.values()))}
 
     @property
