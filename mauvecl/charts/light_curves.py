@@ -140,7 +140,7 @@ def light_curves(star: StarStare) -> Picture:
             Line("star and flares alone", "text", width=1.1, at=mean),
         ]
         x, y = Axis(f"time from the start of the stare ({unit})"), Axis("flux / quiescent")
-        # The layout of a figure fails for markers that are drawn outside the axes but have no place.
+        # Markers outside the axes that have no place would make matplotlib give up the layout of the figure.
         rows.append([Panel(x, y, series, band, finish if peaks else None)])
     title = f"{star.title}: one simulated stare; nominal throughput"
     return Picture(rows, (7.2, 1.5 * len(rows) + 0.9), title, below=True, share_x=True)
@@ -157,11 +157,11 @@ def _stare_points(star: StarStare, band: int) -> tuple[tuple[Float, Float], tupl
     columns = stare.middle_s, light.flux[:, band], light.mean[:, band]
     time, flux, mean = (np.add.reduceat(values, starts) / counts for values in columns)
     time, level = time / time_unit(stare.duration_s)[0], np.median(light.mean[:, band])
-    at, is_gap = with_gaps(np.arange(starts.size), np.searchsorted(starts, [run[0] for run in runs[1:]]))
+    at, is_gap = _with_gaps(np.arange(starts.size), np.searchsorted(starts, [run[0] for run in runs[1:]]))
     return (time, flux / level), (time[at], np.where(is_gap, np.nan, mean[at] / level))
 
 
-def with_gaps(at: NDArray[np.int64], after: NDArray[np.int64]) -> tuple[NDArray[np.int64], Bool]:
+def _with_gaps(at: NDArray[np.int64], after: NDArray[np.int64]) -> tuple[NDArray[np.int64], Bool]:
     """Return indices of points with both ends of each gap once more, and whether each of them is such an end.
 
     Gaps precede the indices at the places `after`.
@@ -286,7 +286,7 @@ def light_curve_series(
         long_s = max(GAP_FRAMES * frames.cadence_s, LONG_GAP * float(np.ptp(frames.time_s)))
         stretch = np.cumsum(np.diff(frames.time_s, prepend=frames.time_s[0]) > long_s)
         at = thinned(middle, most)
-        at, is_gap = with_gaps(at, np.flatnonzero(np.diff(stretch[at])) + 1)
+        at, is_gap = _with_gaps(at, np.flatnonzero(np.diff(stretch[at])) + 1)
         # In a gap the band has no width, since pages cannot interrupt an area.
         x, y, off = time[at], middle[at], np.where(is_gap, 0.0, off[at])
         series |= {"range": (x, y - off, y + off), "level": (x, np.where(is_gap, np.nan, y))}

@@ -98,8 +98,10 @@ def _subfigure_of(ax: Any) -> Any:
     return ax.figure.add_subfigure(spec)
 
 
-def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
-    """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
+def _legend_below(figure: Any, axes: Sequence[Any]) -> None:
+    """Add a legend of axes below all panels, in as few rows as fit, which have about equally many entries."""
+    entries = (zip(*axis.get_legend_handles_labels(), strict=True) for axis in axes)
+    handles = {name: handle for of_axis in entries for handle, name in of_axis}
     for rows in range(1, len(handles) + 1):
         columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
@@ -197,10 +199,7 @@ def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any
         axes[0, 0].set_title(axes[0, 0].get_title(loc="left") or title)
         return figure
     if picture.below:
-        handles = dict[str, Any]()
-        for axis, _ in drawn:
-            handles |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
-        _legend_below(figure, handles)
+        _legend_below(figure, [axis for axis, _ in drawn])
     if title:
         # Wrapped to a part of the width, which matplotlib would fill to the edges.
         text = figure.suptitle(title, fontsize=9.0)
