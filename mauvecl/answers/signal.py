@@ -18,7 +18,7 @@ from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
 from mauvecl.noise.reference import components
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, View, stacked
+from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import DAY_S, FirstRealisation, Wavelength
 from mauvecl.study.cases import Case, cases, collect_messages, star_column, star_label
@@ -280,15 +280,6 @@ class StarSnr(InCell):
     """A star in a cell of the sweep."""
 
     result: SnrResult
-    asked_nm: float | None = None
-
-    @property
-    def shown_nm(self) -> list[float]:
-        """The requested wavelength, or those of `SHOWN_NM` within the spectrum."""
-        if self.asked_nm is not None:
-            return [self.asked_nm]
-        first, last = self.result.expectation.wavelength_nm[[0, -1]]
-        return [nm for nm in SHOWN_NM if first <= nm <= last]
 
 
 #: Metadata of tables of realisations.
@@ -313,6 +304,15 @@ class SnrAnswer(Answer):
     #: Noise by origin, DN rms per pixel, one row per star, cell and pixel.
     noise_budget = TableOf("noise-budget", (), "stars", of=lambda _, star: star.result.expectation.noise_budget(),
                            place=True, key="noise-budget", about=REALISATIONS)  # fmt: skip
+    _shown_elements = TableOf(
+        "", COLUMNS, "stars", of=lambda answer, star: star.result.element[answer.places(star, "element")], place=True,
+        about=(), title="S/N per 10.5 nm element; all of them in the files",
+    )  # fmt: skip
+    _shown_noise = TableOf(
+        "", lambda answer: [column for column in BUDGET_COLUMNS if column.name in answer.noise_budget.colnames],
+        "stars", of=lambda answer, star: star.result.expectation.noise_budget()[answer.places(star, "pixel")],
+        place=True, about=(), title="Noise of a pixel by origin, DN rms",
+    )  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -320,25 +320,18 @@ class SnrAnswer(Answer):
         return _best(self.stars[0].title, self.stars[0].result.expectation, len(self.stars))
 
     @property
-    def inputs(self) -> list[Expectation]:
-        return [star.result.expectation for star in self.stars]
+    def shown_nm(self) -> list[float]:
+        """The requested wavelength, or those of `SHOWN_NM` within the spectrum."""
+        wavelength_nm, (first, last) = self.study.signal.wavelength_nm, self.inputs[0].wavelength_nm[[0, -1]]
+        return [nm for nm in SHOWN_NM if first <= nm <= last] if wavelength_nm is None else [wavelength_nm]
+
+    def places(self, star: StarSnr, per: Per) -> list[int]:
+        """Return the indices of the pixels or elements of a star at the shown wavelengths."""
+        return [place_of(star.result.expectation, nm, per) for nm in self.shown_nm]
 
     @property
-    def views(self) -> list[View]:
-        """S/N and noise at some wavelengths; all of them are in the files."""
-        place = self.placed(())
-
-        def at(star: StarSnr, per: Per) -> list[int]:
-            return [place_of(star.result.expectation, nm, per) for nm in star.shown_nm]
-
-        elements = [(star, star.result.element[at(star, "element")]) for star in self.stars]
-        budgets = [(star, star.result.expectation.noise_budget()[at(star, "pixel")]) for star in self.stars]
-        noise = stacked(place, budgets)
-        sources = [column for column in BUDGET_COLUMNS if column.name in noise.colnames]
-        return [
-            View("S/N per 10.5 nm element; all of them in the files", (*place, *COLUMNS), stacked(place, elements)),
-            View("Noise of a pixel by origin, DN rms", (*place, *sources), noise),
-        ]
+    def inputs(self) -> list[Expectation]:
+        return [star.result.expectation for star in self.stars]
 
 
 @by_keywords("stars")
@@ -357,7 +350,7 @@ def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
 
     def answered(case: Case) -> StarSnr:
         result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)
-        return StarSnr(case.label, case.at, result, wavelength_nm)
+        return StarSnr(case.label, case.at, result)
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)

@@ -394,7 +394,7 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
     from mauvecl.answers.signal import place_of
 
     first, row = answer.study.sweep.axes[0].quantity, []
-    for wavelength in answer.stars[0].shown_nm:
+    for wavelength in answer.shown_nm:
         lines: dict[str, list[Any]] = {}
         for star in answer.stars:
             name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
