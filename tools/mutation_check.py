@@ -575,7 +575,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "exposures of a frame": (
         "test_exposure_inverts_snr[450.0-7-pixel]",
-        ("*asked, x.exposure_s, frames", "*asked, x.exposure_s / x.n_frames, frames"),
+        ("*wanted, x.exposure_s, frames", "*wanted, x.exposure_s / x.n_frames, frames"),
     ),
     "durations in days and seconds": (
         "test_table_of_events_has_the_flare_in_its_units",

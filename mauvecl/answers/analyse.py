@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -282,7 +282,7 @@ EVENTS = (
            "the event's spectrum if star, dark current and sky changed by any amount"),
     Column("kind", "event.kind", "", "flare, or what resembles one: step of the level, edge of a dip, change of "
            "throughput, dark current or sky, cosmic ray", "kind", kind=str, detail=True),
-    Column("note", "note", "", "what is special", kind=str),
+    Column("note", "note", "", "remarks on the event", kind=str),
 )  # fmt: skip
 #: Columns of the table of frames, one row for all frames of an analysis.
 FRAMES = (
@@ -452,8 +452,8 @@ class AnalyseAnswer(Answer):
     def rows(self) -> list[EventRow]:
         """Events in order of time."""
         analysis = self.analysis
-        each = zip(analysis.events, analysis.found, analysis.fitted, strict=True)
-        return [EventRow(analysis, *one) for one in each]
+        columns = analysis.events, analysis.found, analysis.fitted
+        return [EventRow(analysis, *values) for values in zip(*columns, strict=True)]
 
     @property
     def json_tables(self) -> dict[str, Table]:
@@ -464,9 +464,9 @@ class AnalyseAnswer(Answer):
     def headline(self) -> str:
         """The number of detected flares, with the expected false alarms."""
         verdicts = [row.verdict for row in self.rows]
-        number, others = verdicts.count("detected"), len(verdicts) - verdicts.count("detected")
+        number, undetected = verdicts.count("detected"), len(verdicts) - verdicts.count("detected")
         flares = f"{number} flare{' is' if number == 1 else 's are'}" if number else "No flare is"
-        more = f", and {others} more event{'' if others == 1 else 's'} listed" if others else ""
+        more = f", and {undetected} more event{'' if undetected == 1 else 's'} listed" if undetected else ""
         expected = self.analysis.wanted * self.analysis.days
         return (
             f"{flares} detected in {self.analysis.days:.3g} star-days of {self.analysis.frames.name}, where "
@@ -477,14 +477,18 @@ class AnalyseAnswer(Answer):
     def views(self) -> list[View]:
         analysis = self.analysis
         where = f"in {analysis.days:.3g} star-days of {analysis.frames.name}"
-        wanted = f"{analysis.wanted:.3g} false alarms per star-day"
+        rate = f"{analysis.wanted:.3g} false alarms per star-day"
         if not analysis.events:
-            return [View(f"Nothing above {analysis.candidates:.2f} {where} ({wanted})."), *super().views]
+            return [View(f"Nothing above {analysis.candidates:.2f} {where} ({rate})."), *super().views]
         title = (
-            f"Events {where}; detected above {analysis.threshold:.2f} ({wanted}), "
+            f"Events {where}; detected above {analysis.threshold:.2f} ({rate}), "
             f"candidates above {analysis.candidates:.2f}"
         )
         return [AnalyseAnswer.events.view(self, title), *super().views]
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        return self.report("analyse", self.study.data.report)
 
     @property
     def remarks(self) -> list[str]:
@@ -512,8 +516,8 @@ def analyse(
         frames = read_frames(study.data.file, study.data.mapping, quality_bits=study.data.quality_bits,
                              ignore_checksum=study.data.ignore_checksum)  # fmt: skip
     if study.data.barycentric is not None:
-        known = study.orbit.tle is not None or "mauve" in frames.instrument.lower()
-        frames = barycentric(frames, Target.of(study.data.barycentric), study.orbit.orbit() if known else None)
+        has_orbit = study.orbit.tle is not None or "mauve" in frames.instrument.lower()
+        frames = barycentric(frames, Target.of(study.data.barycentric), study.orbit.orbit() if has_orbit else None)
     search, model = study.search, frame_model(study, frames)
     if study.has_neighbours:
         # Errors of the star or its neighbours are reported before the search.
@@ -523,10 +527,10 @@ def analyse(
     def report(share: float) -> None:
         """Report the share of the work in whole frames, whenever their number rises."""
         nonlocal last
-        done = round(share * total)
-        if progress is not None and done > last:
-            last = done
-            progress(done, total)
+        frame = round(share * total)
+        if progress is not None and frame > last:
+            last = frame
+            progress(frame, total)
 
     report(0.0)
     analysis = analyse_frames(

@@ -40,7 +40,7 @@ class InCell:
 
 
 def name_of_instrument(study: Study) -> str:
-    """Return the instrument as sentences name it."""
+    """Return the name of the instrument in sentences."""
     return "Mauve" if study.observation.instrument in shipped_names() else Path(study.observation.instrument).stem
 
 
@@ -57,7 +57,8 @@ IF_KNOWN = "if everything but the noise were known"
 class TableOf:
     """A table that an answer declares once: its file, its printed view and its part of the JSON.
 
-    It is an attribute of the answer, and made when it is read. What depends on the answer is given as a function of it.
+    It is an attribute of the answer that is computed when it is first read. Functions of the answer replace values that
+    depend on it.
     """
 
     file: str  # name of the file without its ending; empty for a table that is only printed or part of the JSON
@@ -88,10 +89,10 @@ class TableOf:
         if answer is None:
             return self
         # The instance's dictionary, which also frozen dataclasses have, hides this attribute from then on.
-        vars(answer)[self.name] = table = self._made(answer)
+        vars(answer)[self.name] = table = self._table(answer)
         return table
 
-    def _made(self, answer: Answer) -> QTable:
+    def _table(self, answer: Answer) -> QTable:
         rows: Any = _of_answer(self.rows, answer)
         if hasattr(rows, "colnames"):
             return rows
@@ -100,14 +101,14 @@ class TableOf:
         about = self.about(answer) if callable(self.about) else metadata_of(answer, *self.about)
         if self.of is None:
             return table_of(self.columns_of(answer), rows, **about)
-        parts = [(row, self.of(answer, row)) for row in rows]
-        names = {name for _, table in parts for name in table.colnames}
-        return stacked([column for column in self.columns_of(answer) if column.name not in names], parts, **about)
+        tables = [(row, self.of(answer, row)) for row in rows]
+        names = {name for _, table in tables for name in table.colnames}
+        return stacked([column for column in self.columns_of(answer) if column.name not in names], tables, **about)
 
     def columns_of(self, answer: Answer) -> tuple[Column, ...]:
         """Return the columns for an answer."""
-        every = self.columns(answer) if callable(self.columns) else self.columns
-        columns = tuple(column for column in every if column.when is None or column.when(answer))
+        declared = self.columns(answer) if callable(self.columns) else self.columns
+        columns = tuple(column for column in declared if column.when is None or column.when(answer))
         return answer.placed(columns) if self.place else columns
 
     def view(self, answer: Answer, title: str = "", table: Table | None = None) -> View:
@@ -183,7 +184,7 @@ class Answer(Drawable, ContentEquality):
 
     @property
     def instrument_name(self) -> str:
-        """The instrument as sentences name it."""
+        """Name of the instrument in sentences."""
         return name_of_instrument(self.study)
 
     def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
@@ -258,8 +259,8 @@ class Answer(Drawable, ContentEquality):
 
     def __str__(self) -> str:
         """Return what the command prints, without details."""
-        parts = [self.headline, *map(str, self.all_views), "Assumed:", *(f"  {clause}" for clause in self.premises)]
-        return "\n".join(part for part in (*parts, *self.messages, *self.remarks) if part)
+        lines = [self.headline, *map(str, self.all_views), "Assumed:", *(f"  {clause}" for clause in self.premises)]
+        return "\n".join(line for line in (*lines, *self.messages, *self.remarks) if line)
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(self.headline)}</p>{''.join(view._repr_html_() for view in self.all_views)}"
@@ -287,8 +288,11 @@ class Answer(Drawable, ContentEquality):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Functions that make the content of documents, by full file name."""
-        documents: dict[str, Callable[[], bytes]] = import_module("mauvecl.charts.chart").made_of(self, document=True)
-        return documents
+        return {}
+
+    def report(self, name: str, form: str) -> dict[str, Callable[[], bytes]]:
+        """Return the document with the answer's report, which is "html" or "pdf"; pictures are imported for it."""
+        return {f"{name}.{form}": lambda: import_module("mauvecl.charts.campaigns").report(self, form)}
 
     @property
     def files(self) -> dict[str, Table]:
@@ -327,10 +331,10 @@ def reported(items: Iterable[Item], total: int, progress: Progress) -> Iterator[
     If that raises, a generator of items is closed at once, while the workers that it uses are still open.
     """
     try:
-        for done, item in enumerate(items, 1):
+        for number, item in enumerate(items, 1):
             yield item
             if progress is not None:
-                progress(done, total)
+                progress(number, total)
     finally:
         if isinstance(items, Generator):
             items.close()

@@ -173,7 +173,7 @@ class CalibrateAnswer(Answer):
         names = ("wavelength shift", "wavelength stretch", "line width", "line width, change to the red")
         usual = (0.0, 0.0, n.gaussian_fwhm_nm, 0.0)
         shapes = zip(names, f.shape_nm.tolist(), f.shape_error_nm.tolist(), usual, strict=True)
-        return [*rows, *(Fitted(*each, "nm") for each in shapes)]
+        return [*rows, *(Fitted(*shape, "nm") for shape in shapes)]
 
     @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:
@@ -221,13 +221,13 @@ class CalibrateAnswer(Answer):
         assumed = [*self.dark.assumed, *self.transfer.assumed, *self.throughput.assumed]
         if assumed:
             lines.append(f"NOT DETERMINED by these observations, taken as nominal: {', '.join(assumed)}.")
-        error, given = self.throughput.spectrum_error, self.study.calibrate.spectrum_error is not None
-        if "errors of the star's spectrum" in self.throughput.assumed and not given:
+        error, is_given = self.throughput.spectrum_error, self.study.calibrate.spectrum_error is not None
+        if "errors of the star's spectrum" in self.throughput.assumed and not is_given:
             lines.append(
                 "One star cannot tell errors of its spectrum from the throughput: an error of "
                 f"{100 * error:.2g} % at each of {ERROR_KNOTS} wavelengths is assumed."
             )
-        elif error > 0 and not given:
+        elif error > 0 and not is_given:
             lines.append(
                 f"The stars disagree: their spectra are taken to be wrong by {100 * error:.2g} % at each of "
                 f"{ERROR_KNOTS} wavelengths."
@@ -322,8 +322,8 @@ class CalibrateAnswer(Answer):
         dark[read], every_bias[read] = level / level.mean(), bias
         by_pixel: dict[str, Any] = {"pixel": np.arange(moved.pixels), "dark": dark}
         for name, unit in (("response", 1), ("gain", 1), ("read_noise_dn", u.DN)):
-            if (given := getattr(self.nominal.pixel_map, name, None)) is not None:
-                by_pixel[name] = given * unit
+            if (column := getattr(self.nominal.pixel_map, name, None)) is not None:
+                by_pixel[name] = column * unit
         if np.ptp(bias) > 0:
             by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
@@ -382,8 +382,8 @@ class CalibrateAnswer(Answer):
         """Return the content of the instrument file."""
         import tomli_w
 
-        given = self.study.observation.instrument
-        extends = given if given in shipped_names() else str(Path(given).resolve())
+        parent = self.study.observation.instrument
+        extends = parent if parent in shipped_names() else str(Path(parent).resolve())
         values: dict[str, Any] = {"version": FILE_VERSION, "extends": extends}
         values |= {"name": f"{self.nominal.name}-calibrated", "notice": self.notice}
         values |= {key: {"value": value, "tag": "C", "source": self.source} for key, value in self.changes.items()}
@@ -393,8 +393,8 @@ class CalibrateAnswer(Answer):
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
-        """The instrument file, alone and with the tables that it names, in addition to those of every answer."""
-        return super().documents | {"instrument.toml": self.instrument_toml, "instrument.zip": self.instrument_zip}
+        """The instrument file, alone and with the tables that it names."""
+        return {"instrument.toml": self.instrument_toml, "instrument.zip": self.instrument_zip}
 
     def instrument_zip(self) -> bytes:
         """Return an archive of the instrument file and of the tables that it names."""
@@ -426,7 +426,7 @@ def calibrate(
     stars : tuple of Source or None, optional
         Spectra in memory, in place of those of the observations; None for frames without light.
     """
-    asked = study.calibrate
+    question = study.calibrate
     nominal, observations = _observations(study, frames, stars)
     lit = [observation for observation in observations if observation.star is not None]
     without = [observation for observation in observations if observation.star is None]
@@ -439,10 +439,10 @@ def calibrate(
         transfer = detector.fit_photon_transfer(variances, nominal, error)
         noise = transfer.noise
     model = ThroughputModel(
-        lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
-        light_error=asked.light_error,
+        lit, nominal, dark, transfer, knots=question.knots, sky=study.sky.sky(), order=study.observation.order,
+        light_error=question.light_error,
     )  # fmt: skip
-    throughput = fit_throughput(model, asked.spectrum_error)
+    throughput = fit_throughput(model, question.spectrum_error)
     return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
 
 
@@ -450,23 +450,23 @@ def _observations(
     study: Study, frames: tuple[Frames, ...] | None, stars: tuple[Source | None, ...] | None
 ) -> tuple[Instrument, tuple[detector.CalibrationFrames, ...]]:
     """Return the instrument from which the fit starts and the observations; parameters as for `calibrate`."""
-    asked = study.calibrate
-    if not any(observation.library or observation.spectrum for observation in asked.observations):
+    question = study.calibrate
+    if not any(observation.library or observation.spectrum for observation in question.observations):
         raise InputError(
             "calibrate.observations must name the library or spectrum of a standard star", key="calibrate.observations"
         )
-    for name, given in (("frames", frames), ("stars", stars)):
-        if given is not None and len(given) != len(asked.observations):
-            raise InputError.of(name, len(given), f"{len(asked.observations)}, one for each observation")
+    for name, argument in (("frames", frames), ("stars", stars)):
+        if argument is not None and len(argument) != len(question.observations):
+            raise InputError.of(name, len(argument), f"{len(question.observations)}, one for each observation")
     nominal = study.observation.load_instrument()
     observations = list[detector.CalibrationFrames]()
-    for k, one in enumerate(asked.observations):
-        read = frames[k] if frames else read_frames(one.frames, one.mapping, raw=True)
-        star = stars[k] if stars else one.source()
-        observation = detector.CalibrationFrames.of(read, nominal, star, one.temperature_c)
+    for k, entry in enumerate(question.observations):
+        read = frames[k] if frames else read_frames(entry.frames, entry.mapping, raw=True)
+        star = stars[k] if stars else entry.source()
+        observation = detector.CalibrationFrames.of(read, nominal, star, entry.temperature_c)
         if not observation.usable(nominal).any():
             raise InputError.of("observations", observation.name, "frames with a pixel below saturation")
-        if any(np.array_equal(observation.raw_dn, other.raw_dn) for other in observations):
+        if any(np.array_equal(observation.raw_dn, earlier.raw_dn) for earlier in observations):
             raise InputError.of("observations", observation.name, "frames that no other observation has")
         observations.append(observation)
     return nominal, tuple(observations)

@@ -51,9 +51,9 @@ class ChangeRow(InCell):
     @property
     def note(self) -> str:
         """What limits the row, in a few words."""
-        lost, every = self.saturated
+        lost, total = self.saturated
         hidden = "hidden by what is unknown" if self.hidden else ""
-        return "; ".join(filter(None, [_lost_pixels(lost, every), "" if every else "no light", hidden]))
+        return "; ".join(filter(None, [_lost_pixels(lost, total), "" if total else "no light", hidden]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +90,9 @@ class PeriodRow(InCell):
         return np.array([[getattr(share, end) for share in row] for row in self.recovery.recovered])
 
 
-def _lost_pixels(lost: int, every: int) -> str:
+def _lost_pixels(lost: int, total: int) -> str:
     """Return how many pixels saturate, or nothing if none do."""
-    text = "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
+    text = "every pixel saturates" if lost == total else f"{lost} of {total} pixels saturate"
     return text if lost else ""
 
 
@@ -195,7 +195,7 @@ class ChangeAnswer(Answer):
 
     @property
     def visits(self) -> str:
-        """Number and exposure of the visits, as sentences say them."""
+        """Number and exposure of the visits, in words."""
         visits = self.study.change.visits
         return f"{'two' if visits == 2 else visits} visits of {self.study.observation.exposure_s:g} s"
 
@@ -218,9 +218,9 @@ class ChangeAnswer(Answer):
         lines = collect_messages(self.inputs)
         hidden = dict.fromkeys(f"{row.title}: {row.change.name}" for row in self.changes if row.hidden)
         lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
-        left = [name for name in visits.INDICES if name not in {row.index.name for row in self.indices}]
-        if left:
-            lines.append(f"The pixels do not cover the line indices {', '.join(left)}.")
+        missing = [name for name in visits.INDICES if name not in {row.index.name for row in self.indices}]
+        if missing:
+            lines.append(f"The pixels do not cover the line indices {', '.join(missing)}.")
         lines.append(
             "Bands of the line indices are wider than published ones, since Mauve resolves 13 nm: their widths are an "
             "assumption; the table of indices names the published ones."
@@ -244,29 +244,30 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
     >>> answer.table["change"].tolist()
     ['200-320']
     """
-    asked = study.change
-    file = asked.light()
+    question = study.change
+    file = question.light()
     prepared = cases(study)
     recovery = None
-    if asked.periods:
+    if question.periods:
         o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
-        seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
+        visibility = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
         # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
         recovery = visits.recover_periods(
-            visits.visit_times_d(seen.windows(0), asked.visits, study.observation.exposure_s, study.run.seed),
-            np.geomspace(asked.shortest_d, asked.longest_d, asked.steps), np.geomspace(*AMPLITUDES, asked.steps),
-            fap=asked.period_fap, trials=asked.trials, seed=study.run.seed,
+            visits.visit_times_d(visibility.windows(0), question.visits, study.observation.exposure_s, study.run.seed),
+            np.geomspace(question.shortest_d, question.longest_d, question.steps),
+            np.geomspace(*AMPLITUDES, question.steps),
+            fap=question.period_fap, trials=question.trials, seed=study.run.seed,
         )  # fmt: skip
     rows, indices, along, periods = [], [], list[ChangeRow](), []
     for case in reported(prepared, len(prepared), progress):
-        own = _changes(case, file)
-        rows += own
+        changes = _changes(case, file)
+        rows += changes
         indices += _indices(case)
         for step in () if case.star.magnitude is None else case.star.magnitude + MAGNITUDES:
             along += _changes(case.with_value("magnitude", float(step)), file)
         if recovery is not None:
             periods += [PeriodRow(row.label, row.at, row.change, row.error, recovery)
-                        for row in own if not np.isnan(row.error)]  # fmt: skip
+                        for row in changes if not np.isnan(row.error)]  # fmt: skip
     return ChangeAnswer(study, rows, indices, along, periods, [case.quiet for case in prepared])
 
 
@@ -281,8 +282,8 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
         error, known_error = (visits.error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
         smallest = visits.Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
         ideal = change.size(known_error * unit.one)
-        lost, own = visits.pixels_of(change.counts_dn, quiet), (change.size(error), change.size(known_error))
-        rows.append(ChangeRow(case.label, case.at, change, *own, smallest, ideal, case.star.magnitude, lost))
+        lost, errors = visits.pixels_of(change.counts_dn, quiet), (change.size(error), change.size(known_error))
+        rows.append(ChangeRow(case.label, case.at, change, *errors, smallest, ideal, case.star.magnitude, lost))
     return rows
 
 
@@ -299,9 +300,9 @@ def _indices(case: Case) -> list[IndexRow]:
         find = partial(visits.line_index, nm[near], band_nm=index.band_nm, continuum_nm=index.continuum_nm)
         with np.errstate(divide="ignore", invalid="ignore"):
             # Pixels of the band alone have no continuum, and no equivalent width.
-            part = find(np.eye(int(near.sum())))
+            per_pixel = find(np.eye(int(near.sum())))
         weights = np.zeros(nm.size)
-        weights[near] = part.flux * flux_per_dn[near]
+        weights[near] = per_pixel.flux * flux_per_dn[near]
         flux = flux_per_dn * quiet.signal_dn
         mean, lost = find(flux[near]), visits.pixels_of(weights, quiet)
         order, band = case.study.observation.order, case.study.change.band

@@ -69,18 +69,18 @@ def unknown_cost(
 
 def unknown_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
     """Return sentences on what is marginalised over, if anything, and on the faintest flare, if any has a signal."""
-    lines, which = list[str](), f"the usual unknowns ({spoken(NuisanceChoice())})"
+    lines, unknowns = list[str](), f"the usual unknowns ({spoken(NuisanceChoice())})"
     if not nuisances.none:
-        which = spoken(nuisances)
+        unknowns = spoken(nuisances)
         texts = "; ".join(PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES)
-        lines.append(f"Statistics are marginalised over {which}{f'; drawn: {texts}' if nuisances.usual else ''}.")
+        lines.append(f"Statistics are marginalised over {unknowns}{f'; drawn: {texts}' if nuisances.usual else ''}.")
     shown = [cost for cost in costs if cost.known > 0]
     if shown:
         faintest = min(shown, key=lambda cost: cost.known)
-        others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
+        faintest_of = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
         lines.append(Message(
-            f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything "
-            f"known; with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} "
+            f"What unknowns cost: {faintest.of}{faintest_of} has a matched S/N of {faintest.known:.3g} with everything "
+            f"known; with {unknowns} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} "
             "marginalised (closed forms).", "cost of unknowns",
         ))  # fmt: skip
     return lines
@@ -180,19 +180,20 @@ def drawn(study: Study) -> DrawnStudies:
     """
     from scipy.stats import qmc
 
-    asked, o = study.unknowns, study.observation
+    question, o = study.unknowns, study.observation
     nominal = o.load_instrument()
     # Values that the study sets are known.
-    known = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
-    rows, priors = values_of(nominal), {k: prior for k, prior in asked.priors(nominal).items() if k not in known}
-    if asked.draws and not priors:
+    known_names = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
+    rows, priors = values_of(nominal), question.priors(nominal)
+    priors = {name: prior for name, prior in priors.items() if name not in known_names}
+    if question.draws and not priors:
         raise InputError("no instrument value is unknown; give a prior, or unknowns.draws = 0", key="unknowns.draws")
-    even = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed)).random(asked.draws)
+    even = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed)).random(question.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
     # An equal share of the realisations, but enough to count the threshold of each draw.
     fewest = int(np.ceil(MIN_IN_TAIL / study.run.fap)) if study.run.tails == "counted" else 1000
-    run = study.run.model_copy(update={"realisations": max(study.run.realisations // asked.draws, fewest)})
-    certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
+    run = study.run.model_copy(update={"realisations": max(study.run.realisations // question.draws, fewest)})
+    certain = study.model_copy(update={"unknowns": type(question)(), "run": run})
     studies = []
     for row in values:
         changes, at = dict[str, Any](), nominal
@@ -253,19 +254,19 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
 
     def explained_by(some: tuple[int, ...]) -> float:
         straight = np.column_stack([scaled[:, some], np.ones(len(y))])
-        left = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
-        return float(1.0 - left.var() / y.var())
+        residual = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
+        return float(1.0 - residual.var() / y.var())
 
-    every = range(len(names))
-    subsets = itertools.chain.from_iterable(itertools.combinations(every, size) for size in (*every, len(names)))
+    indices = range(len(names))
+    subsets = itertools.chain.from_iterable(itertools.combinations(indices, size) for size in (*indices, len(names)))
     explained = {some: explained_by(some) if some else 0.0 for some in subsets}
     share = np.zeros(len(names))
     for some, value in explained.items():
-        for k in {*every}.difference(some):
+        for k in {*indices}.difference(some):
             # Fraction of orders in which exactly these precede unknown k.
             weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
             share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
-    return {names[k]: float(share[k]) for k in np.argsort(-share)} | {REST: 1.0 - explained[tuple(every)]}
+    return {names[k]: float(share[k]) for k in np.argsort(-share)} | {REST: 1.0 - explained[tuple(indices)]}
 
 
 #: Unknowns whose shares of a scatter are named, at most.
@@ -274,6 +275,8 @@ MAX_NAMED = 3
 
 def describe_shares(shares: Mapping[str, float]) -> str:
     """Return the largest shares of a scatter in words, and how many there are."""
+    if any(math.isnan(share) for share in shares.values()):
+        return "sources that only more draws tell apart"
     first = First(shares.items(), MAX_NAMED, "unknowns")
     note = f" ({first.note})" if first.note else ""
     return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from operator import itemgetter
+from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,8 +82,8 @@ def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectatio
     if saturated:
         lost = f"{saturated} of {quiet.saturated.size} pixels that saturate"
         without = f", without the {lost} in a frame of more than {quiet.longest_safe_frame_s:.3g} s"
-    seen = f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star}"
-    return f"{seen} in {quiet.exposure_s:g} s with a chance of {chance}{without}"
+    flare = f"{name_of_instrument(study)} would see a flare of {100 * amplitude:g} % on {star}"
+    return f"{flare} in {quiet.exposure_s:g} s with a chance of {chance}{without}"
 
 
 @dataclass(eq=False)
@@ -133,16 +133,16 @@ class DetectAnswer(Answer):
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
         least = f", the least certain of {len(rows)} flares" if len(rows) > 1 else ""
         chance = f"{chance_text(row['probability'])} ({chance_range(row['low'], row['high'])}{ideal})"
-        seen = chance_of_flare(self.study, star.title, row["amplitude"], star.detection.quiet, chance)
-        return f"{seen}{least}."
+        sentence = chance_of_flare(self.study, star.title, row["amplitude"], star.detection.quiet, chance)
+        return f"{sentence}{least}."
 
     @property
     def views(self) -> list[View]:
         run, quiet = self.study.run, [star.detection.quiet for star in self.stars]
         frames = {x.exposure_s: "1 frame" if x.n_frames == 1 else f"{x.n_frames} frames" for x in quiet}
         exposures = " and ".join(f"{exposure_s:g} s ({text})" for exposure_s, text in frames.items())
-        how = f"{exposures}, {run.realisations:,} realisations"
-        title = f"Detection at a false-alarm probability of {run.fap:g} per test, {how}"
+        exposure = f"{exposures}, {run.realisations:,} realisations"
+        title = f"Detection at a false-alarm probability of {run.fap:g} per test, {exposure}"
         detected = DetectAnswer.table.view(self, title)
         if not len(self.departures):
             return [detected]
@@ -216,14 +216,14 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
 
     def detected(case: Case) -> StarDetection:
         nm = case.quiet.wavelength_nm
-        own = [Linear(name, read_at_pixels("weights", name, path, nm)) for name, path in run.weights.items()]
+        linear = [Linear(name, read_at_pixels("weights", name, path, nm)) for name, path in run.weights.items()]
         # Matched statistics that search for flares of other temperatures than the study's.
         setting = Setting(case.quiet, ~case.quiet.saturated, run.comparison())
         for kelvin in run.template_temperatures_k:
             (shape,) = case.expect(case.with_value("flare_temperature", kelvin).flaring(case.amplitudes[0]))
-            own.append(Linear(f"matched {kelvin:g} K", Matched().weights_per_dn(setting, shape)))
-        how = case.detect_options() | {"statistics": (*run.statistics, *own)}
-        detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
+            linear.append(Linear(f"matched {kelvin:g} K", Matched().weights_per_dn(setting, shape)))
+        options = case.detect_options() | {"statistics": (*run.statistics, *linear)}
+        detection = engine.detect(case.quiet, case.flares, seed=run.seed, **options)
         statistics = [detection.statistic(name) for name in detection.statistics]
         return StarDetection(
             case.label, case.at, case.amplitudes, detection, forms.ideal_chances(case, case.flares, statistics)
@@ -245,10 +245,11 @@ def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress
 
 def _messages(answer: DetectAnswer, prepared: Sequence[Case], campaigns: Sequence[str]) -> list[str]:
     """Return messages on lost pixels, on thresholds, of the expectations, on campaigns, templates and unknowns."""
-    study, run, detections = answer.study, answer.study.run, [(star.title, star.detection) for star in answer.stars]
-    messages: list[str] = [message.about(title) for title, one in detections for message in one.messages]
-    messages += [message.about(title) for title, one in detections for message in one.without_threshold(run.fap)]
-    messages += [message.about(title) for title, one in detections for message in one.lowered]
+    study, run = answer.study, answer.study.run
+    finders = attrgetter("messages"), methodcaller("without_threshold", run.fap), attrgetter("lowered")
+    messages: list[str] = [
+        message.about(star.title) for find in finders for star in answer.stars for message in find(star.detection)
+    ]
     messages += collect_messages([x for case in prepared for x in case.expectations], study.processes)
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
@@ -277,8 +278,8 @@ def _statistic_lines(prepared: Sequence[Case], stars: Sequence[StarDetection]) -
             right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
             name = f"matched {kelvin:g} K"
             share = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
-            kept = f"keeps {100 * share:.1f} % of the matched statistic's S/N"
-            lines.append(f"{star.label}: looking for a flare of {kelvin:g} K in one of {light} {kept}.")
+            text = f"keeps {100 * share:.1f} % of the matched statistic's S/N"
+            lines.append(f"{star.label}: looking for a flare of {kelvin:g} K in one of {light} {text}.")
         for k in range(len(star.amplitudes) if "paper" in detection.statistics else 0):
             form = detection.closed_form("paper", template=k)
             terms += [form.effective_terms] if isinstance(form, QuadraticForm) else []
@@ -293,36 +294,37 @@ def _statistic_lines(prepared: Sequence[Case], stars: Sequence[StarDetection]) -
 
 def _campaign(case: Case) -> list[str]:
     """Return sentences on the false alarms of a study's campaign, if any, and on the probability per test it wants."""
-    asked, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
-    if asked.frames is None:
+    question, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
+    if question.frames is None:
         return []
-    many = campaign(run.fap, asked.frames, stack, step=asked.step, seed=run.seed)
+    many = campaign(run.fap, question.frames, stack, step=question.step, seed=run.seed)
 
-    def overlap(found: Interval | None, before: str, after: str = "") -> str:
-        if found is None:
+    def overlap(interval: Interval | None, before: str, after: str = "") -> str:
+        if interval is None:
             return ""
-        return f"{before} with the overlap of its stacks {found.value:.3g} [{found.low:.3g}, {found.high:.3g}]{after}"
+        ends = f"[{interval.low:.3g}, {interval.high:.3g}]"
+        return f"{before} with the overlap of its stacks {interval.value:.3g} {ends}{after}"
 
     lines, tests = list[str](), many.tests
     lines.append(
-        f"A campaign of {asked.frames} frames makes {tests} tests: at {run.fap:g} per test {tests * run.fap:.3g} false "
-        f"alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
+        f"A campaign of {question.frames} frames makes {tests} tests: at {run.fap:g} per test {tests * run.fap:.3g} "
+        f"false alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
         f"{many.bound:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
     )
-    if asked.fap is not None:
-        rate = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=run.seed)
+    if question.fap is not None:
+        rate = per_test(question.fap, question.frames, stack, step=question.step, seed=run.seed)
         lines.append(
-            f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
+            f"For a chance of {question.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
             f"{rate.independent:.4g} if they are independent, {rate.bound:.4g} in any case"
             f"{overlap(rate.overlapping, ', and')}: `fap={rate.bound:.4g}`."
         )
-    if asked.alarms is not None:
-        if not asked.alarms < tests:
-            raise InputError.of("campaign.alarms", asked.alarms, f"fewer than the {tests} tests")
-        alarms = "false alarm" if asked.alarms == 1 else "false alarms"
+    if question.alarms is not None:
+        if not question.alarms < tests:
+            raise InputError.of("campaign.alarms", question.alarms, f"fewer than the {tests} tests")
+        alarms = "false alarm" if question.alarms == 1 else "false alarms"
         lines.append(
-            f"For {asked.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "
-            f"{asked.alarms / tests:.4g} for any dependence between them: `fap={asked.alarms / tests:.4g}`."
+            f"For {question.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "
+            f"{question.alarms / tests:.4g} for any dependence between them: `fap={question.alarms / tests:.4g}`."
         )
     return lines
 
@@ -332,7 +334,7 @@ PAPER_G2V = {0.24: (6159.88, 3.75), 0.081: (1078.36, 0.66)}
 WHY = (
     "The paper's values are no calibrated chi-squared: with 1643 points a reduced value scatters by 0.035 about one, "
     "so 0.66 lies ten standard deviations below. Divided by the smoothed flare spectrum in DN/s instead of the noise's "
-    "variance they are reproduced; what such a number means, only its simulated null can tell (`statistic='paper'`)."
+    "variance they are reproduced; only its simulated null tells what such a number means (`statistic='paper'`)."
 )
 
 

@@ -55,8 +55,8 @@ def digest_of(path: Path) -> str:
 
 def record_digest(record: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a run record as canonical JSON: sorted keys, no spaces, without its own digest."""
-    rest = {key: value for key, value in record.items() if key != OWN_DIGEST}
-    text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    content = {key: value for key, value in record.items() if key != OWN_DIGEST}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -78,20 +78,21 @@ def coverage(result: SnrResult) -> Float:
     The standard deviation is estimated from the observed photons and the known dark and read noise. Values are
     interpolated within the bins of the histogram of counts, 1/64 of a standard deviation or less.
     """
-    seen = result.observers[: result.scene.n_pixel]
+    observers = result.observers[: result.scene.n_pixel]
     signal = result.expectation.light_dn
-    gain, variance = seen["gain"].astype(float), seen["variance"].astype(float)
+    gain, variance = observers["gain"].astype(float), observers["variance"].astype(float)
     # Ends of the observed signals whose interval reaches the true one: net -+ sqrt(gain max(net, 0) + known) = signal.
     root = np.sqrt(gain**2 / 4 + gain * signal + variance)
     high = signal + gain / 2 + root
     low = signal + gain / 2 - root
     low = np.where(low < 0, signal - np.sqrt(variance), low)
-    width = 2.0 ** seen["bin_shift"].astype(float)
+    width = 2.0 ** observers["bin_shift"].astype(float)
     shares = np.empty(signal.size)
     for p in range(signal.size):
         filled, counts = result.counts.bins["pixel"].of(p)
         edges = width[p] * np.column_stack([filled, filled + 1]).ravel() - 0.5
-        ends = np.interp([low[p], high[p]], edges + float(seen["net_offset"][p]), steps_of(counts) / result.counts.n)
+        edges += float(observers["net_offset"][p])
+        ends = np.interp([low[p], high[p]], edges, steps_of(counts) / result.counts.n)
         shares[p] = ends[1] - ends[0]
     return shares
 
@@ -104,12 +105,12 @@ def beyond(x: Expectation, sigmas: float) -> Float:
     """
     c = Cumulants.of(x, x.n_frames)
     photons = np.where(c.photon_step > 0, c.photons, 0.0)
-    parts = ((c.photon_step, photons), (c.dark_step, c.dark_dn / c.dark_step))
+    steps = ((c.photon_step, photons), (c.dark_step, c.dark_dn / c.dark_step))
 
     def cumulants(u: Float) -> tuple[Float, ...]:
         """Return the cumulant generating function of the deviation and its first two derivatives at u."""
         value, first, second = c.gaussian * u**2 / 2, c.gaussian * u, c.gaussian.copy()
-        for step, mean in parts:
+        for step, mean in steps:
             value = value + mean * (np.expm1(step * u) - step * u)
             first = first + mean * step * np.expm1(step * u)
             second = second + mean * step**2 * np.exp(step * u)
@@ -222,14 +223,14 @@ def gaussian(study: Study, engine: Engine | Pool | None = None, progress: Progre
     its stars, or another exposure than the default. Usual unknowns are left out: the question is about the noise.
     """
     engine, study = engine or Engine(), study.ideal()
-    stated = study.star != PAPER_STARS and all(star.magnitude is not None for star in study.star)
-    if not study.sweep.axes and not stated:
-        own = study.observation.exposure_s
-        usual = own == Observation().exposure_s
-        study = study.model_copy(update={"sweep": formula_grid(exposure_s=None if usual else own)})
+    has_magnitudes = study.star != PAPER_STARS and all(star.magnitude is not None for star in study.star)
+    if not study.sweep.axes and not has_magnitudes:
+        exposure_s = study.observation.exposure_s
+        usual = exposure_s == Observation().exposure_s
+        study = study.model_copy(update={"sweep": formula_grid(exposure_s=None if usual else exposure_s)})
 
-    def report(part: int, done: int, total: int) -> None:
+    def report(stage: int, number: int, total: int) -> None:
         if progress is not None:
-            progress(part * total + done, 2 * total)
+            progress(stage * total + number, 2 * total)
 
     return GaussianAnswer(study, snr(study, engine, partial(report, 0)), detect(study, engine, partial(report, 1)))

@@ -50,7 +50,7 @@ DEFAULT_RANGE = (0.3, 3.0)
 def survey_star(case: Case) -> Survey:
     """Build the search of a case's stare; its only flare component is the study's flare."""
     frame, stare, choice, flare = case.one_frame, case.stare, case.study.search, case.study.flare
-    own = frame.flare_electrons((flare.temperature_k,))
+    electrons_of_flare = frame.flare_electrons((flare.temperature_k,))
     # Templates are blackbodies if the study's flare has no temperature to vary.
     blackbody = flare.model_copy(update={"spectrum": FlareLight()})
     hot = frame if flare.spectrum.file is None else frame.with_sections(flare=blackbody)
@@ -62,7 +62,7 @@ def survey_star(case: Case) -> Survey:
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
-    survey = Survey(Components(quiet, own, templates.weights), stare, bank, templates)
+    survey = Survey(Components(quiet, electrons_of_flare, templates.weights), stare, bank, templates)
     if level.cycle and not len(survey.curves):
         raise InputError("search.cycle needs an unknown cycle of the stare: stare.cycles", key="search.cycle")
     return survey
@@ -74,37 +74,37 @@ def measure_of_size(case: Case) -> tuple[Size, float]:
     All but amplitudes are proportional to the half-width, too. Raises InputError for energies at an unknown size of
     the star.
     """
-    asked, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
-    kind: Kind = "band" if asked == "band_energy" else "bolometric"
+    measure, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
+    kind: Kind = "band" if measure == "band_energy" else "bolometric"
     scale = case.study.flare.energy_scale(case.star, case.source, kind)
-    if asked == "amplitude" or (asked is None and scale is None):
+    if measure == "amplitude" or (measure is None and scale is None):
         return "amplitude", 1.0
-    if asked == "duration":
+    if measure == "duration":
         return "duration", area
     if scale is None:
         raise InputError(
-            f"injections.of = {asked!r}, but the size of {case.source.name} is unknown; give the star's "
+            f"injections.of = {measure!r}, but the size of {case.source.name} is unknown; give the star's "
             "distance_pc, or radius_rsun and effective_temperature_k",
             key="injections.of",
         )
-    return asked or "energy", area * scale.erg_per_s
+    return measure or "energy", area * scale.erg_per_s
 
 
 def injected_sizes(case: Case, per_amplitude: Callable[[Float], Float], unit_snr: float, threshold: float) -> Float:
     """Return the sizes of injected flares, ascending; by default around a completeness of one half in the survey."""
-    asked = case.study.injections
-    widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
+    question = case.study.injections
+    widths = np.array([question.half_width_low_s, question.half_width_high_s])
     frames = widths / case.instrument.frame_s
     # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
     amplitude = threshold / unit_snr / np.sqrt(shape_of(case.study.search.shape).square_integral * frames)
     half = amplitude * per_amplitude(widths)
-    low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
-    high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high
+    low = DEFAULT_RANGE[0] * half.min() if question.low is None else question.low
+    high = DEFAULT_RANGE[1] * half.max() if question.high is None else question.high
     if not low < high:
         raise InputError(
             f"injected sizes must rise from low to high, but run from {low:.3g} to {high:.3g}", key="injections.low"
         )
-    return np.geomspace(low, high, asked.sizes)
+    return np.geomspace(low, high, question.sizes)
 
 
 #: Completeness at which limits are given, by the names of their columns.
@@ -122,15 +122,15 @@ SEARCH_COLUMNS = (
     SHARE,
     Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
     *interval_columns("threshold_{}", "threshold.{}", heading=INTERVAL, format=interval(".3f")),
-    Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
+    Column("checked_at", "checked", "", "S/N at which drawn stares are compared with normal noise",
            "alarms a day above", ".2f", detail=True),
-    Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g",
+    Column("alarms_sampled", "sampled", "", "false alarms per star-day there, normal noise", "sampled", ".3g",
            detail=True),
     Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares",
            "drawn", ".3g", detail=True),
     *interval_columns("alarms_{}", "simulated.{}", of="their interval of 4 standard errors"),
     Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
-    Column("alarmed_expected", "expected", "", "how many should have one"),
+    Column("alarmed_expected", "expected", "", "their expected number"),
     Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),
     Column("templates", "survey.search.n_filters", "", "templates of the bank", "templates"),
     Column("sums", "survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame", detail=True),
@@ -149,7 +149,7 @@ class StarCompleteness(InCell):
     threshold: Interval
     # False alarms per star-day of drawn stares at `checked`, with 4 standard errors; NaN if none are drawn.
     simulated: Interval
-    asked: float  # the same by importance sampling
+    sampled: float  # the same by importance sampling
     checked: float  # value that the maximum of a few stares in ten exceeds
     alarmed: int  # drawn stares with an alarm at the threshold
     expected: float  # their expected number; NaN if none are drawn
@@ -169,8 +169,8 @@ class StarCompleteness(InCell):
         size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
         for name, power in POWERS.items():
             limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
-            own = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=power != 0.5)
-            columns += [column.of(itemgetter(name)) for column in (limit, *own)]
+            around = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=power != 0.5)
+            columns += [column.of(itemgetter(name)) for column in (limit, *around)]
         text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
         ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
         return (
@@ -195,7 +195,7 @@ class StarCompleteness(InCell):
     @property
     def cells(self) -> QTable:
         """Completeness at each half-width and size, and how well the flares are recovered."""
-        own = (
+        cell_columns = (
             Column("half_width", lambda x: np.array(x.half_widths_s)[:, None], "s", "half-width of injected flares"),
             Column("size", "sizes", SIZE_UNITS[self.size], f"{self.size} of the injected flares"),
             Column("amplitude", "amplitudes", "", "relative rise of the photons in the flare's band by them"),
@@ -203,7 +203,7 @@ class StarCompleteness(InCell):
             *interval_columns("completeness_{}"),
             Column("injections", "count", "", "number of injected flares"),
         )
-        columns = [column.of(attrgetter("injected")) for column in own]
+        columns = [column.of(attrgetter("injected")) for column in cell_columns]
         if self.fitted is not None:
             columns += [column.of(attrgetter("fitted")) for column in ACCURACY_COLUMNS]
         return table_of(columns, [self])
@@ -212,11 +212,11 @@ class StarCompleteness(InCell):
     def messages(self) -> list[str]:
         """Messages on stares whose false-alarm rate differs from that of normal noise, and on saturated flares."""
         messages: list[str] = []
-        if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
+        if not np.isnan(self.simulated.value) and not self.simulated.low <= self.sampled <= self.simulated.high:
             messages.append(Message(
                 f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
-                f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
-                "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
+                f"at {self.checked:.2f} in drawn stares, {self.sampled:.3g} by importance sampling: the search does "
+                "not marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
                 'search.null = "counted".', "false alarms",
             ))  # fmt: skip
         # The probability of at least this many alarms if the expected number is right.
@@ -308,14 +308,14 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
             key="injections.of",
         )
     q = study.injections
-    each = q.count * q.sizes * q.widths
+    per_case = q.count * q.sizes * q.widths
 
-    def report(done: int, part: float) -> None:
+    def report(number: int, share: float) -> None:
         if progress is not None:
-            progress(round((done + part) * each), len(prepared) * each)
+            progress(round((number + share) * per_case), len(prepared) * per_case)
 
     report(0, 0.0)
-    stars = [_completeness(case, engine, partial(report, done)) for done, case in enumerate(prepared)]
+    stars = [_completeness(case, engine, partial(report, number)) for number, case in enumerate(prepared)]
     report(len(stars), 0.0)
     messages = [text for star in stars for text in star.messages]
     messages += collect_messages([star.survey.components.quiet for star in stars])
@@ -325,41 +325,41 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
 
 def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
     """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
-    choice, asked, survey = case.study.search, case.study.injections, survey_star(case)
+    choice, question, survey = case.study.search, case.study.injections, survey_star(case)
     reduced: Reduced = engine.stares if isinstance(engine, Pool) else engine.reduced
-    found = _false_alarms(case, survey, reduced)
-    (size, unit), threshold = measure_of_size(case), found["threshold"].value
+    false_alarms = _false_alarms(case, survey, reduced)
+    (size, unit), threshold = measure_of_size(case), false_alarms["threshold"].value
 
     def size_of_unit(half_width_s: Float) -> Float:
         return unit * (np.ones_like(half_width_s) if size == "amplitude" else half_width_s)
 
     values = injected_sizes(case, size_of_unit, survey.unit_snr, threshold)
-    positions = min(asked.positions, asked.count)
+    positions = min(question.positions, question.count)
     injections = Injections(
-        survey, asked.half_widths_s, threshold, case.study.run.seed, positions, -(-asked.count // positions),
+        survey, question.half_widths_s, threshold, case.study.run.seed, positions, -(-question.count // positions),
         case.study.processes.additive_only,
     )  # fmt: skip
     per_amplitude = size_of_unit(np.array(injections.half_widths_s))[:, None]
     amplitudes = values / per_amplitude
-    fit, fitted = SingleFlareFit(survey.bank, survey.templates), -(-asked.fitted // positions)
+    fit, fitted = SingleFlareFit(survey.bank, survey.templates), -(-question.fitted // positions)
     refit = Refit(fit, amplitudes, case.study.flare.temperature_k, fitted)
 
     def at_one_peak(position: int) -> Arrays:
         return reduced(injections.request(position, refit))
 
     peaks = map_in_order(engine, at_one_peak, range(positions))
-    parts = list(reported(peaks, positions, lambda done, total: report(done / total)))
-    known = 0.0
+    arrays = list(reported(peaks, positions, lambda done, total: report(done / total)))
+    known_snr = 0.0
     if any(case.stare.jitters.values()):
         (flare,) = case.one_frame.expect(case.one_frame.flaring(SMALL))
-        known = frame_signal(survey.components.quiet, flare, SMALL)
-    critical = np.stack([part["critical"].T for part in parts], axis=1) * per_amplitude[:, None]
+        known_snr = frame_signal(survey.components.quiet, flare, SMALL)
+    critical = np.stack([array["critical"].T for array in arrays], axis=1) * per_amplitude[:, None]
     return StarCompleteness(
-        case.label, case.at, survey, size, **found, saturates=injections.saturates,
+        case.label, case.at, survey, size, **false_alarms, saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
-        fitted=fit_accuracy(parts) if refit.count else None,
-        ideal_share=survey.unit_snr / known if known > 0 else float("nan"),
+        fitted=fit_accuracy(arrays) if refit.count else None,
+        ideal_share=survey.unit_snr / known_snr if known_snr > 0 else float("nan"),
     )  # fmt: skip
 
 
@@ -379,10 +379,10 @@ def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any
     # The comparison with drawn stares has most power where a few in ten have an alarm.
     checked, likely, error = tail.likely
     shifted = tail.shifted and choice.null == "sampled"
-    found: dict[str, Any] = {"threshold": threshold, "checked": checked, "shifted": shifted}
+    values: dict[str, Any] = {"threshold": threshold, "checked": checked, "shifted": shifted}
     if not n:
         nothing = Interval(np.nan, np.nan, np.nan)
-        return found | {"simulated": nothing, "asked": np.nan, "alarmed": 0, "expected": np.nan}
+        return values | {"simulated": nothing, "sampled": np.nan, "alarmed": 0, "expected": np.nan}
     # Drawn stares may be longer than those of importance sampling.
     longer = days / tail.days
     none = (1 - likely) ** longer
@@ -390,6 +390,6 @@ def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any
     p = float(np.mean(maxima >= checked))
     with np.errstate(divide="ignore"):
         ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / days for x in (p, p - reach, p + reach)]
-        asked = float(-np.log(none) / days)
-    expected, alarmed = float(n * -np.expm1(-choice.rate * days)), int(np.sum(maxima >= threshold.value))
-    return found | {"simulated": Interval(*map(float, ends)), "asked": asked, "alarmed": alarmed, "expected": expected}
+        sampled = float(-np.log(none) / days)
+    alarms = {"alarmed": int(np.sum(maxima >= threshold.value)), "expected": float(n * -np.expm1(-choice.rate * days))}
+    return values | {"simulated": Interval(*map(float, ends)), "sampled": sampled} | alarms

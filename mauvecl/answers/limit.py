@@ -131,8 +131,9 @@ class LimitSearch:
     def simulated(self, value: float, seed: int) -> Interval:
         """Simulate the detection probability; each draw of unknown values has its own reference and threshold."""
         if self.draws:
-            each = [draw.simulated(value, seed) for draw in self.draws]
-            probability = Interval(*map(float, forms.average(*np.array([(p.value, p.low, p.high) for p in each]).T)))
+            intervals = [draw.simulated(value, seed) for draw in self.draws]
+            values = np.array([(interval.value, interval.low, interval.high) for interval in intervals])
+            probability = Interval(*map(float, forms.average(*values.T)))
         else:
             assert self.engine is not None
             quiet, flare = self.pair(value)
@@ -249,10 +250,10 @@ def _settle(question: LimitSearch, start: float) -> Interval:
     for _ in range(MOST_EVALUATIONS):
         p = question.simulated(at, seed)
         clipped = (min(max(q, 0.5 / n), 1 - 0.5 / n) for q in (p.value, p.low, p.high))
-        here, low, high = (float(special.ndtri(q)) for q in clipped)
-        move = (goal - here) / slope
+        probit, low, high = (float(special.ndtri(q)) for q in clipped)
+        move = (goal - probit) / slope
         # Half the interval's width away the slope's own error no longer counts.
-        if abs(goal - here) <= max(0.5 * (high - low), 0.02):
+        if abs(goal - probit) <= max(0.5 * (high - low), 0.02):
             ends = [question.easier(at, (goal - q) / slope) for q in (low, high)]
             return Interval(question.easier(at, move), min(ends), max(ends))
         at = question.easier(at, float(np.clip(move, -0.75, 0.75)))
@@ -268,11 +269,11 @@ def _settle_frames(question: LimitSearch, start: float) -> Interval:
     def at(frames: int) -> Interval:
         return question.simulated(frames * frame_s, seed)
 
-    def fewest(which: str) -> int:
+    def fewest(end: str) -> int:
         """Return the fewest frames that reach the power, by doubling steps and then bisection."""
 
         def reaches(frames: int) -> bool:
-            return frames > 0 and getattr(at(frames), which) >= question.power
+            return frames > 0 and getattr(at(frames), end) >= question.power
 
         many = max(round(start / frame_s), 1)
         few, step = many - 1, 1
@@ -283,7 +284,7 @@ def _settle_frames(question: LimitSearch, start: float) -> Interval:
             few, many, step = max(few - step, 0), few, 2 * step
         return smallest_integer(reaches, few, many)
 
-    value, low, high = (fewest(which) * frame_s for which in ("value", "high", "low"))
+    value, low, high = (fewest(end) * frame_s for end in ("value", "high", "low"))
     return Interval(value, low, high)
 
 
@@ -308,7 +309,7 @@ def what_matters(study: Study) -> QTable:
         changes["dark counts are Poisson in"] = {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
         for label, of_ends in changes.items():
             changed = (replace(case, study=case.study.with_instrument(change)) for change in of_ends.values())
-            low, high = (LimitSearch(each, statistic).root(near=nominal) for each in changed)
+            low, high = (LimitSearch(moved, statistic).root(near=nominal) for moved in changed)
             low_end, high_end = of_ends
             moves.append({
                 "star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0],
@@ -488,16 +489,16 @@ class LimitAnswer(Answer):
     @property
     def headline(self) -> str:
         """The limit of the first star and flare, by the recommended statistic if it is computed."""
-        asked = self.study.limit
+        question = self.study.limit
         limit = next((limit for limit in self.limits if limit.statistic == RECOMMENDED), self.limits[0])
-        before, number = SPOKEN[asked.of]
-        flare = "flares" if asked.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
-        within = "" if asked.of == "exposure" else f" in {self.study.observation.exposure_s:g} s"
+        before, number = SPOKEN[question.of]
+        flare = "flares" if question.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
+        within = "" if question.of == "exposure" else f" in {self.study.observation.exposure_s:g} s"
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
         least = first_of(len(self.limits), "limits")
         return (
             f"{self.instrument_name} would see {flare} on {limit.title}{within} with a "
-            f"chance of {100 * asked.power:g} % {before} {number(limit.value.value)} "
+            f"chance of {100 * question.power:g} % {before} {number(limit.value.value)} "
             f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
         )
 
@@ -515,8 +516,8 @@ class LimitAnswer(Answer):
             heading = "matters most, share of the variance"
             column = Column("shares", lambda row: forms.describe_shares(row.unknown.shares), heading=heading)
             shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], column)
-            what = "what is unknown of the instrument: the limits of each, and what explains their scatter"
-            views.append(View(f"Averaged over {draws} draws of {what}", shown, table_of(shown, self.limits)))
+            unknown = "what is unknown of the instrument: the limits of each, and what explains their scatter"
+            views.append(View(f"Averaged over {draws} draws of {unknown}", shown, table_of(shown, self.limits)))
         return [*views, *super().views]
 
     @cached_property
@@ -543,17 +544,17 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     draws = forms.drawn(study) if study.unknowns.draws else None
-    each = [LimitSearch(replace(case, study=one), statistic, engine) for one in draws.studies] if draws else []
-    question = LimitSearch(case, statistic, engine, report, each)
+    searches = [LimitSearch(replace(case, study=drawn), statistic, engine) for drawn in draws.studies] if draws else []
+    question = LimitSearch(case, statistic, engine, report, searches)
     # The root of the nominal instrument is near and found quickly.
-    theory = question.root(near=LimitSearch(case, statistic).root() if each else None)
-    roots = np.array([draw.root_or_nan(theory) for draw in each])
+    theory = question.root(near=LimitSearch(case, statistic).root() if searches else None)
+    roots = np.array([draw.root_or_nan(theory) for draw in searches])
     value = settle(question, theory)
     # Users are unlikely to choose a seed with this distance from another.
     question.simulated(value.value, (study.run.seed + 0x9E3779B97F4A7C15) % 2**64)
     *points, check = question.points
     quiet, flare = question.pair(value.value)
-    known, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
+    is_ideal, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
     named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
     rise = value.value if question.of == "amplitude" else case.amplitudes[0]
     there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
@@ -561,7 +562,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     amplitude = float("nan") if question.of == "amplitude" else case.amplitudes[0]
     return Limit(
         star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
-        ideal=float("nan") if known else LimitSearch(ideal, statistic).root_or_nan(theory),
+        ideal=float("nan") if is_ideal else LimitSearch(ideal, statistic).root_or_nan(theory),
         check=check, points=tuple(points), curve=question.curve(value.value),
         unknown=UnknownEffect(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
@@ -580,26 +581,26 @@ def limit(study: Study, engine: Engine | Pool | None = None, progress: Progress 
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
         fault = f"the sweep must run over other quantities than the {study.limit.of}, of which the limit is requested"
         raise InputError(fault, key="sweep")
-    asked = list(product(_single_flares(cases(study)), study.run.statistics))
-    steps, lock = [0] * len(asked), Lock()
+    questions = list(product(_single_flares(cases(study)), study.run.statistics))
+    steps, lock = [0] * len(questions), Lock()
 
-    def report(number: int, done: int) -> None:
+    def report(number: int, percent: int) -> None:
         with lock:
-            steps[number] = done
+            steps[number] = percent
             if progress is not None:
-                progress(sum(steps), STEPS * len(asked))
+                progress(sum(steps), STEPS * len(questions))
 
     def solved(number: int) -> Limit | InputError:
         try:
             # At least one more simulation follows each, until the limit is found.
-            return solve(*asked[number], engine, lambda count: report(number, STEPS * count // (count + 1)))
+            return solve(*questions[number], engine, lambda count: report(number, STEPS * count // (count + 1)))
         except InputError as error:
             # The limits of other stars are still computed.
             return error
         finally:
             report(number, STEPS)
 
-    outcomes = list(map_in_order(engine, solved, range(len(asked))))
+    outcomes = list(map_in_order(engine, solved, range(len(questions))))
     errors = [outcome for outcome in outcomes if isinstance(outcome, InputError)]
     limits = [outcome for outcome in outcomes if isinstance(outcome, Limit)]
     if not limits:

@@ -96,12 +96,11 @@ class MapAnswer(Answer):
     def headline(self) -> str:
         """The share of the map in which a flare is rather seen than not, by the recommended statistic if computed."""
         statistic = RECOMMENDED if RECOMMENDED in self.statistics else self.statistics[0]
-        number = self.statistics.index(statistic)
-        seen, known = (int(np.count_nonzero(chances[number] >= 0.5)) for chances in (self.probability, self.ideal))
-        ideal = "" if self.study.nuisances.none else f" ({known} {IF_KNOWN})"
+        chances, ideal = (values[self.statistics.index(statistic)] for values in (self.probability, self.ideal))
+        bound = "" if self.study.nuisances.none else f" ({np.count_nonzero(ideal >= 0.5)} {IF_KNOWN})"
         return (
             f"{self.instrument_name} would see a flare on {self.star} with a chance of at least 50 % in "
-            f"{seen} of {self.probability[number].size} cells of the map{ideal}."
+            f"{np.count_nonzero(chances >= 0.5)} of {chances.size} cells of the map{bound}."
         )
 
     @property
@@ -109,8 +108,8 @@ class MapAnswer(Answer):
         """Map of each statistic, with a row per value of y and a column per value of x."""
         draws = f"{self.study.unknowns.draws} draws of what is unknown"
         lines = [
-            View(f"{statistic}, averaged over {draws}: its scatter is from {forms.describe_shares(parts)}.")
-            for statistic, parts in self.shares.items()
+            View(f"{statistic}, averaged over {draws}: its scatter is from {forms.describe_shares(shares)}.")
+            for statistic, shares in self.shares.items()
         ]
         axes = ", ".join(axis.quantity for axis in self.study.map.axes[::-1])
         columns = [
@@ -123,8 +122,8 @@ class MapAnswer(Answer):
                 {"y": y} | {f"x{k}": p for k, p in enumerate(row)}
                 for y, row in zip(self.y, chances[number], strict=True)
             ]
-            what = f"detection probability in percent, {statistic}{kind}, fap {self.study.run.fap:g} per test"
-            lines.append(View(f"{self.star}: {what}", columns, table_of(columns, rows)))
+            title = f"detection probability in percent, {statistic}{kind}, fap {self.study.run.fap:g} per test"
+            lines.append(View(f"{self.star}: {title}", columns, table_of(columns, rows)))
         return lines
 
     @property
@@ -152,31 +151,30 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     total = len(draws) * len(x.points()) * len(y.points())
     report = (lambda done: None) if progress is None else (lambda done: progress(done, total))
     cells = Cells(x.points(), y.points(), engine or Engine(), report)
-    maps = [cells.map_of(draw) for draw in draws]
-    values, parts = maps[0], {}
+    maps = np.stack([cells.map_of(draw) for draw in draws], axis=1)
+    # Means over the draws; NaN if a draw has none.
+    values, shares = maps.mean(axis=1), dict[str, dict[str, float]]()
     if unknown is not None:
-        # Means over the draws; NaN if a draw has none.
-        every = {name: np.array([one[name] for one in maps]) for name in NUMBERS}
-        ends = dict(zip(NUMBERS[:3], forms.average(*(every[name] for name in NUMBERS[:3])), strict=True))
-        values = {name: each.mean(axis=0) for name, each in every.items()} | ends
+        values[:3] = forms.average(*maps[:3])
         for s, statistic in enumerate(study.run.statistics):
-            parts[statistic] = forms.shares(unknown, np.nanmean(every["probability"][:, s], axis=(1, 2)))
+            shares[statistic] = forms.shares(unknown, np.nanmean(maps[0, :, s], axis=(1, 2)))
     quiet, star, names = cells.quiet[0], study.star[0], {x.quantity, y.quantity}
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
     label = "stars of the axis" if "star" in names else star_label(star, quiet)
     return MapAnswer(study, label, cells.x, cells.y, study.run.statistics, messages=_messages(case, cells, values),
-                     shares=parts, inputs=(quiet,), **values)  # fmt: skip
+                     shares=shares, inputs=(quiet,), **dict(zip(NUMBERS, values, strict=True)))  # fmt: skip
 
 
-def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
+def _messages(case: Case, cells: Cells, values: Float) -> list[str]:
     """Return messages on the cells of a map, the most important first."""
     study, run, number_of_cells, messages = case.study, case.study.run, len(cells.x) * len(cells.y), list[str]()
-    lost = np.isnan(values["closed_form"][0])
+    probability, _, _, closed_form, _ = values
+    lost = np.isnan(closed_form[0])
     if lost.any():
         text = f"SATURATED: every pixel that counts saturates in {lost.sum()} of {lost.size} cells: no number there."
         messages.append(Message(text, SATURATED))
-    missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
+    missing = np.isnan(probability) & ~np.isnan(closed_form)
     for statistic, there in zip(run.statistics, missing, strict=True):
         if there.any():
             messages.append(Message(
@@ -186,12 +184,12 @@ def _messages(case: Case, cells: Cells, values: Arrays) -> list[str]:
             ))  # fmt: skip
     for why, number in cells.failed.items():
         messages.append(Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer"))
-    how = "" if study.nuisances.none else "marginalised over unknowns, "
+    marginalised = "" if study.nuisances.none else "marginalised over unknowns, "
     lowered = Counter(statistic for statistic, *_ in cells.lowered)
     for statistic in (name for name in run.statistics if lowered[name]):
         messages.append(Message(
-            f"WRONG SIGN: {how}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} cells, "
-            "and only higher values are alarms: its detection probability says nothing of the flare there.",
+            f"WRONG SIGN: {marginalised}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} "
+            "cells, and only higher values are alarms: its detection probability says nothing of the flare there.",
             "wrong sign",
         ))  # fmt: skip
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
@@ -216,8 +214,8 @@ def magnitudes_of(case: Case) -> Axis:
     ends, saturating, faint = list[float](), list[float](), SEARCH["magnitude"][0]
     for value in values if isinstance(values[0], str) else (values[0], values[-1]):
         for power in (min(powers), max(powers)):
-            one = case.with_sections(limit=LimitQuestion(of="magnitude", power=power))
-            search = LimitSearch(one.with_value(question.y.quantity, value), statistic)
+            question_of_power = case.with_sections(limit=LimitQuestion(of="magnitude", power=power))
+            search = LimitSearch(question_of_power.with_value(question.y.quantity, value), statistic)
             quiet = search.scaled(MIDDLE)[0]
             star = quiet.gain_dn_per_electron * quiet.source_electrons
             room = quiet.ceiling_dn - (quiet.mean_raw_dn - star)
@@ -243,9 +241,6 @@ def _shown(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
-Arrays = dict[str, Float]
-
-
 @dataclass(eq=False)
 class Cells:
     """Cells of a map, and what their computation finds for messages."""
@@ -261,10 +256,9 @@ class Cells:
     lowered: set[tuple[str, int, int]] = field(default_factory=set)
     failed: Counter[str] = field(default_factory=Counter)  # number of cells without an answer by the reason
 
-    def map_of(self, case: Case) -> Arrays:
-        """Compute the map on the instrument of a case."""
-        shape = (len(case.study.run.statistics), len(self.y), len(self.x))
-        values = {name: np.full(shape, np.nan) for name in NUMBERS}
+    def map_of(self, case: Case) -> Float:
+        """Compute the map on the instrument of a case, shape (n_number, n_statistic, n_y, n_x)."""
+        values = np.full((len(NUMBERS), len(case.study.run.statistics), len(self.y), len(self.x)), np.nan)
 
         def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int, list[str]]:
             group = [_cell(case, self.x[i], self.y[j]) for i, j in cells]
@@ -291,7 +285,7 @@ class Cells:
             self.progress(self.done)
         return values
 
-    def _fill(self, values: Arrays, cells: list[tuple[int, int]], case: Case, flares: list[Expectation]) -> None:
+    def _fill(self, values: Float, cells: list[tuple[int, int]], case: Case, flares: list[Expectation]) -> None:
         """Compute cells that share the quiescent star of a case."""
         run = case.study.run
         result = self.engine.detect(case.quiet, flares, seed=run.seed, **case.detect_options())
@@ -299,13 +293,9 @@ class Cells:
         for s, statistic in enumerate(run.statistics):
             probabilities = result.detection_probability(run.fap, statistic)
             for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
-                at = (s, j, i)
-                values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
                 limit = result.closed_form(statistic, template=k).isf(run.fap)
-                if ideal is not None:
-                    values["ideal"][at] = ideal[k, s]
-                if k not in result.blinding:
-                    values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+                chance = np.nan if k in result.blinding else result.closed_form(statistic, k).sf(limit)
+                values[:, s, j, i] = p.value, p.low, p.high, chance, np.nan if ideal is None else ideal[k, s]
                 if result.fall(statistic, k):
                     self.lowered.add((statistic, i, j))
 

@@ -104,8 +104,8 @@ def _line_flux(light: FlareSpectrum, scale: float, of: str) -> float:
         return 0.0 if light.surface else np.nan
     relative = scale * light.continuum_flux
     lines = dict(light.fluxes_cgs) | {line: relative * share for line, share in light.fractions.items()}
-    wanted = spectra.EmissionLine.named(of).name
-    return next((flux for line, flux in lines.items() if spectra.EmissionLine.named(line).name == wanted), 0.0)
+    name = spectra.EmissionLine.named(of).name
+    return next((flux for line, flux in lines.items() if spectra.EmissionLine.named(line).name == name), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +195,8 @@ def model_of(case: Case, *, jump: bool = False, lines: tuple[str, ...] = ()) -> 
 
 def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
     """Return the models that are fitted to exposures of a case, the simplest first."""
-    asked = fitted_models(case.study.measure, case.study.flare)
-    models = {name: model_of(case, jump=jump, lines=lines) for name, jump, lines in asked}
+    fitted = fitted_models(case.study.measure, case.study.flare)
+    models = {name: model_of(case, jump=jump, lines=lines) for name, jump, lines in fitted}
     return {name: TwoTemperatures(model) if name == "two-temperatures" else model for name, model in models.items()}
 
 
@@ -231,8 +231,8 @@ def expected_measurements(
             # The observer knows the quiescent exposure from other frames, and fits with the calibrated throughput.
             moved = [fit_model(exposure, quiet, model, unknown, skipped).estimates[0] for exposure in calibrated]
             of_throughput = np.asarray(np.sqrt(np.sum(np.square(moved - perfect.estimates[0]), axis=0)))
-        found = (known_snr, snr), true, known, ahead, perfect, model, quiet, unknown, of_throughput, skipped
-        expected.append(ExpectedMeasurement(case.label, case.at, amplitude, name, *found))
+        results = (known_snr, snr), true, known, ahead, perfect, model, quiet, unknown, of_throughput, skipped
+        expected.append(ExpectedMeasurement(case.label, case.at, amplitude, name, *results))
     return expected
 
 
@@ -274,8 +274,8 @@ class MeasuredFlare(ExpectedMeasurement):
             return mean, np.zeros_like(mean)
         unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
         variance, used = usable_variance(self.quiet, mean, self.skipped_nm, unknown)
-        variance, left = np.where(used, variance, np.inf), self.frame - mean - expected
-        return mean, expected + fitted_amplitudes(unknown.spectra, unknown.sd, left, variance) @ unknown.spectra
+        variance, residual = np.where(used, variance, np.inf), self.frame - mean - expected
+        return mean, expected + fitted_amplitudes(unknown.spectra, unknown.sd, residual, variance) @ unknown.spectra
 
     def rows(self) -> QTable:
         """Return one row per quantity."""
@@ -286,11 +286,11 @@ class MeasuredFlare(ExpectedMeasurement):
         """Shares of intervals that hold the truth, with 95 % intervals, by their columns; shape (3, n_derived) each."""
         found, covers = self.found, dict[str, Float]()
         exposures = {"": np.ones(self.selected.size, np.bool_), "_selected": self.selected}
-        for (suffix, which), (k, level) in product(exposures.items(), enumerate(found.levels)):
-            inside = ((found.low[k] <= self.truth) & (self.truth <= found.high[k]))[which]
+        for (suffix, chosen), (k, level) in product(exposures.items(), enumerate(found.levels)):
+            inside = ((found.low[k] <= self.truth) & (self.truth <= found.high[k]))[chosen]
             cover = covers[f"coverage_{100 * level:.0f}{suffix}"] = np.full((3, self.truth.size), np.nan)
-            known = np.isfinite(self.truth) & bool(len(inside))
-            cover[:, known] = clopper_pearson_ends(inside[:, known].sum(axis=0), max(len(inside), 1))
+            has_truth = np.isfinite(self.truth) & bool(len(inside))
+            cover[:, has_truth] = clopper_pearson_ends(inside[:, has_truth].sum(axis=0), max(len(inside), 1))
         return covers
 
     @property
@@ -446,7 +446,7 @@ class MeasureAnswer(Answer):
     #: Measurements against time; one row per star, cell and bin of its stare.
     temperatures = TableOf(
         "temperatures",
-        lambda answer: [replace(MODEL_COLUMN, heading=""), *chain(*(_bin_columns(one) for one in answer.binned[:1]))],
+        lambda answer: [replace(MODEL_COLUMN, heading=""), *chain(*map(_bin_columns, answer.binned[:1]))],
         lambda answer: answer.binned or QTable(), place=True, key="temperatures", when="study.measure.snr_per_bin",
         of=lambda _, stare: table_of(_bin_columns(stare), [stare]),
         title=lambda answer: answer.binned and f"Measured along the stare, in bins of S/N "
@@ -477,8 +477,8 @@ class MeasureAnswer(Answer):
         """The error of the first measured quantity of the first flare."""
         flare = self.flares[0]
         name, unit = flare.found.names[0], flare.found.units[0]
-        error, known = flare.ahead.errors[0], flare.known.errors[0]
-        ideal = "" if self.study.nuisances.none else f" ({known:.3g} {unit} {IF_KNOWN})"
+        error, known_error = flare.ahead.errors[0], flare.known.errors[0]
+        ideal = "" if self.study.nuisances.none else f" ({known_error:.3g} {unit} {IF_KNOWN})"
         return (
             f"{self.instrument_name} would measure the {name.replace('_', ' ')} of a flare of "
             f"{100 * flare.amplitude:g} % on {flare.title} in {flare.quiet.exposure_s:g} s with a standard error of "
@@ -502,8 +502,8 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
         raise InputError.of("flare.amplitudes", 0, "above 0 in a measurement")
     expectations = [x for case in prepared for x in case.expectations]
     engine = engine or Engine()
-    asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
-    measured = reported(map_in_order(engine, lambda row: _measured(*row), asked), len(asked), progress)
+    questions = [(case, *flare) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
+    measured = reported(map_in_order(engine, lambda row: _measured(*row, engine), questions), len(questions), progress)
     flares = list(chain.from_iterable(measured))
     stares = [measured_stare(case, engine) for case in prepared] if study.measure.along_stare else []
     messages = collect_messages(expectations) + [stare.unmeasured for stare in stares if stare.unmeasured]
@@ -538,21 +538,21 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         return arrays
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
-    parts: list[Arrays] = []
+    batches: list[Arrays] = []
     for start in range(0, study.measure.fits, BATCH):
         count = min(BATCH, study.measure.fits - start)
         # The number changes with the arrays that a fit keeps.
         depends_on = ("measure", 2, quiet, flare, unknown, models, study.text(), start, count)
-        parts.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
-    selected = np.concatenate([arrays["detected"] for arrays in parts])
+        batches.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
+    selected = np.concatenate([arrays["detected"] for arrays in batches])
     measured = []
     for k, forecast in enumerate(expected):
-        own: list[dict[str, Any]] = [
-            {key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts
-        ]
-        batches = [replace(forecast.perfect, **arrays | {"dof": int(arrays["dof"])}) for arrays in own]
-        found = Measurement.joined(batches)
-        measured.append(MeasuredFlare(**vars(forecast), found=found, selected=selected, frame=parts[0]["first"]))
+        fits = list[Measurement]()
+        for batch in batches:
+            arrays: dict[str, Any] = {name: batch[f"{k} {name}"] for name in forecast.perfect.arrays()}
+            fits.append(replace(forecast.perfect, **arrays | {"dof": int(arrays["dof"])}))
+        joined = Measurement.joined(fits)
+        measured.append(MeasuredFlare(**vars(forecast), found=joined, selected=selected, frame=batches[0]["first"]))
     return measured
 
 
@@ -563,16 +563,16 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
     from mauvecl.fits.time_course import fit_bins, measure_along
     from mauvecl.flares.stare_scene import StaresRequest
 
-    study, asked = case.study, case.study.measure
+    study, question = case.study, case.study.measure
     staring, events = case.stare_expectation, case.events
-    if asked.joint_fit and len(events) != 1:
+    if question.joint_fit and len(events) != 1:
         fault = f"a joint fit needs a stare with a single flare, but it has {len(events)}"
         raise InputError(fault, key="measure.joint_fit")
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
     models = models_of(case.one_frame)
-    single = [(name, one) for name, one in models.items() if isinstance(one, FlareModel)]
     # Where only two temperatures are fitted, the model of one of them, with its lines.
-    single += [("blackbody", one.single) for one in models.values() if isinstance(one, TwoTemperatures) and not single]
+    single = [("blackbody", double.single) for double in models.values() if isinstance(double, TwoTemperatures)]
+    single += [(name, model) for name, model in models.items() if isinstance(model, FlareModel)]
     name, model = single[-1]
     unknown = case.unknowns_of_fits(quiet, stare)
     processes = study.processes.additive_only
@@ -586,11 +586,11 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
     depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
     raw = kept(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
-    joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
-    bins, perfect, unmeasured, skipped = None, None, "", asked.skipped_nm
-    if (wanted := asked.snr_per_bin) is not None:
+    joint = _joint_fit(case, raw, unknown) if question.joint_fit else None
+    bins, perfect, unmeasured, skipped = None, None, "", question.skipped_nm
+    if (snr := question.snr_per_bin) is not None:
         try:
-            bins = measure_along(raw, quiet, model, unknown, snr_per_bin=wanted, stare=stare, skipped_nm=skipped)
+            bins = measure_along(raw, quiet, model, unknown, snr_per_bin=snr, stare=stare, skipped_nm=skipped)
         except InputError as error:
             unmeasured = f"No flare of {case.label} is measured along the stare: {error}."
         else:

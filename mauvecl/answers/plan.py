@@ -15,7 +15,7 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, TableOf, reported, share_co
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.answers.verbs import Progress, by_keywords
-from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible
+from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible_targets
 from mauvecl.device.stares import Stares
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
 from mauvecl.flares.settings import Curve
@@ -26,7 +26,7 @@ from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.noise.unknowns import COURSES
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.columns import Column, interval_columns, number, percent, records
+from mauvecl.schema.columns import Column, interval_columns, number, percent
 from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
 from mauvecl.schema.fields import DAY_S
 from mauvecl.schema.section import given_keys
@@ -42,7 +42,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.detection.nuisances import Nuisances
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.search.completeness import DurationLaw
 
 
 def two_digits(value: float) -> str:
@@ -50,9 +49,9 @@ def two_digits(value: float) -> str:
     return f"{value:.0f}" if value == 0 or value >= 9.95 else f"{value:#.2g}"
 
 
-def energy(value: float, unit: str = "") -> str:
+def energy(value: float) -> str:
     """Format an energy with two significant digits, or "none" if it is not finite."""
-    return f"{value:.1e}{unit}" if math.isfinite(value) else "none"
+    return f"{value:.1e}" if math.isfinite(value) else "none"
 
 
 def months(names: str) -> str:
@@ -60,7 +59,7 @@ def months(names: str) -> str:
     years: dict[str, list[str]] = {}
     for name in names.split():
         years.setdefault(name[:4], []).append(calendar.month_abbr[int(name[5:])])
-    return ", ".join(f"{' '.join(each)} {year}" for year, each in years.items())
+    return ", ".join(f"{' '.join(of_year)} {year}" for year, of_year in years.items())
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +141,9 @@ class Planned:
             return {"target": self.name, "energy": np.zeros(0), "recovered": np.zeros(0), "rate_above": np.zeros(0)}
         energies, p = self.completeness.energy_erg, self.completeness.probability
         first = max(int(np.argmax(p > 0)) - 1, 0)
-        part = slice(first, first + 161)
-        rate = np.full(p[part].size, np.nan) if self.rates is None else self.rates.per_day_above(energies[part])
-        return {"target": self.name, "energy": energies[part], "recovered": p[part], "rate_above": rate}
+        rows = slice(first, first + 161)
+        rate = np.full(p[rows].size, np.nan) if self.rates is None else self.rates.per_day_above(energies[rows])
+        return {"target": self.name, "energy": energies[rows], "recovered": p[rows], "rate_above": rate}
 
     @property
     def published(self) -> str:
@@ -152,13 +151,13 @@ class Planned:
         return "" if self.rates is None else "published for {:.2g} to {:.2g} erg".format(*self.rates.measured_erg)
 
 
-def closed_form(observation: TargetObservation, *, known: bool = False) -> Completeness:
+def closed_form(observation: TargetObservation, *, ideal: bool = False) -> Completeness:
     """Return the completeness of a bank of matched filters in white noise; see `Completeness.of_search`.
 
-    `known` takes everything but the noise as known.
+    `ideal` takes everything but the noise as known.
     """
     study = observation.case.study
-    signal = observation.signal_with(None) if known else observation.signal_per_frame
+    signal = observation.signal_with(None) if ideal else observation.signal_per_frame
     return Completeness.of_search(
         signal, observation.scale, window_s=observation.window_s, false_alarms_per_day=study.search.rate,
         bank=study.search.white_bank(observation.quiet.frame_s), law=study.plan.law(),
@@ -173,8 +172,8 @@ def errors_of_throughput(observation: TargetObservation, rates: Rates | None) ->
     calibrated = throughput_cases(observation.case)
     if not calibrated or not observation.signal_per_frame > 0 or not observation.window_s > 0:
         return None
-    answers = [closed_form(replace(observation, case=case)) for case in (observation.case, *calibrated)]
-    values = [(its.energy_at(0.5), np.nan if rates is None else recovered_per_day(rates, its)) for its in answers]
+    forms = [closed_form(replace(observation, case=case)) for case in (observation.case, *calibrated)]
+    values = [(form.energy_at(0.5), np.nan if rates is None else recovered_per_day(rates, form)) for form in forms]
     nominal, *moved = np.log(values)
     energy, number = np.sqrt(((np.array(moved) - nominal) ** 2).sum(axis=0))
     return float(energy), float(number)
@@ -183,11 +182,11 @@ def errors_of_throughput(observation: TargetObservation, rates: Rates | None) ->
 def rates_of(observation: TargetObservation) -> tuple[Rates | None, str]:
     """Return a target's flare rates by bolometric energy, or None and the reason why they are unknown."""
     case, flare = observation.case, observation.case.study.flare
-    text = case.study.plan.targets[observation.number]
+    row = case.study.plan.targets[observation.number]
     try:
-        rates = text.distribution(observation.target.spectral_type or "")
+        rates = row.distribution(observation.target.spectral_type or "")
     except InputError as error:
-        if given_keys(text, RATES):
+        if given_keys(row, RATES):
             raise
         return None, str(error)
     if rates.definition == "light":
@@ -199,50 +198,49 @@ def rates_of(observation: TargetObservation) -> tuple[Rates | None, str]:
     return rates.of_light(erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
 
 
-def star_of(text: PlanTarget, simbad: bool) -> Star:
-    """Return the library star that represents a target.
+def star_of(row: PlanTarget, target: Target) -> Star:
+    """Return the library star that represents a target of a plan, which has been looked up.
 
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """
-    target = text.target(simbad)
-    given: dict[str, Any] = {name: getattr(target, name) for name in ("spectral_type", "magnitude", "distance_pc")}
-    missing = [name for name, value in given.items() if value is None]
+    properties: dict[str, Any] = {name: getattr(target, name) for name in ("spectral_type", "magnitude", "distance_pc")}
+    missing = [name for name, value in properties.items() if value is None]
     if missing:
-        gaia = [name for name in text.unused if name.casefold() == "phot_g_mean_mag" and "magnitude" in missing]
-        other = f", and {gaia[0]} is a magnitude in G, not in V" if gaia else ""
+        gaia = [name for name in row.unused if name.casefold() == "phot_g_mean_mag" and "magnitude" in missing]
+        gaia_text = f", and {gaia[0]} is a magnitude in G, not in V" if gaia else ""
         raise InputError(
-            f"target {text.name!r} has no {' and no '.join(missing)}; give them in the table of targets, since it is "
-            f"not in the embedded list{other}",
+            f"target {row.name!r} has no {' and no '.join(missing)}; give them in the table of targets, since it is "
+            f"not in the embedded list{gaia_text}",
             key="plan.targets",
         )
-    library = nearest_spectrum(given.pop("spectral_type"))
-    given |= {name: getattr(text, name) for name in ("neighbours", "neighbours_of", "neighbour_share")}
-    return Star(library=library, **given)
+    library = nearest_spectrum(properties.pop("spectral_type"))
+    properties |= {name: getattr(row, name) for name in ("neighbours", "neighbours_of", "neighbour_share")}
+    return Star(library=library, **properties)
 
 
 def observe(
-    case: Case, k: int, star: Star, seen: VisibleAnswer, along: tuple[Float, Float] | None
+    case: Case, k: int, star: Star, visible: VisibleAnswer, along: tuple[Float, Float] | None
 ) -> TargetObservation:
     """Return the observation of target `k`, with the sky behind it and the conditions while it is visible.
 
     `along` has the detector's temperature (deg C) and the particle hits (cm-2 s-1) at each time of the orbit, or is
     None for those of the study.
     """
-    target, study, when = seen.targets[k], case.study, seen.visibility.seen[:, k]
-    windows, zodiacal = seen.windows[k], seen.zodiacal[k]
+    target, study, when = visible.targets[k], case.study, visible.visibility.seen[:, k]
+    windows, zodiacal = visible.windows[k], visible.zodiacal[k]
     changes: dict[str, Any] = {"star": (star,)}
     sky, window_s, swing = None, 0.0, tuple[tuple[float, float], ...]()
-    known = np.isfinite(zodiacal)
-    if known.any():
+    has_sky = np.isfinite(zodiacal)
+    if has_sky.any():
         # The median over the days on which the target is visible, or over all.
-        used = known & (seen.visibility.by_day(k) > 0)
-        sky = float(np.median(zodiacal[used if used.any() else known]))
+        used = has_sky & (visible.visibility.by_day(k) > 0)
+        sky = float(np.median(zodiacal[used if used.any() else has_sky]))
         changes["sky"] = SkyLight(surface_brightness=sky)
     if when.any():
         window_s = float(np.median(windows.length_s))
     if when.any() and along is not None:
         temperature_c, hits = along
-        mean_c, step_s = float(temperature_c[when].mean()), seen.times.step_s
+        mean_c, step_s = float(temperature_c[when].mean()), visible.times.step_s
         # The first window if several have the median length.
         typical = int(np.argmin(np.abs(windows.length_s - window_s)))
         first = round(float(windows.start_s[typical]) / step_s)
@@ -279,42 +277,26 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
     )  # fmt: skip
     stare, search = study.stare.model_copy(update=changes), study.search.model_copy(update={"nulls": 0})
     question = observation.case.with_sections(stare=stare, search=search, injections=injections).study
-    energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
+    energy_erg = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
 
     def computed() -> Arrays:
         star = inject(question, engine).stars[0]
-        widths = np.array(star.injected.half_widths_s)
-        found = found_by_energy(star.injected.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
-        return {"probability": found, "threshold": np.array(star.threshold.value), "shifted": np.array(star.shifted)}
+        probability = star.injected.by_energy(energy_erg, study.plan.law())
+        return {
+            "probability": probability,
+            "threshold": np.array(star.threshold.value),
+            "shifted": np.array(star.shifted),
+        }
 
     depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
     arrays = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
-    how = (
+    method = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
         f"{observation.window_s / 60:.0f} min, found above {float(arrays['threshold']):.2f} sigma, "
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
         + (", allowing for unknowns that the search leaves in" if arrays["shifted"] else "")
     )
-    return Completeness(energy, arrays["probability"], BOLOMETRIC, how)
-
-
-def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
-    """Return the completeness by energy, averaged over the half-widths of an energy, shape (n_energy,).
-
-    `critical_erg` holds the smallest detected energy of each injection, shape (n_half_width, n_draw). It is zero if
-    there is an alarm without the flare; these injections are ignored, since false alarms are counted separately.
-    """
-    of_width = np.empty((half_widths_s.size, energy_erg.size))
-    for row, energies in zip(of_width, critical_erg, strict=True):
-        counted = np.sort(energies[energies > 0])
-        row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
-    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
-    half = np.log(law.half_width(energy_erg)[:, None] * 10 ** (law.scatter_dex * nodes))
-    place = np.interp(half, np.log(half_widths_s), np.arange(half_widths_s.size))
-    i = np.minimum(place.astype(int), half_widths_s.size - 2)
-    part, column = place - i, np.arange(energy_erg.size)[:, None]
-    p = (1 - part) * of_width[i, column] + part * of_width[i + 1, column]
-    return np.asarray(np.clip(p @ (weights / weights.sum()), 0.0, 1.0))
+    return Completeness(energy_erg, arrays["probability"], BOLOMETRIC, method)
 
 
 def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
@@ -330,7 +312,7 @@ def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
     Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f", detail=True),
-    Column("hours", "", "h", "of it observed", "observed (h)", ".0f"),
+    Column("hours", "", "h", "part of it that is observed", "observed (h)", ".0f"),
     Column("E50", lambda row: row.energy_at(0.5), "erg",
            "bolometric energy from which on half of the flares are recovered", "E50 (erg)", energy),
     Column("E90", lambda row: row.energy_at(0.9), "erg",
@@ -345,12 +327,12 @@ COLUMNS = (
                       lambda low, high: "" if low is None else f"{low} to {high}", kind=int),
     Column("at_least_one", lambda row: row.recovered.at_least_one if row.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f"), detail=True),
-    Column("false_alarms", lambda row: row.observation.case.study.search.rate * row.hours / 24, "", "expected of noise",
-           "false alarms", two_digits, detail=True),
+    Column("false_alarms", lambda row: row.observation.case.study.search.rate * row.hours / 24, "",
+           "expected from noise", "false alarms", two_digits, detail=True),
     share_column("observation.quiet.target_share"),
     _throughput_column("E50_error", 0, "E50", "E50 by throughput"),
     _throughput_column("expected_error", 1, "the recovered flares", "flares by throughput"),
-    Column("best_months", lambda row: " ".join(row.best_months), "", "those with most hours", "best months",
+    Column("best_months", lambda row: " ".join(row.best_months), "", "months with the most hours", "best months",
            months, detail=True),
 )  # fmt: skip
 #: Columns of the table of inputs.
@@ -358,7 +340,7 @@ STAR_COLUMNS = (
     Column("target", "name", "", "name of the target"),
     Column("ra", "observation.target.ra_deg", "deg", "right ascension"),
     Column("dec", "observation.target.dec_deg", "deg", "declination"),
-    Column("position", "observation.target.source", "", "who says so"),
+    Column("position", "observation.target.source", "", "source of the position"),
     Column("spectral_type", lambda row: row.observation.target.spectral_type or ""),
     Column("spectrum", lambda row: row.observation.case.star.library or "", "",
            "embedded spectrum that stands for the star"),
@@ -377,7 +359,7 @@ STAR_COLUMNS = (
     Column("saturated", lambda row: int(row.observation.quiet.saturated.sum()), "",
            "pixels left out since they saturate"),
     Column("rates", lambda row: row.no_rates if row.rates is None else row.rates.source, "",
-           "where its flare rates are from, or why there are none"),
+           "source of its flare rates, or the reason why there are none"),
     Column("recovered_per_day",
            lambda row: np.nan if row.rates is None or row.completeness is None
            else recovered_per_day(row.rates, row.completeness), "", "flares recovered in a day of exposure"),
@@ -418,10 +400,10 @@ class PlanAnswer(Answer):
     @property
     def headline(self) -> str:
         """The expected flares of the target with most of them."""
-        known = [target for target in self.planned if target.recovered is not None]
-        if not known:
+        with_rates = [target for target in self.planned if target.recovered is not None]
+        if not with_rates:
             return f"No flares are predicted for {self.planned[0].name}: its flare rates are not known."
-        best = max(known, key=lambda target: target.recovered.expected if target.recovered else 0.0)
+        best = max(with_rates, key=lambda target: target.recovered.expected if target.recovered else 0.0)
         assert best.recovered is not None
         ideal = "" if np.isnan(best.ideal) else f"; {two_digits(best.ideal)} {IF_KNOWN}"
         most = f", the most of {len(self.planned)} targets" if len(self.planned) > 1 else ""
@@ -456,7 +438,7 @@ class PlanAnswer(Answer):
             ("duration of flares", half_width, "assumption; exponent of Maehara et al. 2015"),
             ("shape of flares", study.search.shape, "every flare alike, no bursts"),
             ("light of flares", light,
-             "assumption; energies are those of all its light, spread alike in all directions"),
+             "assumption; energies are those of all its light, emitted equally in all directions"),
             ("noise of a stare", "white", "in addition to the study's unknowns of a stare; see completeness"),
             *self._along_orbit,
             ("false alarms", alarms, "sets the threshold; of noise, not of hits by particles that look like flares"),
@@ -492,6 +474,10 @@ class PlanAnswer(Answer):
     def observed(self) -> list[Case]:
         """One frame of each target."""
         return [target.observation.case for target in self.planned]
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        return self.report("plan", self.study.plan.report)
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -576,11 +562,11 @@ def plan(
                 f"processes.{name} needs plan.completeness = 'injections', since 'closed form' takes the stare for "
                 "known", key=f"processes.{name}",
             )  # fmt: skip
-    stars: list[Star] = []
-    errors: list[InputError] = []
-    for text in study.plan.targets:
+    targets, stars, errors = list[Target](), list[Star](), list[InputError]()
+    for row in study.plan.targets:
         try:
-            stars.append(star_of(text, study.orbit.simbad))
+            targets.append(row.target(study.orbit.simbad))
+            stars.append(star_of(row, targets[-1]))
         except InputError as error:
             errors.append(error)
     if errors:
@@ -588,23 +574,23 @@ def plan(
         raise together(errors)
     if progress is not None:
         progress(0, len(stars))
-    seen, base, along = visible(study), Case(study), None
+    visible, base, along = visible_targets(study, targets), Case(study), None
     if study.plan.along_orbit:
-        track = seen.visibility.track
+        track = visible.visibility.track
         along = Thermal().temperature_c(track.sunlight, track.times.step_s), Particles().rate_per_cm2_s(track)
-    observed = (observe(base, k, star, seen, along) for k, star in enumerate(stars))
-    planned_for = partial(_planned, seen, completeness or partial(inject_target, engine=engine or Stares()))
+    observed = (observe(base, k, star, visible, along) for k, star in enumerate(stars))
+    planned_for = partial(_planned, visible, completeness or partial(inject_target, engine=engine or Stares()))
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     planned = tuple(reported(map_in_order(engine, planned_for, observed), len(stars), progress))
-    return PlanAnswer(study, seen, planned)
+    return PlanAnswer(study, visible, planned)
 
 
-def _planned(seen: VisibleAnswer, completeness: CompletenessOf, target: TargetObservation) -> Planned:
+def _planned(visible: VisibleAnswer, completeness: CompletenessOf, target: TargetObservation) -> Planned:
     """Return the plan of an observed target."""
-    study, k, its = seen.study, target.number, None
+    study, k, its = visible.study, target.number, None
     if target.window_s > 0:
         its = completeness(target) if target.signal_per_frame > 0 else NOTHING
-    exposed, (names, hours) = float(seen.visibility.hours[k]), seen.by_month
+    exposed, (names, hours) = float(visible.visibility.hours[k]), visible.by_month
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
     # The months in which it is seen for the most hours, in order.
@@ -615,55 +601,6 @@ def _planned(seen: VisibleAnswer, completeness: CompletenessOf, target: TargetOb
     if rates is not None:
         recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
         if study.nuisances.usual and its not in (None, NOTHING):
-            ideal = recovered_per_day(rates, closed_form(target, known=True)) * days
+            ideal = recovered_per_day(rates, closed_form(target, ideal=True)) * days
     errors = errors_of_throughput(target, rates)
     return Planned(target, exposed, observed, its, rates, recovered, best, why, errors, ideal)
-
-
-#: Explanation of the columns.
-LEGEND = (
-    "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
-    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
-    "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
-    "P(>= 1): probability of recovering any. False alarms: expected of noise. Numbers are those of plan.ecsv."
-)
-
-
-def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
-    """Return the lines on a target: quantity, value, and the file and column of the value."""
-    target, observation = answer.planned[k], answer.planned[k].observation
-    record = records(answer.table)[k]
-    columns = PlanAnswer.table.columns_of(answer)
-    said = {column.name: column.text(record) for column in columns if column.heading}
-    place, star, seen = observation.target, observation.case.star, answer.seen
-    lines = [
-        ("right ascension, declination", f"{place.ra_deg:.4f}, {place.dec_deg:.4f} deg ({place.source})",
-         "stars: ra, dec, position"),
-        ("type; spectrum that stands for it", f"{place.spectral_type}; {star.library}",
-         "stars: spectral_type, spectrum"),
-        ("V; distance", f"{star.magnitude:g}; {star.distance_pc:g} pc", "stars: V, distance"),
-        ("seen; observed", f"{said['seen']} h; {said['hours']} h", "plan: seen, hours"),
-    ]  # fmt: skip
-    if target.seen_h == 0:
-        return [*lines, ("never seen", seen.reason(place.name), "assumptions")]
-    away = seen.elongation_deg(k)
-    lines += [
-        ("median stretch", f"{observation.window_s / 60:.0f} min", "stars: window"),
-        ("best months", said["best_months"], "plan: best_months; months"),
-        ("angle from the Sun", f"{away.min():.0f} to {away.max():.0f} deg", "days: elongation"),
-        ("detector; hits by particles", f"{observation.quiet.conditions['temperature_c']:.1f} deg C; "
-         f"{observation.case.study.processes.particles_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
-        ("S/N of a frame at amplitude 1", f"{observation.signal_per_frame:.4g}", "stars: signal_per_frame"),
-        ("half of flares recovered from", energy(target.energy_at(0.5), " erg"), "plan: E50; energies: recovered"),
-        ("90 % of flares recovered from", energy(target.energy_at(0.9), " erg"), "plan: E90; energies: recovered"),
-    ]  # fmt: skip
-    if target.recovered is not None:
-        lines += [
-            ("flares recovered, expected", said["expected"], "plan: expected; stars: recovered_per_day"),
-            ("95 % of campaigns", said["low"], "plan: low, high; stars: scatter"),
-            ("probability of at least one", said["at_least_one"], "plan: at_least_one"),
-        ]
-    lines.append(("false alarms expected", said["false_alarms"], "plan: false_alarms"))
-    rates = target.no_rates if target.rates is None else target.rates.source
-    lines.append(("flare rates", rates, "stars: rates; assumptions"))
-    return lines

@@ -18,7 +18,7 @@ from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
 from mauvecl.noise.reference import components
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, View, stacked
+from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import DAY_S, FirstRealisation, Wavelength
 from mauvecl.study.cases import Case, cases, collect_messages, star_column, star_label
@@ -121,19 +121,19 @@ def exposure(study: Study, engine: Engine | Pool | None = None, progress: Progre
     prepared = cases(study, swept=False)
     for case in reported(prepared, len(prepared), progress):
         try:
-            answered.append(_one(case, snr, wavelength_nm, per))
+            answered.append(_shortest_exposure(case, snr, wavelength_nm, per))
         except InputError as error:
             # The exposures of other stars are still computed.
             failed.append(error)
     if not answered:
         raise failed[0]
-    exposures, seen = zip(*answered, strict=True)
-    messages = [Message(f"NO ANSWER: {error}.", "no answer") for error in failed] + collect_messages(list(seen))
+    exposures, expectations = zip(*answered, strict=True)
+    messages = [Message(f"NO ANSWER: {error}.", "no answer") for error in failed] + collect_messages(list(expectations))
     for e in exposures:
         if e.exposure_s > DAY_S:
             days = f"{np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up"
             messages.append(Message(f"{e.star} needs more than a day: {days}.", "long exposure"))
-    return ExposureAnswer(study, exposures, tuple(messages), seen)
+    return ExposureAnswer(study, exposures, tuple(messages), expectations)
 
 
 @validated
@@ -148,7 +148,7 @@ def exposure_for(
     return exposure(study)
 
 
-def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
+def _shortest_exposure(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
     """Return the fewest frames for an S/N, and the expectation of as many."""
     frame = case.one_frame.quiet
     place = place_of(frame, wavelength_nm, per)
@@ -169,19 +169,19 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
     near = int(np.ceil((snr / single) ** 2))
     frames = smallest_integer(lambda n: after(n) >= snr, max(near - 2, 0), near + 1)
     x = replace(frame, n_frames=frames)
-    here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
+    saturated = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
     reached, less = after(frames), after(frames - 1) if frames > 1 else 0.0
-    asked = case.one_frame.label, wavelength_nm, per, snr
-    return Exposure(*asked, x.exposure_s, frames, reached, less, bool(here.any())), x
+    wanted = case.one_frame.label, wavelength_nm, per, snr
+    return Exposure(*wanted, x.exposure_s, frames, reached, less, bool(saturated.any())), x
 
 
 def _best(title: str, x: Expectation, number: int) -> str:
     """Return the sentence on the best S/N of the first of several observations."""
-    each = x.snr_per_element()
-    at = float(x.wavelength_nm[x.element == int(np.argmax(each))].mean())
+    snr = x.snr_per_element()
+    at = float(x.wavelength_nm[x.element == int(np.argmax(snr))].mean())
     saturated = int(x.saturated.sum())
     without = f"; {saturated} of {x.saturated.size} pixels saturate" if saturated else ""
-    best = f"{title} has an S/N of up to {each.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
+    best = f"{title} has an S/N of up to {snr.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
     return f"{best}{without}{first_of(number, 'cases')}."
 
 
@@ -280,15 +280,6 @@ class StarSnr(InCell):
     """A star in a cell of the sweep."""
 
     result: SnrResult
-    asked_nm: float | None = None
-
-    @property
-    def shown_nm(self) -> list[float]:
-        """The requested wavelength, or those of `SHOWN_NM` within the spectrum."""
-        if self.asked_nm is not None:
-            return [self.asked_nm]
-        first, last = self.result.expectation.wavelength_nm[[0, -1]]
-        return [nm for nm in SHOWN_NM if first <= nm <= last]
 
 
 #: Metadata of tables of realisations.
@@ -313,6 +304,15 @@ class SnrAnswer(Answer):
     #: Noise by origin, DN rms per pixel, one row per star, cell and pixel.
     noise_budget = TableOf("noise-budget", (), "stars", of=lambda _, star: star.result.expectation.noise_budget(),
                            place=True, key="noise-budget", about=REALISATIONS)  # fmt: skip
+    _shown_elements = TableOf(
+        "", COLUMNS, "stars", of=lambda answer, star: star.result.element[answer.places(star, "element")], place=True,
+        about=(), title="S/N per 10.5 nm element; all of them in the files",
+    )  # fmt: skip
+    _shown_noise = TableOf(
+        "", lambda answer: [column for column in BUDGET_COLUMNS if column.name in answer.noise_budget.colnames],
+        "stars", of=lambda answer, star: star.result.expectation.noise_budget()[answer.places(star, "pixel")],
+        place=True, about=(), title="Noise of a pixel by origin, DN rms",
+    )  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -320,25 +320,18 @@ class SnrAnswer(Answer):
         return _best(self.stars[0].title, self.stars[0].result.expectation, len(self.stars))
 
     @property
-    def inputs(self) -> list[Expectation]:
-        return [star.result.expectation for star in self.stars]
+    def shown_nm(self) -> list[float]:
+        """The requested wavelength, or those of `SHOWN_NM` within the spectrum."""
+        wavelength_nm, (first, last) = self.study.signal.wavelength_nm, self.inputs[0].wavelength_nm[[0, -1]]
+        return [nm for nm in SHOWN_NM if first <= nm <= last] if wavelength_nm is None else [wavelength_nm]
+
+    def places(self, star: StarSnr, per: Per) -> list[int]:
+        """Return the indices of the pixels or elements of a star at the shown wavelengths."""
+        return [place_of(star.result.expectation, nm, per) for nm in self.shown_nm]
 
     @property
-    def views(self) -> list[View]:
-        """S/N and noise at some wavelengths; all of them are in the files."""
-        place = self.placed(())
-
-        def at(star: StarSnr, per: Per) -> list[int]:
-            return [place_of(star.result.expectation, nm, per) for nm in star.shown_nm]
-
-        parts = [(star, star.result.element[at(star, "element")]) for star in self.stars]
-        budgets = [(star, star.result.expectation.noise_budget()[at(star, "pixel")]) for star in self.stars]
-        noise = stacked(place, budgets)
-        sources = [column for column in BUDGET_COLUMNS if column.name in noise.colnames]
-        return [
-            View("S/N per 10.5 nm element; all of them in the files", (*place, *COLUMNS), stacked(place, parts)),
-            View("Noise of a pixel by origin, DN rms", (*place, *sources), noise),
-        ]
+    def inputs(self) -> list[Expectation]:
+        return [star.result.expectation for star in self.stars]
 
 
 @by_keywords("stars")
@@ -348,16 +341,16 @@ def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     Usual unknowns are left out: the question is about the noise.
     """
     study = study.ideal()
-    prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
+    prepared, run, wavelength_nm = cases(study), study.run, study.signal.wavelength_nm
     quiet, engine = [case.quiet for case in prepared], engine or Engine()
-    if asked is not None:
+    if wavelength_nm is not None:
         # Invalid input raises an error before anything is drawn.
         for x in quiet:
-            place_of(x, asked, "element")
+            place_of(x, wavelength_nm, "element")
 
     def answered(case: Case) -> StarSnr:
         result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)
-        return StarSnr(case.label, case.at, result, asked)
+        return StarSnr(case.label, case.at, result)
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)

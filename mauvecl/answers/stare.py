@@ -33,8 +33,8 @@ from mauvecl.runs.checkpoint import Checkpoint, kept
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import DAY_S
+from mauvecl.search import false_alarms
 from mauvecl.search.alarms import Alarm, alarms
-from mauvecl.search.false_alarms import sampled_rate
 from mauvecl.study.cases import Case, cases, collect_messages, place_columns
 from mauvecl.study.questions import check_sweep
 from mauvecl.study.stare import orbit_lines, threshold_line
@@ -185,7 +185,7 @@ COLUMNS = (
            "median net light of a frame, sky included, without bias and dark", "light (DN/s)", ".4g"),
     Column("frame_noise", lambda row: float(np.median(row.light.sd[:, 0] / row.light.mean[:, 0])), "",
            "standard deviation of a frame's own noise, relative to its light", "noise of a frame", percent(".3g")),
-    Column("flares", lambda row: len(row.flares), "", "flares put into it"),
+    Column("flares", lambda row: len(row.flares), "", "flares that it contains"),
     Column("threshold", "", "", "value of the search's statistic from which on it alarms",
            when=lambda answer: answer.study.stare.search),
     Column("found", lambda row: -1 if np.isnan(row.threshold) else len(row.found), "",
@@ -207,7 +207,7 @@ EVENT_COLUMNS = (
     Column("equivalent_duration", "event.equivalent_duration_s", "s", "in the flare's band", "ED (s)", ".4g"),
     Column("energy_band", "band_erg", "erg", "in the flare's band; nan: star of unknown size"),
     Column("energy_bolometric", "bolometric_erg", "erg", "of all of its light", "bolometric (erg)", number(".3g")),
-    Column("snr", "snr", "", "of one who knows all but whether the flare is there", "S/N", ".3g"),
+    Column("snr", "snr", "", "if everything but the presence of the flare is known", "S/N", ".3g"),
     Column("shape", "event.form.name", kind=str),
 )  # fmt: skip
 
@@ -249,7 +249,7 @@ FOUND_COLUMNS = (
     Column("dof", "alarm.dof", "", "degrees of freedom of this fit", kind=int),
     Column("p_value", "alarm.p_value", "", "probability of a chi-squared at least as large where the model is right"),
     Column("note", "alarm.note", "",
-           "what is special: a flare that is not measured, an interval that ends where the fit does", kind=str),
+           "remarks: a flare that is not measured, an interval that ends where the fit does", kind=str),
 )  # fmt: skip
 #: Columns of a light curve for every frame; those of the light follow for each band.
 FRAME_COLUMNS = (
@@ -293,8 +293,8 @@ class StareAnswer(Answer):
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
-        place=True, title="Flares in them; S/N of one who knows all but whether the flare is there", key="events",
-        about=SEED,
+        place=True, title="Flares in them; S/N if everything but the presence of the flare is known",
+        key="events", about=SEED,
     )  # fmt: skip
     #: One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
     #: Values are NaN where the fit does not measure the flare: `note` says why.
@@ -316,10 +316,10 @@ class StareAnswer(Answer):
         drawn = f"flare{'' if flares == 1 else 's'} in {frames} frames of {stare.title}"
         if np.isnan(stare.threshold):
             return f"The stare has {flares} {drawn}, which are not searched for{least}."
-        found = len({flare.event for flare in stare.found if flare.event})
+        number_found = len({flare.event for flare in stare.found if flare.event})
         false = sum(not flare.event for flare in stare.found)
         alarms = f"{false or 'no'} false alarm{'' if false == 1 else 's'}"
-        return f"The search finds {found} of {flares} {drawn} and raises {alarms}{least}."
+        return f"The search finds {number_found} of {flares} {drawn} and raises {alarms}{least}."
 
     @property
     def views(self) -> list[View]:
@@ -425,8 +425,8 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     staring = case.stare_expectation
 
     def draw(components: Any) -> Any:
-        what = components, staring.stare, 1, seed, staring.flare
-        request = StaresRequest(*what, start=q.number, method="pixels", processes=processes)
+        arguments = components, staring.stare, 1, seed, staring.flare
+        request = StaresRequest(*arguments, start=q.number, method="pixels", processes=processes)
         return kept(checkpoint, ("frames", request), lambda: stares.reduced(request))["values"][0]
 
     light = draw_light_curves(staring, q.bands_nm, draw)
@@ -436,8 +436,8 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     kelvin, flares = temperatures_of(case.events), list[StareFlare]()
     for event in case.events:
         band, bolometric = (case.energy(event, kind, kelvin) for kind in ("band", "bolometric"))
-        own = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
-        flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(own)))
+        of_flare = coefficients([event], case.stare.start_s, case.stare.frame_s, kelvin)
+        flares.append(StareFlare(case.label, case.at, event, band, bolometric, staring.snr(of_flare)))
     return StarStare(case.label, case.at, staring, flares, light, lost, **searched)
 
 
@@ -449,7 +449,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
         survey = replace(survey, components=staring.components(survey.templates.weights))
 
         def computed() -> Arrays:
-            tail = sampled_rate(survey, study.run.seed)
+            tail = false_alarms.sampled_rate(survey, study.run.seed)
             return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
 
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
@@ -458,8 +458,8 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
     threshold = float(tail["threshold"])
     scale = log_energy(case, survey.templates.temperatures_k)
     raised = alarms(survey, draw(survey.components), threshold, scale)
-    found = [_found_flare(case, alarm) for alarm in raised]
-    return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": found}
+    flares = [_found_flare(case, alarm) for alarm in raised]
+    return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": flares}
 
 
 def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
@@ -471,7 +471,7 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
     event = Event(*values, kelvin, case.study.search.shape)
     reach = 2 * case.stare_expectation.stare.frame_s
-    away = {k: abs(other.peak_s - event.peak_s) for k, other in enumerate(case.events, 1)}
+    away = {k: abs(injected.peak_s - event.peak_s) for k, injected in enumerate(case.events, 1)}
     nearest = min(away, key=lambda k: away[k], default=0)
     near = nearest > 0 and away[nearest] <= case.events[nearest - 1].half_width_s + reach
     return FoundFlare(case.label, case.at, alarm, _found_energy(case, event), nearest if near else 0)

@@ -89,28 +89,28 @@ class Verb:
         return any(key == prefix or key.startswith(f"{prefix}.") for prefix in self.keys)
 
     def study_of(
-        self, given: dict[str, Any], keywords: Mapping[str, Keyword], study: Study | None, where: str
+        self, values: dict[str, Any], keywords: Mapping[str, Keyword], study: Study | None, where: str
     ) -> tuple[Study, list[str]]:
         """Return the study that keywords of the verb ask for, with messages on what they do not state.
 
-        `given` has the value of each keyword, or None, and also ``paper``, and ``setting``, texts of any keys. They
+        `values` has that of each keyword, or None, and also ``paper``, and ``setting``, texts of any keys. They
         change the study or, without one, the verb's default; `where` names their origin in messages.
         """
         from mauvecl.study.study import Study, changes_of, stars_of
 
-        own = study is not None
+        is_given = study is not None
         if study is None:
             for name, keyword in keywords.items():
-                if given[name] is None:
-                    given[name] = (self.defaults or {}).get(keyword.path)
-            study = self.default(given) if self.default else Study()
-        if given.get("paper"):
+                if values[name] is None:
+                    values[name] = (self.defaults or {}).get(keyword.path)
+            study = self.default(values) if self.default else Study()
+        if values.get("paper"):
             study = study.paper()
-        stars = stars_of(study.star, given, keywords, own=own)
-        study = study.with_changes(changes_of(given, keywords, study.nuisances), stars, where)
-        if given.get("setting"):
-            study = study.with_settings(given["setting"], where)
-        if own or given.get("tails", study) is not None:
+        stars = stars_of(study.star, values, keywords, own=is_given)
+        study = study.with_changes(changes_of(values, keywords, study.nuisances), stars, where)
+        if values.get("setting"):
+            study = study.with_settings(values["setting"], where)
+        if is_given or values.get("tails", study) is not None:
             return study, []
         # Maps and limits would sample a tail in each cell or step, which takes longer than more realisations.
         return study.with_enough_tails(sampled=self.counts != "cells", raised=self.counts in ("cells", "steps"))
@@ -122,19 +122,19 @@ class Verb:
         return function
 
 
-def _budgets_or_star(given: dict[str, Any]) -> Study:
+def _budgets_or_star(values: dict[str, Any]) -> Study:
     """Return the study of the paper's noise budgets if no flag names a star, else the default one."""
     from mauvecl.study.study import PAPER_BUDGETS, Study
 
-    return Study() if any(given[name] for name in ("star", "magnitude", "exposure", "sweep")) else PAPER_BUDGETS
+    return Study() if any(values[name] for name in ("star", "magnitude", "exposure", "sweep")) else PAPER_BUDGETS
 
 
-def _formula_grid(given: dict[str, Any]) -> Study:
+def _formula_grid(values: dict[str, Any]) -> Study:
     """Return a study that sweeps what no flag states: magnitudes, exposures, or both, as `gaussian` does."""
     from mauvecl.study.questions import formula_grid
     from mauvecl.study.study import Study
 
-    magnitudes, exposure = given["magnitude"], given["exposure"]
+    magnitudes, exposure = values["magnitude"], values["exposure"]
     if not magnitudes and exposure is None:
         return Study()
     return Study().model_copy(update={"sweep": formula_grid(magnitude=not magnitudes, exposure_s=exposure)})
@@ -418,20 +418,21 @@ def by_keywords(parts: str) -> Callable[[Callable[..., Answered]], Question[Answ
 
         @wraps(checked)
         def ask(study: Any = None, *arguments: Any, **keywords: Any) -> Any:
-            own = {key: keywords.pop(key) for key in tuple(keywords) if key in checks}
+            arguments_by_name = {key: keywords.pop(key) for key in tuple(keywords) if key in checks}
             if study is None or keywords:
                 from mauvecl.study.study import keys_of, values_of
 
                 verb, where = VERBS[function.__name__], f"{function.__name__}()"
-                known, given = {entry.name: entry for entry in keys_of(verb.keys)}, study and checks["study"](study)
-                study, messages = verb.study_of(values_of(keywords, known, where), known, given, where)
+                flags = {keyword.name: keyword for keyword in keys_of(verb.keys)}
+                values, given_study = values_of(keywords, flags, where), study and checks["study"](study)
+                study, messages = verb.study_of(values, flags, given_study, where)
                 for message in messages:
                     warnings.warn(message, stacklevel=2)
-            return checked(study, *arguments, **own)
+            return checked(study, *arguments, **arguments_by_name)
 
-        study, *others = inspect.signature(function).parameters.values()
+        study, *parameters = inspect.signature(function).parameters.values()
         keywords = inspect.Parameter("keywords", inspect.Parameter.VAR_KEYWORD, annotation=Any)
-        vars(ask)["__signature__"] = inspect.Signature([study.replace(default=None), *others, keywords])
+        vars(ask)["__signature__"] = inspect.Signature([study.replace(default=None), *parameters, keywords])
         ask.__doc__ = f"{inspect.getdoc(function)}{COMMON_PARAMETERS.format(parts=parts)}"
         return ask
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
@@ -42,10 +42,10 @@ def calendar_bytes(entries: Iterable[tuple[str, str, str, str]]) -> bytes:
     for start, stop, title, text in entries:
         unique = hashlib.sha256("\0".join((start, stop, title)).encode()).hexdigest()[:24]
         # An event of whole days ends at the beginning of the next day.
-        whole = "T" not in stop
-        end = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat() if whole else stop
+        is_day = "T" not in stop
+        end = (datetime.date.fromisoformat(stop) + datetime.timedelta(days=1)).isoformat() if is_day else stop
         times = [moment.replace("-", "").replace(":", "") for moment in (start, end)]
-        begins, ends = (f";VALUE=DATE:{time}" if whole else f":{time}Z" for time in times)
+        begins, ends = (f";VALUE=DATE:{time}" if is_day else f":{time}Z" for time in times)
         # A fixed time of the entry, so that equal plans give equal files.
         lines += ["BEGIN:VEVENT", f"UID:{unique}@mauvecl", f"DTSTAMP:{times[0][:8]}T000000Z", f"DTSTART{begins}",
                   f"DTEND{ends}", f"SUMMARY:{title.translate(ESCAPES)}", f"DESCRIPTION:{text.translate(ESCAPES)}",
@@ -53,7 +53,7 @@ def calendar_bytes(entries: Iterable[tuple[str, str, str, str]]) -> bytes:
     lines.append("END:VCALENDAR")
     # Lines have at most 75 bytes; the rest of a longer one follows after a space. No character is cut.
     folded = (re.findall(rb"(?:^.{1,75}|.{1,74})(?![\x80-\xbf])", line.encode()) for line in lines)
-    return b"".join(b"\r\n ".join(parts) + b"\r\n" for parts in folded)
+    return b"".join(b"\r\n ".join(pieces) + b"\r\n" for pieces in folded)
 
 
 #: Largest number of rows for which the table of windows is written.
@@ -97,7 +97,7 @@ WINDOW_COLUMNS = (
     Column("start", description="UTC", kind=str),
     Column("stop", description="UTC", kind=str),
     Column("length", "", "min"),
-    Column("in_shadow", "", "min", "of it, in the Earth's shadow"),
+    Column("in_shadow", "", "min", "part of it in the Earth's shadow"),
     Column("orbit", description="ascending nodes since the start of the plan", kind=int),
 )
 
@@ -196,17 +196,18 @@ class VisibleAnswer(Answer):
 
     def _row(self, k: int) -> dict[str, Any]:
         """Return the row of a target, by the names of columns."""
-        seen, windows, target = self.visibility, self.windows[k], self.targets[k]
+        visibility, windows, target = self.visibility, self.windows[k], self.targets[k]
         hours, away, sky = self.by_month[1][:, k], self.elongation_deg(k), self.zodiacal[k]
         # The least and the largest value of no values is none.
         sky = sky[np.isfinite(sky)] if np.isfinite(sky).any() else sky[:1]
         length, end_s = windows.length_s, self.times.n * self.times.step_s
         gaps_s = np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s)
         return {
-            "target": target.name, "ra": target.ra_deg, "dec": target.dec_deg, "hours": seen.hours[k],
-            "share": seen.share[k], **{f"leaves_{name}": shares[k] for name, shares in seen.kept_by.items()},
+            "target": target.name, "ra": target.ra_deg, "dec": target.dec_deg, "hours": visibility.hours[k],
+            "share": visibility.share[k],
+            **{f"leaves_{name}": shares[k] for name, shares in visibility.kept_by.items()},
             "windows": length.size, "median_window": float(np.median(length / 60)) if length.size else 0.0,
-            "longest_gap": float(np.max(gaps_s)) / DAY_S, "per_orbit": float(np.mean(seen.by_orbit(k))),
+            "longest_gap": float(np.max(gaps_s)) / DAY_S, "per_orbit": float(np.mean(visibility.by_orbit(k))),
             "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
             "best_month": self.by_month[0][int(np.argmax(hours))] if hours.any() else "",
             "least_elongation": float(away.min()), "most_elongation": float(away.max()),
@@ -219,8 +220,8 @@ class VisibleAnswer(Answer):
             return super().views
         names, hours = self.by_month
         columns = (TARGET_COLUMN, *(Column(name, heading=name, format=".0f") for name in names))
-        rows = [{"target": target.name} | dict(zip(names, own, strict=True))
-                for target, own in zip(self.targets, hours.T, strict=True)]  # fmt: skip
+        rows = [{"target": target.name} | dict(zip(names, target_hours, strict=True))
+                for target, target_hours in zip(self.targets, hours.T, strict=True)]  # fmt: skip
         return [*super().views, View("Hours of exposure by month", columns, table_of(columns, rows))]
 
     @property
@@ -262,7 +263,7 @@ class VisibleAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """Messages on the orbit, assumptions, effects that are not modelled, and targets that are never visible."""
-        never = [target.name for target, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
+        never = [target.name for target, share in zip(self.targets, self.visibility.share, strict=True) if share == 0]
         lines = [f"{name} is never seen: {self.reason(name)}." for name in never]
         lines += self.study.orbit.orbit().messages(self.times)
         lines.append(
@@ -298,9 +299,14 @@ def visible(study: Study, engine: Engine | Pool | None = None, progress: Progres
     >>> seen.months["month"].tolist()
     ['2027-01']
     """
-    o, targets = study.orbit, tuple(targets_of(study.orbit, study.plan))
-    directions = np.array([target.direction for target in targets])
-    answer = VisibleAnswer(study, targets, Visibility.of(o.orbit().track(o.times()), directions, o.limits))
+    targets = targets_of(study.orbit, study.plan)
+    answer = visible_targets(study, targets)
     if progress is not None:
         progress(len(targets), len(targets))
     return answer
+
+
+def visible_targets(study: Study, targets: Sequence[Target]) -> VisibleAnswer:
+    """Return when targets that are already looked up are visible."""
+    o, directions = study.orbit, np.array([target.direction for target in targets])
+    return VisibleAnswer(study, tuple(targets), Visibility.of(o.orbit().track(o.times()), directions, o.limits))

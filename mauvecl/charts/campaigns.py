@@ -6,17 +6,16 @@ import base64
 import calendar as months_of_years
 import io
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Area, Axis, Dots, Line, Mesh, Panel, Picture, Rule, Series, pictures_of, register
+from mauvecl.charts.chart import Area, Axis, Dots, Line, Mesh, Panel, Picture, Rule, Series, pictures_of
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 
@@ -80,9 +79,9 @@ def _calendars(answer: VisibleAnswer, hours: Any) -> Picture:
     x = Axis("day of the month (UTC)", ticks=([1, 8, 15, 22, 29],))
     names = np.arange(0, len(months), step), [_month(name) for name in months[::step]]
     y, panels = Axis(limits=(len(months) - 0.5, -0.5), ticks=names), list[Panel]()
-    for target, seen, total in zip(answer.targets, hours, answer.visibility.hours, strict=True):
+    for target, daily_hours, total in zip(answer.targets, hours, answer.visibility.hours, strict=True):
         grid = np.full((len(months), 31), np.nan)
-        for day, value in zip(answer.days, seen, strict=True):
+        for day, value in zip(answer.days, daily_hours, strict=True):
             grid[months.index(day[:7]), int(day[8:]) - 1] = value
         at = np.arange(0.5, 32), np.arange(-0.5, len(months)), grid
         mesh = Mesh("hours a day", high=max(float(hours.max()), 0.1), edges="white", empty="white", at=at)
@@ -141,7 +140,7 @@ class Part:
     note: str = ""
     # Draws in a part of a page, or in a figure of its own if it is given none, which it returns.
     picture: Callable[[Any], Any] | None = None
-    seen: str = ""  # the picture in words
+    text: str = ""  # the picture in words
     height_in: float = 0.0  # of the picture on a page; 0 for a page of its own
     new_page: bool = False
 
@@ -150,22 +149,22 @@ def pdf_bytes(title: str, parts: Sequence[Part]) -> bytes:
     """Return a report as PDF; without a date, so that equal answers give equal files."""
     from matplotlib.backends.backend_pdf import PdfPages
 
-    made, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
-    with style(), PdfPages(made, metadata=about) as pages:
+    content, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
+    with style(), PdfPages(content, metadata=about) as pages:
         sheets = Sheets()
         for part in parts:
             sheets.add(part)
         for figure in sheets.pages:
             pages.savefig(figure)
-    return made.getvalue()
+    return content.getvalue()
 
 
 def html_bytes(title: str, parts: Sequence[Part]) -> bytes:
     """Return a report as a page, with pictures if matplotlib is installed."""
     from mako.template import Template
 
-    how = {"default_filters": ["str", "escape"], "imports": ["from html import escape"], "strict_undefined": True}
-    template = Template(filename=str(Path(__file__).with_name("reports.html.mako")), **how)
+    options = {"default_filters": ["str", "escape"], "imports": ["from html import escape"], "strict_undefined": True}
+    template = Template(filename=str(Path(__file__).with_name("reports.html.mako")), **options)
     return str(template.render(title=title, parts=parts, html_image=html_image)).encode()
 
 
@@ -176,7 +175,7 @@ def html_image(draw: Callable[[Any], Any], text: str) -> str:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
-    made = io.BytesIO()
+    content = io.BytesIO()
     with style():
         figure = draw(None)
         # savefig draws each picture twice.
@@ -185,9 +184,9 @@ def html_image(draw: Callable[[Any], Any], text: str) -> str:
         drawn.draw()  # type: ignore[no-untyped-call]
     # A palette holds the few colours of a figure in a fourth of the bytes: a report may hold hundreds.
     colours = Image.fromarray(np.asarray(drawn.buffer_rgba())[:, :, :3])  # type: ignore[no-untyped-call]
-    colours.quantize(COLOURS_KEPT, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(made, "png")
-    content = base64.b64encode(made.getvalue()).decode()
-    return f"<img alt='{escape(text, quote=True)}' src='data:image/png;base64,{content}'>"
+    colours.quantize(COLOURS_KEPT, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(content, "png")
+    encoded = base64.b64encode(content.getvalue()).decode()
+    return f"<img alt='{escape(text, quote=True)}' src='data:image/png;base64,{encoded}'>"
 
 
 class Sheets:
@@ -229,10 +228,10 @@ class Sheets:
             self.pages.append(part.picture(None))
             self.left_in = 0.0
 
-    def line(self, cells: Sequence[tuple[float, str]], size: float, **how: Any) -> None:
+    def line(self, cells: Sequence[tuple[float, str]], size: float, **look: Any) -> None:
         """Write cells at fractions of the text width, each wrapped before the start of the next."""
         edges = [*(place for place, _ in cells[1:]), 1.0]
-        width, letter = PAGE[0] - 2 * MARGIN, LETTER * (BOLD if how.get("weight") == "bold" else 1.0)
+        width, letter = PAGE[0] - 2 * MARGIN, LETTER * (BOLD if look.get("weight") == "bold" else 1.0)
         wrapped = []
         for (place, text), end in zip(cells, edges, strict=True):
             letters = max(5, int((end - place) * width * 72 / (letter * size)) - 1)
@@ -241,7 +240,7 @@ class Sheets:
         y = self.take(height)
         for x, lines in wrapped:
             self.pages[-1].text(x / PAGE[0], y / PAGE[1], "\n".join(lines), fontsize=size, va="top", linespacing=LINE,
-                                parse_math=False, **how)  # fmt: skip
+                                parse_math=False, **look)  # fmt: skip
 
     def take(self, height_in: float) -> float:
         """Reserve a height, on a new page if necessary, and return its top in inches from the bottom."""
@@ -255,8 +254,6 @@ class Sheets:
 
 def plan_report(answer: PlanAnswer) -> tuple[str, list[Part]]:
     """Return title and parts of a plan's report: summary, messages, a part for each target, and all assumptions."""
-    from mauvecl.answers.plan import LEGEND, target_lines
-
     height = 0.2 * len(answer.planned) + 1.3
 
     def all_targets(figure: Any) -> Any:
@@ -265,18 +262,21 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[Part]]:
             drawn.subplots_adjust(left=0.2, right=0.98, bottom=0.6 / height, top=1 - 0.3 / height)
         return drawn
 
-    names, cells = answer.views[0].texts()
-    fits, seen = height < PAGE[1] - 2 * MARGIN, "flares expected and energies of all targets"
+    view = answer.views[0]
+    headings, rows = view.texts()
+    names = [column.name for column in view.columns if column.heading]
+    fits, text = height < PAGE[1] - 2 * MARGIN, "flares expected and energies of all targets"
     parts = [
-        Part("Mauve: yields of a campaign", [f"{answer.heading}; mauvecl {VERSION}."], names, cells, SUMMARY_AT, 2,
-             LEGEND, all_targets, seen, height if fits else 0.0),
+        Part("Mauve: yields of a campaign", [f"{answer.heading}; mauvecl {VERSION}."], headings, rows, SUMMARY_AT, 2,
+             LEGEND, all_targets, text, height if fits else 0.0),
         Part(lines=answer.messages),
     ]  # fmt: skip
-    for k, target in enumerate(answer.planned):
+    for k, (target, row) in enumerate(zip(answer.planned, rows, strict=True)):
         draw = partial(_panels, answer, k) if target.seen_h > 0 else None
+        lines = _target_lines(answer, k, dict(zip(names, row, strict=True)))
         parts.append(Part(
-            target.name, (), ("", "", "table: column"), target_lines(answer, k), TARGET_AT, picture=draw,
-            seen=f"hours and energies of {target.name}", height_in=PANELS_IN, new_page=True,
+            target.name, (), ("", "", "table: column"), lines, TARGET_AT, picture=draw,
+            text=f"hours and energies of {target.name}", height_in=PANELS_IN, new_page=True,
         ))  # fmt: skip
     assumed = answer.assumptions
     note = "Rows of assumptions.ecsv."
@@ -284,12 +284,61 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[Part]]:
     return f"Mauve: {answer.heading}", parts
 
 
+#: Explanation of the columns.
+LEGEND = (
+    "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
+    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
+    "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
+    "P(>= 1): probability of recovering any. False alarms: expected from noise. Numbers are those of plan.ecsv."
+)
+
+
+def _target_lines(answer: PlanAnswer, k: int, cells: Mapping[str, str]) -> list[tuple[str, str, str]]:
+    """Return the lines on a target: quantity, value, and the file and column of the value.
+
+    `cells` has the texts of the target in the table of the plan, by column.
+    """
+    target, observation = answer.planned[k], answer.planned[k].observation
+    place, star, visible = observation.target, observation.case.star, answer.seen
+    lines = [
+        ("right ascension, declination", f"{place.ra_deg:.4f}, {place.dec_deg:.4f} deg ({place.source})",
+         "stars: ra, dec, position"),
+        ("type; spectrum that stands for it", f"{place.spectral_type}; {star.library}",
+         "stars: spectral_type, spectrum"),
+        ("V; distance", f"{star.magnitude:g}; {star.distance_pc:g} pc", "stars: V, distance"),
+        ("seen; observed", f"{cells['seen']} h; {cells['hours']} h", "plan: seen, hours"),
+    ]  # fmt: skip
+    if target.seen_h == 0:
+        return [*lines, ("never seen", visible.reason(place.name), "assumptions")]
+    away = visible.elongation_deg(k)
+    lines += [
+        ("median stretch", f"{observation.window_s / 60:.0f} min", "stars: window"),
+        ("best months", cells["best_months"], "plan: best_months; months"),
+        ("angle from the Sun", f"{away.min():.0f} to {away.max():.0f} deg", "days: elongation"),
+        ("detector; hits by particles", f"{observation.quiet.conditions['temperature_c']:.1f} deg C; "
+         f"{observation.case.study.processes.particles_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
+        ("S/N of a frame at amplitude 1", f"{observation.signal_per_frame:.4g}", "stars: signal_per_frame"),
+        ("half of flares recovered from (erg)", cells["E50"], "plan: E50; energies: recovered"),
+        ("90 % of flares recovered from (erg)", cells["E90"], "plan: E90; energies: recovered"),
+    ]  # fmt: skip
+    if target.recovered is not None:
+        lines += [
+            ("flares recovered, expected", cells["expected"], "plan: expected; stars: recovered_per_day"),
+            ("95 % of campaigns", cells["low"], "plan: low, high; stars: scatter"),
+            ("probability of at least one", cells["at_least_one"], "plan: at_least_one"),
+        ]
+    lines.append(("false alarms expected", cells["false_alarms"], "plan: false_alarms"))
+    rates = target.no_rates if target.rates is None else target.rates.source
+    lines.append(("flare rates", rates, "stars: rates; assumptions"))
+    return lines
+
+
 def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
     """Plot the daily hours of a target, its angle from the Sun, and its recovered fraction and rate by energy."""
-    target, seen, days = answer.planned[k], answer.seen, np.arange(len(answer.seen.days))
-    x = Axis(limits=(0, max(len(days) - 1, 1)), ticks=_first_days(seen, MOST_MONTHS // 2))
-    hours = Area("", COLOURS[3], alpha=1.0, step=True, at=(days, np.zeros(days.size), seen.visibility.by_day(k)))
-    away = Line("", "flare", at=(days, seen.elongation_deg(k)))
+    target, visible, days = answer.planned[k], answer.seen, np.arange(len(answer.seen.days))
+    x = Axis(limits=(0, max(len(days) - 1, 1)), ticks=_first_days(visible, MOST_MONTHS // 2))
+    hours = Area("", COLOURS[3], alpha=1.0, step=True, at=(days, np.zeros(days.size), visible.visibility.by_day(k)))
+    away = Line("", "flare", at=(days, visible.elongation_deg(k)))
     rows = [[
         Panel(x, Axis("hours a day", limits=(0, None)), [hours], "when it is seen"),
         Panel(x, Axis("angle from the Sun (deg)", limits=(0, 180)), [away]),
@@ -298,8 +347,11 @@ def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
         row, x = target.by_energy, Axis("bolometric energy (erg)", log=True)
         energy, often = row["energy"], row["rate_above"] * target.hours / 24
         share = Line("", "star", at=(energy, row["recovered"]))
-        limits = [Rule("", dash=dash, at=target.energy_at(part)) for part, dash in ((0.5, "--"), (0.9, ":"))]
-        shares = Axis("share recovered", limits=(0, 1.02)), [share, *(one for one in limits if np.isfinite(one.at))]
+        limits = [Rule("", dash=dash, at=target.energy_at(p)) for p, dash in ((0.5, "--"), (0.9, ":"))]
+        shares = (
+            Axis("share recovered", limits=(0, 1.02)),
+            [share, *(limit for limit in limits if np.isfinite(limit.at))],
+        )
         rows.append([Panel(x, *shares, "flares recovered (E50 dashed, E90 dotted)", _plain_decades)])
         if target.rates is not None:
             rate = Line("", "flare", at=(energy, np.where(often > 0, often, np.nan)))
@@ -329,16 +381,10 @@ def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[Part]]:
     parts = [Part(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
     parts += [Part(view.title, (), *view.texts(empty=False)) for view in answer.all_views]
     parts.append(Part(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
-    return title, parts + [Part(picture=draw, seen=name) for name, draw in pictures_of(answer).items()]
+    return title, parts + [Part(picture=draw, text=name) for name, draw in pictures_of(answer).items()]
 
 
-# Each report as HTML and as PDF; the study chooses one of them, or none.
-for kind, name, report, chosen in (
-    ("PlanAnswer", "plan", plan_report, "study.plan.report"),
-    ("AnalyseAnswer", "analyse", analysis_report, "study.data.report"),
-):
-    for ending, write in (("html", html_bytes), ("pdf", pdf_bytes)):
-        register(
-            kind, f"{name}.{ending}", lambda answer, write=write, report=report: write(*report(answer)), document=True,
-            when=lambda answer, chosen=chosen, ending=ending: attrgetter(chosen)(answer) == ending,
-        )  # fmt: skip
+def report(answer: Any, form: str) -> bytes:
+    """Return the report of a plan or an analysis as "html" or "pdf"."""
+    title, parts = plan_report(answer) if hasattr(answer, "planned") else analysis_report(answer)
+    return (html_bytes if form == "html" else pdf_bytes)(title, parts)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from importlib import import_module
+from operator import itemgetter
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, TypeVar
+from typing import Any
 
-F = TypeVar("F", bound=Callable[..., Any])
 #: Colours on light ground by name, after Okabe & Ito; `web.figures.INKS` has those on dark ground as well.
 INK = {
     "text": "#1b2733", "grid": "#dde3ea", "ground": "#ffffff", "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73",
@@ -225,15 +225,15 @@ class Chart:
         assert data.series.keys() <= {item.key for item in self.series}
         sources, props, names = dict[str, Any](), dict(data.props), dict[str, str]()
         for item in self.series:
-            given = data.series.get(item.key, item.at)
+            columns = data.series.get(item.key, item.at)
             if isinstance(item, Rule):
-                props[item.key] = {"location": given}
+                props[item.key] = {"location": columns}
             elif isinstance(item, Targets):
-                for k, (name, x, y) in enumerate([*(given or ()), *[("", [], [])] * MOST_TARGETS][:MOST_TARGETS]):
+                for k, (name, x, y) in enumerate([*(columns or ()), *[("", [], [])] * MOST_TARGETS][:MOST_TARGETS]):
                     sources[f"{item.key} {k}"] = {"x": x, "y": y}
                     names |= {f"target {k + 1}": name} if name else {}
             elif not isinstance(item, Listed):
-                columns = [[]] * len(item.columns) if given is None else given
+                columns = [[]] * len(item.columns) if columns is None else columns
                 sources[item.key] = dict(zip(item.columns, columns, strict=True))
         return {"text": data.text, "sources": sources, "props": props, "names": names}
 
@@ -269,51 +269,37 @@ class Picture:
 
 @dataclass(frozen=True)
 class Entry:
-    """Function that draws a picture or writes a document of a class."""
+    """Function that draws a picture of the objects of a class."""
 
     name: str  # name of the file
-    make: Callable[..., Any]
-    given: Callable[[Any], tuple[Any, ...]] = lambda thing: (thing,)  # arguments of `make` for a thing
-    #: Arguments of `make` for each of several numbered pictures of a thing.
+    draw: Callable[..., Any]
+    given: Callable[[Any], tuple[Any, ...]] = lambda instance: (instance,)  # arguments of `draw` for an object
+    #: Arguments of `draw` for each of several numbered pictures of an object.
     each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
-    when: Callable[[Any], bool] = lambda thing: True  # whether a thing has the picture
-    document: bool = False
+    when: Callable[[Any], object] = lambda instance: True  # whether an object has the picture
 
 
 #: Entries by class name, since importing the classes would import every answer.
 ENTRIES: defaultdict[str, list[Entry]] = defaultdict(list)
 
 
-def register(kind: str, name: str, make: F, **how: Any) -> F:
-    """Register a function that makes a picture, or the bytes of a document, of a class; `how` as in `Entry`."""
-    ENTRIES[kind].append(Entry(name, make, **how))
-    return make
-
-
-def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:
-    """Return every picture of an object by file name, as functions of `path` and `ax`."""
-    return {
-        name: lambda path=None, draw=draw, **how: draw(path=path, **how)
-        for name, draw in made_of(thing, document=False).items()
-    }
-
-
-def made_of(thing: Any, *, document: bool) -> dict[str, Callable[..., Any]]:
-    """Return the function of each document or picture of an object by file name, numbered ones by their numbers."""
-    load()
-    own = next((ENTRIES[kind.__name__] for kind in type(thing).__mro__ if kind.__name__ in ENTRIES), [])
-    made = list[tuple[int, str, Callable[..., Any]]]()
-    for entry in own:
-        if entry.document is not document or not entry.when(thing):
-            continue
-        single = entry.each is None
-        for n, given in enumerate([entry.given(thing)] if entry.each is None else entry.each(thing), 1):
-            made.append((n, entry.name if single else f"{entry.name}-{n}", partial(entry.make, *given)))
-    return {name: make for _, name, make in sorted(made, key=lambda pair: pair[0])}
-
-
-@cache
 def load() -> None:
     """Import all modules of pictures, so that they register their functions."""
     for module in iter_modules([str(Path(__file__).parent)]):
         import_module(f"{__package__}.{module.name}")
+
+
+def pictures_of(instance: Any) -> dict[str, Callable[..., Any]]:
+    """Return every picture of an object by file name, numbered ones by number, as functions of `path` and `ax`."""
+    load()
+    entries = next((ENTRIES[kind.__name__] for kind in type(instance).__mro__ if kind.__name__ in ENTRIES), [])
+    numbered = list[tuple[int, str, Callable[..., Any]]]()
+    for entry in filter(lambda entry: entry.when(instance), entries):
+        if entry.each is None:
+            numbered.append((1, entry.name, partial(entry.draw, *entry.given(instance))))
+        for number, arguments in enumerate(entry.each(instance) if entry.each else (), 1):
+            numbered.append((number, f"{entry.name}-{number}", partial(entry.draw, *arguments)))
+    return {
+        name: lambda path=None, draw=draw, **options: draw(path=path, **options)
+        for _, name, draw in sorted(numbered, key=itemgetter(0))
+    }

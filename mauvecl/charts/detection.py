@@ -11,21 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Area,
-    Axis,
-    Chart,
-    Dots,
-    Levels,
-    Line,
-    Mesh,
-    Panel,
-    Picture,
-    Rule,
-    Series,
-    Strips,
-)
+from mauvecl.charts import chart
+from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Panel, Picture, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.requests import statistic_label
@@ -113,16 +100,16 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
         series.append(Area("", colour, alpha=0.3, step=True, at=(middle, 0 * height, height)))
         series.append(Line(name, colour, step=True, at=(middle, height)))
     # Statistics that are scaled by the flare have a threshold per flare.
-    own, cuts = chosen if kind.shaped and not linear else [0], list[float]()
-    for k, colour in zip(own, cycle(COLOURS if len(own) > 1 else ["text"]), strict=False):
+    thresholded, cuts = chosen if kind.shaped and not linear else [0], list[float]()
+    for k, colour in zip(thresholded, cycle(COLOURS if len(thresholded) > 1 else ["text"]), strict=False):
         try:
             cut = outcome.threshold(fap, statistic, template=k).value
         except NoThresholdError:
             continue
         cuts.append(cut)
-        series.append(Rule("threshold", colour, listed=len(own) == 1, at=cut))
-    above = f"{title}: a threshold per flare" if len(own) > 1 else title
-    if len(own) == len(cuts) == 1:
+        series.append(Rule("threshold", colour, listed=len(thresholded) == 1, at=cut))
+    above = f"{title}: a threshold per flare" if len(thresholded) > 1 else title
+    if len(thresholded) == len(cuts) == 1:
         above = f"{title}: threshold {written(float(f'{cuts[0]:.3g}'))}"
     low, high = min(ends + cuts), max(ends + cuts)
     x, y = Axis(statistic_label(statistic)), Axis("realisations / peak", limits=(0, 1.05))
@@ -134,18 +121,16 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
 
 def _asinh(axis: Any, ends: tuple[float, float]) -> None:
     """Scale the axis of a weighted sum, whose means differ by decades, and show the values between two ends."""
+    from matplotlib.ticker import FixedLocator
+
     axis.set_xscale("asinh", linear_width=2)
     low, high = np.arcsinh(np.array(ends) / 2)
     axis.set_xlim(*2 * np.sinh([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
-    shown = [*range(-10, 8, 2)] if high - low < WIDE else [-10, -4, 0, 4]
-    decades = [10.0**power for power in range(1, 10)]
-    major = [*shown, *(digit * decade for decade in decades for digit in ((1, 3) if decade < 100 else (1,)))]
-    minor = [*range(-10, 10), *(digit * decade for decade in decades for digit in range(1, 10))]
-    low, high = axis.get_xlim()
-    axis.set_xticks([tick for tick in major if low <= tick <= high])
-    axis.set_xticks([tick for tick in minor if low <= tick <= high], minor=True)
+    decades = 10.0 ** np.arange(1, 10)
+    few = range(-10, 10, 2) if high - low < WIDE else (-10, -4, 0, 4)
+    axis.xaxis.set_major_locator(FixedLocator([*few, 10, 30, *decades[1:]]))
+    axis.xaxis.set_minor_locator(FixedLocator([*range(-10, 10), *np.outer(decades, range(1, 10)).ravel()]))
     axis.xaxis.set_major_formatter(lambda value, _: written(value))
-    axis.tick_params(axis="x", which="minor", labelbottom=False)
 
 
 def roc_columns(curve: Roc) -> tuple[Any, ...]:
@@ -180,7 +165,7 @@ def spectra(stars: Sequence[Shown]) -> Picture:
 
     above, below = list[Panel](), list[Panel]()
     for title, outcome, names in stars:
-        quiet, whole, nm = outcome.quiet, _whole(outcome.quiet), outcome.quiet.wavelength_nm
+        quiet, complete, nm = outcome.quiet, _complete_elements(outcome.quiet), outcome.quiet.wavelength_nm
         sigma = np.sqrt(quiet.per_element(quiet.variance_dn2))
         drawn = [(names[k], outcome.flares[k], COLOURS[i % len(COLOURS)]) for i, k in enumerate(_drawn_flares(names))]
         mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
@@ -190,7 +175,7 @@ def spectra(stars: Sequence[Shown]) -> Picture:
         y = Axis("net signal (DN s$^{-1}$ pixel$^{-1}$)")
         above.append(Panel(WAVELENGTH, y, series, f"{title}, {quiet.exposure_s:g} s"))
         risen = [(x.per_element(x.signal_dn - quiet.signal_dn) / sigma, colour) for _, x, colour in drawn[::-1]]
-        lines = [Line("", colour, at=(quiet.element_wavelength_nm[whole], rise[whole])) for rise, colour in risen]
+        lines = [Line("", colour, at=(quiet.element_wavelength_nm[complete], rise[complete])) for rise, colour in risen]
         y = Axis("flare less quiet\n(sigma per 10.5 nm)", log=True)
         below.append(Panel(WAVELENGTH, y, [*lines, Rule(along="y", at=1.0)], finish=finish))
     title = "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration"
@@ -198,7 +183,7 @@ def spectra(stars: Sequence[Shown]) -> Picture:
     return Picture([above, below], size, title, _notes(stars), below=True, share_x=True, heights=(3, 2))
 
 
-def _whole(x: Expectation) -> NDArray[np.bool_]:
+def _complete_elements(x: Expectation) -> NDArray[np.bool_]:
     """Return the complete elements; the last one of the spectrum may have fewer pixels."""
     pixels = np.bincount(x.element, minlength=x.element_wavelength_nm.size)
     return np.asarray(pixels >= np.median(pixels) - 1)
@@ -239,23 +224,23 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult]]) -> Picture:
     """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations."""
     rows = list[list[Panel]]()
     for title, result in stars:
-        x, whole = result.expectation, _whole(result.expectation)
+        x, complete = result.expectation, _complete_elements(result.expectation)
         title = title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s"
-        nm, snr = x.element_wavelength_nm[whole], x.snr_per_element()[whole]
+        nm, snr = x.element_wavelength_nm[complete], x.snr_per_element()[complete]
         rows.append([_snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), result.pixel),
-                     _snr_panel(title, "per 10.5 nm element", nm, snr, result.element[whole])])  # fmt: skip
+                     _snr_panel(title, "per 10.5 nm element", nm, snr, result.element[complete])])  # fmt: skip
     title = "S/N of one exposure; nominal throughput, not a flight calibration"
     return Picture(rows, (7.6, 2.6 * len(rows) + 0.4), title, (note_of(stars),), below=True, share_x=True)
 
 
-def _snr_panel(title: str, what: str, nm: Any, expected: Any, table: QTable) -> Panel:
+def _snr_panel(title: str, per: str, nm: Any, expected: Any, table: QTable) -> Panel:
     """Return the S/N in closed form, over the ranges of realisations."""
     series: list[Series] = [
         Area("95 % of realisations", "star", alpha=0.25, at=(nm, table["q2.5"], table["q97.5"])),
         Area("68 % of realisations", "star", alpha=0.45, at=(nm, table["q16"], table["q84"])),
         Line("closed form", "text", width=1.2, at=(nm, expected)),
     ]
-    return Panel(WAVELENGTH, Axis(f"S/N {what}"), series, title)
+    return Panel(WAVELENGTH, Axis(f"S/N {per}"), series, title)
 
 
 @picture_of("UnknownAnswer", "unknowns")
@@ -269,14 +254,14 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     needed, above, below = ndtri(answer.study.limit.power) - ndtri(fap), list[Panel](), list[Panel]()
     for star in stars:
         # Those of its first flare.
-        own = [row for row in answer.rows if row["star"] == star]
-        known, amplitude = own[0]["known"], own[0]["amplitude"]
-        least = amplitude * needed / known if known > 0 else float("inf")
+        of_star = [row for row in answer.rows if row["star"] == star]
+        snr, amplitude = of_star[0]["known"], of_star[0]["amplitude"]
+        least = amplitude * needed / snr if snr > 0 else float("inf")
         relative = np.geomspace(0.03, 300.0, 200) * least
-        at = relative, power(known * relative / amplitude, fap)
+        at = relative, power(snr * relative / amplitude, fap)
         series: list[Series] = [Line("everything known", "text", width=4, at=at)]
         smallest = [Dots("", "text", size=12, at=([0], [least]))]
-        first = [row for row in own if row["amplitude"] == amplitude]
+        first = [row for row in of_star if row["amplitude"] == amplitude]
         for k, (colour, row) in enumerate(zip(cycle(COLOURS), first, strict=False), 1):
             marginal, plain = (power(row[name] * relative / amplitude, fap) for name in ("marginal", "plain"))
             series.append(Line(row["unknown"].replace("+-", "±"), colour, at=(relative, marginal)))
@@ -296,11 +281,11 @@ def unknowns(answer: UnknownAnswer) -> Picture:
 MARKS = "osD^vPX"
 
 
-def quantity_axis(study: Study, name: str, **how: Any) -> Axis:
+def quantity_axis(study: Study, name: str, **options: Any) -> Axis:
     """Return the axis of a quantity, with the band of magnitudes if all stars have the same."""
     bands = {star.band for star in study.star}
     band = f" ({bands.pop()})" if name == "magnitude" and len(bands) == 1 else ""
-    return Axis(QUANTITIES[name].label + band, **how)
+    return Axis(QUANTITIES[name].label + band, **options)
 
 
 @picture_of("MapAnswer", "map")
@@ -315,9 +300,9 @@ def detection_map(answer: MapAnswer) -> Picture:
     (x, y), (x_axis, y_axis) = places, axes
     contoured, row = bool(question.contours) and min(x.size, y.size) > 1, []
     for statistic, p in zip(answer.statistics, answer.probability, strict=True):
-        series: list[Series] = [Mesh("detection probability", at=(x, y, p))]
+        series: list[Series] = [chart.Mesh("detection probability", at=(x, y, p))]
         if contoured:
-            series.append(Levels("detected", levels=tuple(question.contours), at=(x, y, p)))
+            series.append(chart.Levels("detected", levels=tuple(question.contours), at=(x, y, p)))
         title = statistic_label(statistic).partition(" (")[0]
         row.append(Panel(x_axis, y_axis, series, title))
     names = {axis.quantity for axis in question.axes}
@@ -386,8 +371,8 @@ def budget_series(x: Expectation) -> dict[str, Any]:
 @picture_of("SnrAnswer", "noise-budget")
 def noise_budgets(answer: SnrAnswer) -> Picture:
     """Plot pixel noise by origin against wavelength, one panel per star and cell, as in the paper."""
-    each, seen = answer.study.sweep.size, [(star, star.result.expectation) for star in answer.stars]
-    observed = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in seen]
+    number_of_cells, expectations = answer.study.sweep.size, [(star, star.result.expectation) for star in answer.stars]
+    observed = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in expectations]
 
     def finish(axis: Any) -> None:
         # Zodiacal light can be far below everything else.
@@ -396,7 +381,7 @@ def noise_budgets(answer: SnrAnswer) -> Picture:
     shown = First(observed, MOST_BUDGETS, "observations")
     panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in shown]
     # A column for each cell, unless these are too many.
-    across = len(observed) // each if each <= MAX_COLUMNS and len(shown) == len(observed) else 0
+    across = len(observed) // number_of_cells if number_of_cells <= MAX_COLUMNS and len(shown) == len(observed) else 0
     rows = [panels[k::across] for k in range(across)] or in_rows(panels, MAX_COLUMNS)
     size = COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
     title = "Noise budgets; nominal throughput, not a flight calibration"
@@ -409,14 +394,14 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
     from mauvecl.answers.signal import place_of
 
     first, row = answer.study.sweep.axes[0].quantity, []
-    for wavelength in answer.stars[0].shown_nm:
+    for wavelength in answer.shown_nm:
         lines: dict[str, list[Any]] = {}
         for star in answer.stars:
             name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
-            rest = full_label(name, {k: v for k, v in star.at.items() if k != first})
+            name_of_line = full_label(name, {k: v for k, v in star.at.items() if k != first})
             element = star.result.element[place_of(star.result.expectation, wavelength, "element")]
             ends = (max(element[q], 1e-3) for q in ("q2.5", "q97.5"))
-            lines.setdefault(rest, []).append((star.at[first], element["expected"], *ends))
+            lines.setdefault(name_of_line, []).append((star.at[first], element["expected"], *ends))
         series: list[Series] = []
         for (name, points), colour in zip(lines.items(), cycle(COLOURS), strict=False):
             x, expected, low, high = zip(*points, strict=True)

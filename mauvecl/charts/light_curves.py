@@ -14,14 +14,15 @@ from scipy.special import ndtri
 from mauvecl.charts import chart
 from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, picture_of, styled_picture
-from mauvecl.host.arrays import Float
+from mauvecl.charts.matplotlib import COLOURS, picture_of
+from mauvecl.host.arrays import Bool, Float
+from mauvecl.observations.events import GAP_FRAMES
 from mauvecl.schema.columns import First, part_note
 
 if TYPE_CHECKING:
     from mauvecl.answers.analyse import AnalyseAnswer
     from mauvecl.answers.inject import InjectAnswer
-    from mauvecl.answers.stare import StareAnswer, StarStare
+    from mauvecl.answers.stare import StarStare
     from mauvecl.flares.stare import Stare
     from mauvecl.observations.frames import Frames
 
@@ -117,11 +118,10 @@ TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.
 @picture_of("StareAnswer", "light-curve", each=lambda answer: [(star,) for star in answer.stares])
 def light_curves(star: StarStare) -> Picture:
     """Plot light curves in all bands, relative to the quiescent star, with injected and found flares."""
-    stare, light, rows = star.staring.stare, star.light, list[list[Panel]]()
+    stare, bands, rows = star.staring.stare, star.light.bands, list[list[Panel]]()
     scale, unit = time_unit(stare.duration_s)
-    level, gaps = np.median(light.mean, axis=0), _runs(stare.numbers)
     lost = stare.numbers[:0] if star.pointing_loss is None else stare.numbers[star.pointing_loss > 0]
-    ends = [(lost[part[0]] * stare.frame_s, (lost[part[-1]] + 1) * stare.frame_s) for part in _runs(lost) if part.size]
+    ends = [(lost[run[0]] * stare.frame_s, (lost[run[-1]] + 1) * stare.frame_s) for run in _runs(lost) if run.size]
     always = [
         Strips("light lost in pointing drifts", alpha=0.2, at=np.reshape(ends, (-1, 2)).T / scale),
         Rule("injected flare", dash="dotted", at=[flare.event.peak_s / scale for flare in star.flares]),
@@ -129,45 +129,46 @@ def light_curves(star: StarStare) -> Picture:
     peaks = [float(flare.alarm.recovered.peak_s[0]) / scale for flare in star.found if flare.alarm.measured]
 
     def finish(axis: Any) -> None:
-        label = {"label": "found flare"} if peaks else {}
         axis.plot(peaks, [1.03] * len(peaks), "v", color=chart.INK["flare"], transform=axis.get_xaxis_transform(),
-                  markersize=4, clip_on=False, **label)  # fmt: skip
+                  markersize=4, clip_on=False, label="found flare")  # fmt: skip
 
-    for k, band in enumerate(light.bands):
-        series = list[Series](always)
-        for number, part in enumerate(gaps):
-            # Means of groups of frames, of which the last may be smaller.
-            edges = np.arange(0, part.size, -(-stare.n_frames // MOST_POINTS))
-            columns = (stare.middle_s / scale, light.flux[:, k] / level[k], light.mean[:, k] / level[k])
-            sums = (np.add.reduceat(values[part], edges) for values in columns)
-            time, flux, mean = (values / np.diff(np.append(edges, part.size)) for values in sums)
-            series += [
-                Dots("simulated frames", "star", size=2, alpha=0.6, listed=not number, at=(time, flux)),
-                Line("star and flares alone", "text", width=1.1, listed=not number, at=(time, mean)),
-            ]
+    for k, band in enumerate(bands):
+        frames, mean = _stare_points(star, k)
+        series = [
+            *always,
+            Dots("simulated frames", "star", size=2, alpha=0.6, at=frames),
+            Line("star and flares alone", "text", width=1.1, at=mean),
+        ]
         x, y = Axis(f"time from the start of the stare ({unit})"), Axis("flux / quiescent")
-        rows.append([Panel(x, y, series, band, finish)])
+        # Markers outside the axes that have no place would make matplotlib give up the layout of the figure.
+        rows.append([Panel(x, y, series, band, finish if peaks else None)])
     title = f"{star.title}: one simulated stare; nominal throughput"
     return Picture(rows, (7.2, 1.5 * len(rows) + 0.9), title, below=True, share_x=True)
 
 
-@styled_picture
-def compare_light_curves(answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Picture:
-    """Plot light curves of titled answers, a row per star and a column per answer; band 0 is the whole range."""
-    rows: list[list[Panel]] = [[] for _ in answers[0][1].stares]
-    for title, answer in answers:
-        for row, star in zip(rows, answer.stares, strict=True):
-            light, stare = star.light, star.staring.stare
-            scale, unit = time_unit(stare.duration_s)
-            level, time = np.median(light.mean[:, band]), stare.middle_s / scale
-            series = [
-                Dots("", "star", size=1.3, at=(time, light.flux[:, band] / level)),
-                Line("", width=1.1, at=(time, light.mean[:, band] / level)),
-            ]
-            above = f"{title}\n" if row is rows[0] else ""
-            heading = f"{above}{star.title}, {light.bands[band]}"
-            row.append(Panel(Axis(f"time ({unit})"), Axis("flux / quiescent"), series, heading))
-    return Picture(rows, (3.7 * len(answers), 1.5 * len(rows) + 0.8), share_x=True, share_y="row")
+def _stare_points(star: StarStare, band: int) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
+    """Return times and relative fluxes of a band, as drawn and without noise; the latter have no value in gaps.
+
+    Each point of a long stare is the mean of a group of frames, of which the last before a gap may be smaller.
+    """
+    stare, light, runs = star.staring.stare, star.light, _runs(star.staring.stare.numbers)
+    starts = np.concatenate([np.arange(run[0], run[-1] + 1, -(-stare.n_frames // MOST_POINTS)) for run in runs])
+    counts = np.diff(np.append(starts, stare.n_frames))
+    columns = stare.middle_s, light.flux[:, band], light.mean[:, band]
+    time, flux, mean = (np.add.reduceat(values, starts) / counts for values in columns)
+    time, level = time / time_unit(stare.duration_s)[0], np.median(light.mean[:, band])
+    at, is_gap = _with_gaps(np.arange(starts.size), np.searchsorted(starts, [run[0] for run in runs[1:]]))
+    return (time, flux / level), (time[at], np.where(is_gap, np.nan, mean[at] / level))
+
+
+def _with_gaps(at: NDArray[np.int64], after: NDArray[np.int64]) -> tuple[NDArray[np.int64], Bool]:
+    """Return indices of points with both ends of each gap once more, and whether each of them is such an end.
+
+    Gaps precede the indices at the places `after`.
+    """
+    ends = np.column_stack([at[after - 1], at[after]]).ravel()
+    places = np.repeat(after, 2)
+    return np.insert(at, places, ends), np.insert(np.zeros(at.size, np.bool_), places, True)
 
 
 @picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(star,) for star in answer.stares])
@@ -236,6 +237,8 @@ def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
 #: Verdicts on events, with their colours, and these in words.
 VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
 WORDS = {"star": "blue", "drawn": "grey", "own": "red", "dark": "pink"}
+#: Shortest gap in which the level is not drawn, as a share of the whole time.
+LONG_GAP = 0.005
 #: Flux in standard deviations above which the light curve has a second panel near the level.
 BRIGHT = 30.0
 LIGHT_CURVE = Chart(
@@ -280,10 +283,15 @@ def light_curve_series(
             ends = [(row.event.first, row.event.last) for row in answer.rows if row.verdict == verdict]
             ends_s = answer.analysis.survey.time_s[np.array(ends, int).reshape(-1, 2)] + [-half_s, half_s]
             series[f"{verdict} events"] = (ends_s - frames.time_s[0]).T / unit_s
+        long_s = max(GAP_FRAMES * frames.cadence_s, LONG_GAP * float(np.ptp(frames.time_s)))
+        stretch = np.cumsum(np.diff(frames.time_s, prepend=frames.time_s[0]) > long_s)
         at = thinned(middle, most)
-        series |= {"range": (time[at], (middle - off)[at], (middle + off)[at]), "level": (time[at], middle[at])}
-    for name, which in (("searched", used), ("left out", ~used & np.isfinite(flux))):
-        at = np.flatnonzero(which)
+        at, is_gap = _with_gaps(at, np.flatnonzero(np.diff(stretch[at])) + 1)
+        # In a gap the band has no width, since pages cannot interrupt an area.
+        x, y, off = time[at], middle[at], np.where(is_gap, 0.0, off[at])
+        series |= {"range": (x, y - off, y + off), "level": (x, np.where(is_gap, np.nan, y))}
+    for name, chosen in (("searched", used), ("left out", ~used & np.isfinite(flux))):
+        at = np.flatnonzero(chosen)
         at = at[thinned(flux[at], most)]
         series[name] = time[at], flux[at]
     return series
@@ -303,7 +311,7 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     around = float(np.min((flux - error)[used])), float(np.max((flux + error)[used]))
     # Frames that are left out may be far off.
     reach = around[1] - around[0]
-    beside = [one for one in flux[~used & np.isfinite(flux)] if around[0] - reach < one < around[1] + reach]
+    beside = [value for value in flux[~used & np.isfinite(flux)] if around[0] - reach < value < around[1] + reach]
     shown = [(Axis(label, limits=(min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach)), False)]
     if ((flux - analysis.level.level) / error)[used].max() > BRIGHT:
         shown.append((Axis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2)), True))
@@ -341,9 +349,9 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     noise = spectra.noise
     nm, series = noise.wavelength_nm, list[Series]()
     series.append(Area("95 % of normal noise", at=(nm, noise.low / noise.stated, noise.high / noise.stated)))
-    for name, which, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
-        if which.any():
-            series.append(Dots(name, colour, size=4, at=(nm[which], (noise.measured / noise.stated)[which])))
+    for name, chosen, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
+        if chosen.any():
+            series.append(Dots(name, colour, size=4, at=(nm[chosen], (noise.measured / noise.stated)[chosen])))
     panel = Panel(Axis("wavelength (nm)"), Axis("measured / stated noise"), series)
     return Picture([[panel]], (4.6, 3.5), f"{answer.analysis.frames.name}: noise of quiescent frames", below=True)
 

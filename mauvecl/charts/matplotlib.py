@@ -68,7 +68,7 @@ def style() -> Any:
     return mpl.rc_context(STYLE)  # type: ignore[arg-type]
 
 
-def new_figure(size: tuple[float, float], **how: Any) -> Any:
+def new_figure(size: tuple[float, float], **options: Any) -> Any:
     """Return an empty figure that Agg renders, without pyplot's windows, and that notebooks display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -78,13 +78,13 @@ def new_figure(size: tuple[float, float], **how: Any) -> Any:
         figure.savefig(content, format="png")
         return content.getvalue()
 
-    figure: Any = Figure(figsize=size, **how)
+    figure: Any = Figure(figsize=size, **options)
     FigureCanvasAgg(figure)
     figure._repr_png_ = png
     return figure
 
 
-def _own_part(ax: Any) -> Any:
+def _subfigure_of(ax: Any) -> Any:
     """Return the part of the caller's figure that axes occupy, for a picture of several panels.
 
     Raises InputError if the axes are not part of a grid.
@@ -98,8 +98,10 @@ def _own_part(ax: Any) -> Any:
     return ax.figure.add_subfigure(spec)
 
 
-def _legend_below(figure: Any, handles: dict[str, Any]) -> None:
-    """Add a legend below all panels, in as few rows as fit, which have about equally many entries."""
+def _legend_below(figure: Any, axes: Sequence[Any]) -> None:
+    """Add a legend of axes below all panels, in as few rows as fit, which have about equally many entries."""
+    entries = (zip(*axis.get_legend_handles_labels(), strict=True) for axis in axes)
+    handles = {name: handle for of_axis in entries for handle, name in of_axis}
     for rows in range(1, len(handles) + 1):
         columns = -(-len(handles) // rows)
         legend = figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
@@ -137,27 +139,31 @@ def styled_picture(draw: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @wraps(draw)
-    def picture(*what: Any, path: str | Path | None = None, ax: Any = None, **how: Any) -> Any:
+    def picture(*arguments: Any, path: str | Path | None = None, ax: Any = None, **keywords: Any) -> Any:
         if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
             raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
         with style():
-            made = draw(*what, **how)
-            figure = draw_picture(Picture([[made]]) if isinstance(made, Panel) else made, ax=ax)
-            saved = save_or_return(figure, path)
+            description = draw(*arguments, **keywords)
+            picture = Picture([[description]]) if isinstance(description, Panel) else description
+            saved = save_or_return(draw_picture(picture, ax=ax), path)
         return saved if ax is None else ax
 
     return picture
 
 
-def picture_of(kind: str, name: str, **how: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def picture_of(kind: str, name: str, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
 
-    `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `how` is as for
-    `chart.Entry`. A function that is a picture of several classes is decorated once.
+    `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `options` are as
+    for `chart.Entry`. A function that is a picture of several classes is decorated once.
     """
-    return lambda draw: chart.register(
-        kind, name, draw if hasattr(draw, "__wrapped__") else styled_picture(draw), **how
-    )
+
+    def registered(draw: Callable[..., Any]) -> Callable[..., Any]:
+        styled = draw if hasattr(draw, "__wrapped__") else styled_picture(draw)
+        chart.ENTRIES[kind].append(chart.Entry(name, styled, **options))
+        return styled
+
+    return registered
 
 
 def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any:
@@ -165,7 +171,7 @@ def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any
     rows, n = picture.rows, max(len(row) for row in picture.rows)
     alone = ax is not None and len(rows) == n == 1
     if figure is None:
-        figure = new_figure(picture.size) if ax is None else ax.figure if alone else _own_part(ax)
+        figure = new_figure(picture.size) if ax is None else ax.figure if alone else _subfigure_of(ax)
     axes = np.array([[ax]]) if alone else figure.subplots(
         len(rows), n, squeeze=False, sharex=picture.share_x, sharey=picture.share_y, height_ratios=picture.heights,
         width_ratios=picture.widths,
@@ -193,8 +199,7 @@ def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any
         axes[0, 0].set_title(axes[0, 0].get_title(loc="left") or title)
         return figure
     if picture.below:
-        entries = [zip(*axis.get_legend_handles_labels(), strict=True) for axis, _ in drawn]
-        _legend_below(figure, {name: handle for each in entries for handle, name in each})
+        _legend_below(figure, [axis for axis, _ in drawn])
     if title:
         # Wrapped to a part of the width, which matplotlib would fill to the edges.
         text = figure.suptitle(title, fontsize=9.0)
@@ -295,14 +300,14 @@ def save_or_return(figure: Any, path: str | Path | None) -> Any:
     """
     if path is None:
         return figure
-    drawn, place, whole = io.BytesIO(), Path(path), figure.figure
+    content, place, parent = io.BytesIO(), Path(path), figure.figure
     if place.suffix == ".png":
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         # savefig gives the same result, but draws each picture twice.
-        whole.set_dpi(STYLE["savefig.dpi"])
-        FigureCanvasAgg(whole).print_png(drawn)  # type: ignore[no-untyped-call]
+        parent.set_dpi(STYLE["savefig.dpi"])
+        FigureCanvasAgg(parent).print_png(content)  # type: ignore[no-untyped-call]
     else:
-        whole.savefig(drawn, format=place.suffix[1:] or None)
-    write_whole(place, drawn.getbuffer())
+        parent.savefig(content, format=place.suffix[1:] or None)
+    write_whole(place, content.getbuffer())
     return place

@@ -38,7 +38,7 @@ td,th{padding:.2em .7em;text-align:left;border-bottom:1px solid #ccc;vertical-al
 <p class=from>${part.note}</p>
 % endif
 % if part.picture:
-${html_image(part.picture, part.seen) | n}
+${html_image(part.picture, part.text) | n}
 % endif
 </section>
 % endfor

@@ -4,48 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mauvecl.charts import chart
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Area,
-    Axis,
-    Chart,
-    Dots,
-    Line,
-    Mesh,
-    Panel,
-    Picture,
-    Rule,
-    Series,
-    Strips,
-    Targets,
-)
-from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of, styled_picture
-from mauvecl.schema.columns import First, note_of, with_error
+from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of
+from mauvecl.schema.columns import First, with_error
 
 if TYPE_CHECKING:
     from mauvecl.answers.calibrate import CalibrateAnswer
     from mauvecl.answers.change import ChangeAnswer
     from mauvecl.answers.measure import JointFit, MeasureAnswer, MeasuredFlare, MeasuredStare
-    from mauvecl.host.exposure.background import Sky
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
-
-FLUX = Axis("flux (erg s$^{-1}$ cm$^{-2}$ Å$^{-1}$)")
-OPTICS = {
-    "grating_efficiency": "grating",
-    "fibre_efficiency": "fibre",
-    "telescope_mirror_reflectivity": "telescope mirror",
-    "spectrometer_mirror_reflectivity": "spectrometer mirror",
-    "collection_lens_efficiency": "collection lens",
-    "window_efficiency": "window",
-}
 
 
 @picture_of("Source", "source")
@@ -53,7 +26,8 @@ def source(star: Source) -> Panel:
     """Plot a spectrum in Mauve's wavelength range."""
     inside = (star.wavelength_nm >= RANGE_NM[0]) & (star.wavelength_nm <= RANGE_NM[1])
     flux = Line("", "star", width=1.1, at=(star.wavelength_nm[inside], star.flux_flam[inside]))
-    return Panel(WAVELENGTH, FLUX, [flux], ", ".join([star.name, *star.history]))
+    y = Axis("flux (erg s$^{-1}$ cm$^{-2}$ Å$^{-1}$)")
+    return Panel(WAVELENGTH, y, [flux], ", ".join([star.name, *star.history]))
 
 
 @picture_of("Expectation", "expectation")
@@ -64,83 +38,6 @@ def expectation(x: Expectation) -> Panel:
     line = Line("mean signal", "star", width=1.2, at=(w, mean))
     return Panel(Axis("wavelength (nm)", limits=(w[0], w[-1])), Axis("DN per pixel"), [band, line],
                  f"{x.name}, {x.exposure_s:g} s")  # fmt: skip
-
-
-@styled_picture
-def magnitudes(source: Source, values: Sequence[float], band: str = "V") -> Panel:
-    """Plot a spectrum at several magnitudes, as the paper's figure of the rescaled HD 37202."""
-    stars = [(f"{band} = {value:g}", source.at_magnitude(value, band)) for value in values]
-    lines = Targets(at=[(name, star.wavelength_nm, star.flux_flam) for name, star in stars])
-    return Panel(WAVELENGTH, Axis(FLUX.label, log=True), [lines], source.name)
-
-
-@styled_picture
-def zodiacal(source: Source, sky: Sky, instrument: Instrument) -> Picture:
-    """Plot a spectrum with zodiacal light, and the zodiacal light, as the paper's figure of the residual."""
-    light, nm = sky.spectrum(instrument.field_of_view_arcsec2), source.wavelength_nm
-    added = 0.0 if light is None else np.interp(nm, light.wavelength_nm, light.flux_flam)
-    both = Line("with zodiacal light", "read", at=(nm, source.flux_flam + added))
-    alone = Line("star alone", "star", dash="dashed", at=(nm, source.flux_flam))
-    rest = [] if light is None else [Line("", "sky", at=(light.wavelength_nm, light.flux_flam))]
-    above = Panel(WAVELENGTH, FLUX, [both, alone], source.name)
-    below = Panel(WAVELENGTH, FLUX, rest, f"difference: {sky.description}")
-    return Picture([[above], [below]], (3.6, 4.0), share_x=True)
-
-
-@styled_picture
-def convolved(source: Source, instrument: Instrument) -> Panel:
-    """Plot a spectrum and its convolution with the line spread function, as the paper's figure.
-
-    The efficiencies of optics and detector are not applied.
-    """
-    from mauvecl.host.exposure.response import electrons_per_second
-
-    nm = source.wavelength_nm
-    # Division by a flat spectrum removes the efficiencies and leaves the effect of the line spread function.
-    flat = electrons_per_second(instrument, nm, np.ones_like(source.flux_flam))
-    seen = electrons_per_second(instrument, nm, source.flux_flam) / flat
-    given = Line("as given", COLOURS[3], width=1.1, at=(nm, source.flux_flam))
-    through = Line("through Mauve's line function", "sky", at=(instrument.wavelength_nm, seen))
-    return Panel(WAVELENGTH, Axis(FLUX.label, limits=(0, 1.1 * float(seen.max()))), [given, through], source.name)
-
-
-@styled_picture
-def efficiencies(instrument: Instrument) -> Picture:
-    """Plot each optical element's efficiency, as the paper's figure of the payload's components."""
-    w = np.linspace(*RANGE_NM, 501)
-    lines = Targets(at=[(text, w, 100 * getattr(instrument, name).at(w)) for name, text in OPTICS.items()])
-    title = f"{instrument.name}: nominal, some of it assumed"
-    panel = Panel(WAVELENGTH, Axis("efficiency (%)", limits=(0, 105)), [lines], title)
-    return Picture([[panel]], (3.6, 3.4), below=True)
-
-
-@styled_picture
-def throughput(instrument: Instrument) -> Picture:
-    """Plot the quantum efficiency and the end-to-end throughput, which includes it, as the paper's figure."""
-    w, errors = np.linspace(*RANGE_NM, 501), instrument.throughput_errors
-    origin, label = ("nominal, not a flight calibration", "assumed uncertainty")
-    share = np.where(w < 250, 0.5, 0.3)
-    low, high, spread = 1 - share, 1 + share, 100 * instrument.throughput(w)
-    if errors is not None:
-        origin, label = "calibrated", "95 %"
-        low, high = (np.exp(sign * 1.96 * errors.sd(w)) for sign in (-1, 1))
-    quantum = Line("", "star", at=(w, 100 * instrument.quantum_efficiency(w)))
-    band, line = Area(label, alpha=0.25, at=(w, low * spread, high * spread)), Line("", "flare", at=(w, spread))
-    above = Panel(WAVELENGTH, Axis("quantum efficiency (%)"), [quantum], f"{instrument.name}: {origin}")
-    below = Panel(WAVELENGTH, Axis("end-to-end throughput (%)"), [line, band])
-    return Picture([[above], [below]], (3.6, 4.0), share_x=True)
-
-
-@styled_picture
-def flares(source: Source, amplitudes: Sequence[float]) -> Panel:
-    """Plot a star's spectrum at several stages of a flare, as the paper's figures of the inputs."""
-    stars = [(f"flare {100 * a:g} %", source.flaring(a)) for a in amplitudes]
-    lines = [
-        Line(name, colour, width=1.1, at=(star.wavelength_nm, star.flux_flam))
-        for colour, (name, star) in zip(cycle(COLOURS), stars, strict=False)
-    ]
-    quiet = Line("no flare", "text", width=1.1, dash="dashed", at=(source.wavelength_nm, source.flux_flam))
-    return Panel(WAVELENGTH, FLUX, [*lines[::-1], quiet], source.name)
 
 
 #: Pixels that are averaged for a point of the residuals, and values for one of the photon transfer.
@@ -180,7 +77,7 @@ def fitted_throughput(answer: CalibrateAnswer) -> Picture:
 @Chart(
     "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {BIN} pixels (sigma)"),
     (
-        Targets("residual", tips=("residual (sigma)",)),
+        chart.Targets("residual", tips=("residual (sigma)",)),
         Rule("2 sigma", "threshold", "above", along="y", at=2.0),
         Rule("2 sigma", "threshold", "below", along="y", listed=False, at=-2.0),
     ),
@@ -256,10 +153,10 @@ def dark_current(answer: CalibrateAnswer) -> Picture:
         mean.append(Dots("" if number else "means of frames", "star", at=at))
     mean.append(Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))))
     mean.append(Line("nominal", dash="dashed", at=(kelvin, usual)))
-    left = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
-    right = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
+    pixel_panel = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
+    mean_panel = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
     title = f"Dark current: slope {with_error(d.slope_per_c, d.slope_error)} per °C"
-    return Picture([[left, right]], (7.2, 2.9), title)
+    return Picture([[pixel_panel, mean_panel]], (7.2, 2.9), title)
 
 
 #: Changes whose periods are drawn, at most.
@@ -275,8 +172,8 @@ def along_magnitude(answer: ChangeAnswer, scales: Mapping[str, float]) -> list[t
     lines = list[tuple[str, Any, Any]]()
     for name, unit in dict.fromkeys((row.change.name, row.change.unit) for row in answer.along):
         if unit in scales:
-            own = [row for row in answer.along if row.change.name == name][: MAGNITUDES.size]
-            x, y = np.array([(row.magnitude, row.smallest.one) for row in own]).T
+            changes = [row for row in answer.along if row.change.name == name][: MAGNITUDES.size]
+            x, y = np.array([(row.magnitude, row.smallest.one) for row in changes]).T
             lines.append((shown_name(name), x[np.isfinite(y)], scales[unit] * y[np.isfinite(y)]))
     return lines
 
@@ -293,14 +190,14 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     (title,), star, row = titles, answer.study.star[0], []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
-        here = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
+        rules = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
         values, limits = [value for _, _, column in lines for value in column], None
         if lines:
             # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
             limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
         y = Axis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
-        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [Targets(at=lines), *here]))
+        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [chart.Targets(at=lines), *rules]))
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
     title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
     return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
@@ -313,7 +210,7 @@ def recovered_periods(answer: ChangeAnswer) -> Picture:
     for row_of_change in first:
         r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
         shares = 100 * row_of_change.shares("value")
-        mesh = Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
+        mesh = chart.Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
         unit = row_of_change.change.unit
         y = Axis(f"semi-amplitude ({in_figure(unit) if unit else '%'})", log=True)
         row.append(Panel(Axis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
@@ -352,22 +249,12 @@ MOST_FLARES = 4
 MANY_FITS = 1000
 
 
-def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
-    """Return the first flares."""
-    return (First(answer.flares, MOST_FLARES, "flares"),)
-
-
-def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
-    """Return the first flares whose model has a single temperature."""
-    return (First([flare for flare in answer.flares if flare.model != "two-temperatures"], MOST_FLARES, "flares"),)
-
-
-@picture_of("MeasureAnswer", "fit", given=_few)
-def fits(flares: Sequence[MeasuredFlare]) -> Picture:
+@picture_of("MeasureAnswer", "fit")
+def fits(answer: MeasureAnswer) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     from mauvecl.fits.flare_model import usable_variance
 
-    above, below = list[Panel](), list[Panel]()
+    flares, above, below = First(answer.flares, MOST_FLARES, "flares"), list[Panel](), list[Panel]()
     for flare in flares:
         quiet, measurement = flare.quiet, flare.found
         mean, unknown = flare.fitted_dn()
@@ -376,8 +263,8 @@ def fits(flares: Sequence[MeasuredFlare]) -> Picture:
         sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (flare.frame - unknown, mean, variance)]
         # Resolution elements of which some pixels are not used are not shown.
         pixels = quiet.per_element(np.ones(used.size))
-        whole = quiet.per_element(used.astype(np.float64)) == pixels
-        data, fit, variance = (np.where(whole, values, np.nan) for values in sums)
+        complete = quiet.per_element(used.astype(np.float64)) == pixels
+        data, fit, variance = (np.where(complete, values, np.nan) for values in sums)
         nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
         x = Axis("wavelength (nm)")
         # Elements differ in their number of pixels, means hardly.
@@ -387,17 +274,23 @@ def fits(flares: Sequence[MeasuredFlare]) -> Picture:
         residuals = Dots("", "star", size=4, at=(nm, (data - fit) / noise))
         below.append(Panel(x, Axis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
     size = 3.6 * len(flares), 4.6
-    return Picture([above, below], size, notes=(note_of(flares),), share_x=True, heights=(2, 1))
+    return Picture([above, below], size, notes=(flares.note,), share_x=True, heights=(2, 1))
 
 
-def _each(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
-    """Return a picture with a panel per flare."""
-    row = [panel(flare) for flare in flares]
-    return Picture([row], (3.4 * len(flares), 3.6), notes=(note_of(flares),), below=True)
+def _panel_per_flare(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
+    """Return a picture with a panel for each of the first flares."""
+    first = First(flares, MOST_FLARES, "flares")
+    row = [panel(flare) for flare in first]
+    return Picture([row], (3.4 * len(first), 3.6), notes=(first.note,), below=True)
 
 
-@picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
-def contours(flares: Sequence[MeasuredFlare]) -> Picture:
+def _of_single_temperature(answer: MeasureAnswer) -> list[MeasuredFlare]:
+    """Return the flares whose model has a single temperature."""
+    return [flare for flare in answer.flares if flare.model != "two-temperatures"]
+
+
+@picture_of("MeasureAnswer", "contours", when=_of_single_temperature)
+def contours(answer: MeasureAnswer) -> Picture:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
 
     def panel(flare: MeasuredFlare) -> Panel:
@@ -411,15 +304,15 @@ def contours(flares: Sequence[MeasuredFlare]) -> Picture:
             series.append(Dots("simulated flare", "text", marker="x", size=8, at=flare.truth[:2]))
         return Panel(Axis("flare temperature (K)"), Axis("flare amplitude"), series, flare.name)
 
-    return _each(flares, panel)
+    return _panel_per_flare(_of_single_temperature(answer), panel)
 
 
-@picture_of("MeasureAnswer", "pulls", given=_few)
-def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
+@picture_of("MeasureAnswer", "pulls")
+def pulls(answer: MeasureAnswer) -> Picture:
     """Plot the pulls of estimates, (estimate - truth) / standard error, and the standard normal."""
     # Few fits need wide bins.
-    most = max(len(flare.found.estimates) for flare in flares)
-    x, edges = np.linspace(-5.0, 5.0, 201), np.linspace(-5.0, 5.0, 41 if most >= MANY_FITS else 21)
+    bins = 40 if answer.study.measure.fits >= MANY_FITS else 20
+    x, edges = np.linspace(-5.0, 5.0, 201), np.linspace(-5.0, 5.0, bins + 1)
 
     def panel(flare: MeasuredFlare) -> Panel:
         series: list[Series] = []
@@ -434,11 +327,11 @@ def pulls(flares: Sequence[MeasuredFlare]) -> Picture:
         x_axis = Axis("(estimate \N{MINUS SIGN} truth) / standard error")
         return Panel(x_axis, Axis("probability density"), series, flare.name)
 
-    return _each(flares, panel)
+    return _panel_per_flare(answer.flares, panel)
 
 
-@picture_of("MeasureAnswer", "errors", given=_few)
-def errors(flares: Sequence[MeasuredFlare]) -> Picture:
+@picture_of("MeasureAnswer", "errors")
+def errors(answer: MeasureAnswer) -> Picture:
     """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
 
     def panel(flare: MeasuredFlare) -> Panel:
@@ -452,7 +345,7 @@ def errors(flares: Sequence[MeasuredFlare]) -> Picture:
         x, y = Axis("flare amplitude", log=True), Axis("relative standard error", log=True)
         return Panel(x, y, series, flare.name)
 
-    return _each(flares, panel)
+    return _panel_per_flare(answer.flares, panel)
 
 
 @picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(star,) for star in answer.stares if star.perfect])

@@ -48,6 +48,12 @@ class DurationLaw:
         """Return the median half-width, s, shape of the energy."""
         return np.asarray(self.half_width_s * (np.asarray(energy_erg, float) / self.at_erg) ** self.exponent)
 
+    def quantiles(self, energy_erg: Float) -> tuple[Float, Float]:
+        """Return half-widths of each energy, shape (n_energy, n_node), and their weights in a mean, (n_node,)."""
+        nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+        half_widths = self.half_width(energy_erg)[:, None] * 10 ** (self.scatter_dex * nodes)
+        return half_widths, weights / weights.sum()
+
 
 @dataclass(frozen=True, eq=False)
 class Completeness:
@@ -122,8 +128,7 @@ class Completeness:
         widths, gain = _gains(bank.shape, window_s, bank.frame_s)
         # From undetectable energies to those that are always detected.
         log_energy = np.arange(24.0, 40.0, 1 / PER_DECADE)
-        nodes, weights = np.polynomial.hermite_e.hermegauss(15)
-        half = law.half_width(10**log_energy)[:, None] * 10 ** (law.scatter_dex * nodes)
+        half, weights = law.quantiles(10**log_energy)
         duration = scale.equivalent_duration(1.0) * 10**log_energy
         amplitude = duration[:, None] / (half * bank.shape.equivalent_duration)
         log_gain = interpolate.make_interp_spline(np.log(widths), np.log(gain), k=1)
@@ -132,7 +137,7 @@ class Completeness:
         # Small flares that noise lifts above the threshold, about 1 % of them, count as false alarms, since small
         # flares are arbitrarily frequent.
         p = np.where(signal > threshold / 2, stats.norm.sf(threshold - signal), 0.0).mean(axis=-1)
-        probability = p @ (weights / weights.sum())
+        probability = p @ weights
         how = (
             f"closed form of a bank of matched filters, {bank.shape.name}, threshold {threshold:.2f} sigma for "
             f"{false_alarms_per_day:g} false alarms a day, stretches of {window_s / 60:.0f} min"
@@ -272,6 +277,23 @@ class InjectedCompleteness:
         """Return the fraction that no template can detect because of gaps."""
         critical = self.critical if half_width is None else self.critical[half_width]
         return float(np.mean(np.isinf(critical)))
+
+    def by_energy(self, energy_erg: Float, law: DurationLaw) -> Float:
+        """Return the detected fraction of flares by energy, averaged over their half-widths, shape (n_energy,).
+
+        Sizes are energies. Injections with an alarm without the flare, whose critical size is zero, are ignored, since
+        false alarms are counted separately.
+        """
+        fractions = np.empty((len(self.half_widths_s), energy_erg.size))
+        for row, critical in zip(fractions, self.critical, strict=True):
+            counted = np.sort(critical[critical > 0])
+            row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
+        half_widths, weights = law.quantiles(energy_erg)
+        place = np.interp(np.log(half_widths), np.log(self.half_widths_s), np.arange(len(fractions)))
+        below = np.minimum(place.astype(int), len(fractions) - 2)
+        part, column = place - below, np.arange(energy_erg.size)[:, None]
+        fraction = (1 - part) * fractions[below, column] + part * fractions[below + 1, column]
+        return np.asarray(np.clip(fraction @ weights, 0.0, 1.0))
 
 
 #: Energy steps per decade for sums of rates.

@@ -47,6 +47,14 @@ def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float
     assert found["chi2"] < found["chi2_element"]
 
 
+def test_few_draws_do_not_tell_unknowns_apart(engine: Engine) -> None:
+    axes = {"x": {"quantity": "magnitude", "values": [7]}, "y": {"quantity": "amplitude", "values": [0.1]}}
+    asked = study(unknowns={"draws": 3}, map=axes, run={"statistics": ("matched",), "realisations": 2000, "fap": 0.1})
+    first = mauvecl.map(asked, engine).views[0].title
+    assert "only more draws tell apart" in first
+    assert "nan" not in first
+
+
 def test_limit_inverts_detect(engine: Engine) -> None:
     """Check that the smallest amplitude and the shortest exposure at the limiting magnitude are those given."""
     only = {"statistics": ("matched",)}

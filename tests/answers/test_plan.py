@@ -15,7 +15,6 @@ from scenes import paper
 from scipy import stats
 
 from mauvecl import Study, plan, stare, visible
-from mauvecl.answers.plan import found_by_energy
 from mauvecl.search import completeness
 
 #: Injections take ten seconds a target.
@@ -195,14 +194,14 @@ def test_targets_and_rates_are_read_from_tables(tmp_path: Path) -> None:
 
 def test_shares_equal_those_computed_by_hand() -> None:
     """Two half-widths; every flare of an energy has one half-width, in the middle of their logarithms."""
-    critical = np.array([[1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 0.0, 30.0]])
-    widths = np.array([10.0, 1000.0])
+    critical = np.array([[[1.0, 2.0, 3.0, 4.0]], [[10.0, 20.0, 0.0, 30.0]]])
+    injected = completeness.InjectedCompleteness((10.0, 1000.0), np.ones(1), np.ones((2, 1)), critical)
     fixed = ["plan.at_erg=1", "plan.exponent=0", "plan.scatter_dex=0"]
     law, short = (paper(*fixed, f"plan.half_width_s={w}").plan.law() for w in (100, 1))
-    found = found_by_energy(critical, widths, np.array([0.5, 2.5, 15.0, 99.0]), law)
+    found = injected.by_energy(np.array([0.5, 2.5, 15.0, 99.0]), law)
     # An alarm without a flare is none of it: three injections are left of the second half-width.
     assert found == pytest.approx([0.0, 0.25, (1 + 1 / 3) / 2, 1.0])
-    assert found_by_energy(critical, widths, np.array([2.5]), short) == pytest.approx([0.5])
+    assert injected.by_energy(np.array([2.5]), short) == pytest.approx([0.5])
 
 
 @pytest.mark.long

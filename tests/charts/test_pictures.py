@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import tomllib
+import warnings
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -127,6 +128,37 @@ def test_report_has_every_table_remark_and_picture() -> None:
     assert "&lt;A &amp; B&gt;: 300 frames" in page
     assert all(view.title.split(";")[0] in page.replace("&lt;A &amp; B&gt;", "<A & B>") for view in answer.views)
     assert page.count("<img") == len(answer.pictures)
+
+
+def labelled(figure: Any, label: str) -> list[np.ndarray]:
+    """Return the values of the lines with a label along y."""
+    return [np.asarray(line.get_ydata()) for axis in figure.axes for line in axis.lines if line.get_label() == label]
+
+
+def test_stare_without_found_flares_has_a_layout_and_gaps() -> None:
+    study = paper(*ONE, "flare.amplitudes=[0.5]", "stare.duration_s=300", "stare.gaps=[[100, 150]]",
+                  "stare.half_width_s=20", "stare.search=false")  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (figure, *_) = (figure for _, figure, _ in drawn(mauvecl.stare(study, mauvecl.Stares())))
+    bands = labelled(figure, "star and flares alone")
+    assert len(bands) == 5
+    # Twenty frames before the gap and thirty after it.
+    assert all(np.flatnonzero(np.isnan(band)).tolist() == [20, 21] and band.size == 52 for band in bands)
+
+
+def test_level_of_observed_frames_is_not_drawn_in_long_gaps() -> None:
+    """Two days are missing, where the level has no line and its range no width, and single frames, where it has."""
+    time, rng = np.arange(200) * 120.0, np.random.default_rng(1)
+    time = np.delete(np.where(time < 12_000, time, time + 172_800.0), [50, 51])
+    frames = mauvecl.Frames.of(time, rng.normal(100.0, 1.0, time.size), np.ones(time.size), name="star")
+    figure = mauvecl.analyse(Study().paper(), frames=frames).pictures["light-curve"]()
+    (level,) = labelled(figure, "quiescent level")
+    assert np.flatnonzero(np.isnan(level)).tolist() == [98, 99]
+    (area,) = (part for part in figure.axes[0].collections if part.get_label() == "95 % of the level")
+    path, hours = area.get_paths()[0].vertices, (time - time[0]) / 3600
+    # Both ends of the range and, once more, the level between them.
+    assert [np.unique(path[path[:, 0] == hour][:, 1]).size for hour in hours[96:100]] == [2, 3, 3, 2]
 
 
 def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:

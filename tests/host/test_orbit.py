@@ -14,7 +14,7 @@ from refusals import refused
 from scipy.interpolate import RegularGridInterpolator
 
 import mauvecl
-from mauvecl import Study, visible
+from mauvecl import Study, plan, visible
 from mauvecl.host.orbit import visibility
 
 VECTORS = Path(sgp4.__file__).parent
@@ -267,6 +267,10 @@ def test_simbad_is_asked_for_other_names(monkeypatch: pytest.MonkeyPatch) -> Non
     assert (star.spectral_type, star.source) == ("K2V", "SIMBAD")
     assert "ident.id = 'Barnard''s other star'" in asked[0]
     assert (bare.name, bare.distance_pc, bare.magnitude, bare.spectral_type) == ("HD 2", None, None, None)
+    asked.clear()
+    targets = [{"name": name, "spectral_type": "K2V"} for name in ("HD 4", "HD 5")]
+    plan(Study.build({"plan": {"targets": targets}, "orbit": {"days": 0.1, "simbad": True}}, "test"))
+    assert [query[-5:] for query in asked] == ["HD 4'", "HD 5'"]
     monkeypatch.setattr("mauvecl.host.orbit.orbit.TIMEOUT_S", 0.5)
     for name, fault in (("HD 3", "SIMBAD knows no"), ("HD 0", "ConnectionError"), ("HD 1", "0.5")):
         with refused("target", fault):

@@ -22,15 +22,16 @@ BRIGHT = ('star=[{library="G2V", magnitude=7.4}]', "search.half_widths_s=[22, 42
 def one_threshold_per_star() -> Iterator[None]:
     """Sample the false alarms of each star once: they depend on neither flares nor, but for the sampling, seeds."""
     rates: dict[str, Any] = {}
+    sampled = false_alarms.sampled_rate
 
     def sampled_once(survey: Any, seed: int) -> Any:
         name = survey.components.quiet.name
         if name not in rates:
-            rates[name] = false_alarms.sampled_rate(survey, seed)
+            rates[name] = sampled(survey, seed)
         return rates[name]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mauvecl.answers.stare.sampled_rate", sampled_once)
+        patch.setattr(false_alarms, "sampled_rate", sampled_once)
         yield
 
 
