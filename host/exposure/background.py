@@ -45,7 +45,7 @@ def parse_time(time: Time | str, name: str = "time") -> Time:
         with contextlib.suppress(ValueError):
             moment = Time(moment.strip().removesuffix("Z"), scale="utc")
     if isinstance(moment, Time) and not moment.isscalar:
-        raise InputError(f"{name} must be a single time, but holds {moment.size} times", key=name)
+        raise InputError(f"{name} must be a single time, but contains {moment.size} times", key=name)
     if not isinstance(moment, Time) or np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
         raise InputError.of(name, time, "a UTC time such as '2026-03-01T12:00:00'")
     year = float(moment.decimalyear)
@@ -72,7 +72,7 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
             raise InputError.of("target", target, expected) from error
     position = SkyCoord(target) if isinstance(target, SkyCoord | BaseCoordinateFrame) else None
     if position is not None and not position.isscalar:
-        raise InputError(f"target must be a single position, but holds {position.size} positions", key="target")
+        raise InputError(f"target must be a single position, but contains {position.size} positions", key="target")
     if position is None or not np.isfinite([position.spherical.lon.deg, position.spherical.lat.deg]).all():
         raise InputError.of("target", target, names.EXPECTED_POSITION)
     return position
@@ -204,7 +204,7 @@ def zodiacal_brightness(
     return float(np.sum(weights * np.nan_to_num(corners)) / weights.sum())
 
 
-#: Distance up to which a row of a table may be the target itself, which a message then says, arcsec.
+#: Distance up to which a message warns that a row of a table may be the target itself, arcsec.
 SAME_STAR_ARCSEC = 2.0
 #: Largest number of neighbours that a message names.
 MOST_NAMED = 4
@@ -380,7 +380,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     named = f"table of neighbours {shortened(path.name)}"
     table = Rows(read_table(path, "table of neighbours"), named, "neighbours")
     if not 1 <= table.n <= MOST_ROWS:
-        raise InputError(f"{named} must hold 1 to {MOST_ROWS} stars, not {table.n}", key="neighbours")
+        raise InputError(f"{named} must contain 1 to {MOST_ROWS} stars, not {table.n}", key="neighbours")
     name = table.first(names.STARS)
     titles = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
     target_row = None if target is None or target.strip() not in titles else titles.index(target.strip())

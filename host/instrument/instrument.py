@@ -215,7 +215,7 @@ class Instrument(Section):
         if not high > low:
             raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
         if self.wavelength_nm.size == 0:
-            fault = f"the output range {low:g}-{high:g} nm needs at least one pixel, but holds none"
+            fault = f"the output range {low:g}-{high:g} nm needs at least one pixel, but contains none"
             raise InputError(fault, key="output_min_nm")
         self._check_curves(low, high)
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
@@ -415,7 +415,7 @@ class Instrument(Section):
         values = {
             name: (value.wavelength_nm, value.value) if isinstance(value, SpectralCurve) else value
             for name, value in self._values().items()
-            # Files without a calibration keep the digest that they had before there was one.
+            # Files without a calibration keep the digest that they had before calibrations were added.
             if name not in LABELS and not (name.startswith("throughput_") and not value)
         }
         return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()
@@ -434,7 +434,7 @@ class Instrument(Section):
 
 
 def _from_file(name: str | Path) -> Instrument:
-    """Read a file, whose values and sources go before those of the file that it extends."""
+    """Read a file, whose values and sources have precedence over those of the file that it extends."""
     path = file = instrument_path(name, Path())
     entries: dict[str, tuple[Any, str]] = {}
     for _ in range(MAX_EXTENDED):

@@ -81,13 +81,9 @@ class TimeGrid:
     def first(self) -> tuple[float, float]:
         """Julian date of the start, UTC: the preceding midnight and the fraction of the day."""
         with offline():
-            time = parse_time(self.start, "start")
-            day, remainder = float(time.utc.jd1), float(time.utc.jd2)
-        midnight = np.floor(day - 0.5) + 0.5
-        fraction = (day - midnight) + remainder
-        # Astropy's second part lies within half a day on either side.
-        midnight += np.floor(fraction)
-        return float(midnight), float(fraction - np.floor(fraction))
+            time = parse_time(self.start, "start").utc
+        midnight = float(np.floor(time.jd - 0.5)) + 0.5
+        return midnight, float((time.jd1 - midnight) + time.jd2)
 
     @cached_property
     def seconds(self) -> Float:
@@ -192,7 +188,7 @@ class Elements:
     def read(cls, path: str | Path | None = None) -> Elements:
         """Read the newest set of Mauve in a file, or of its only satellite; titles and comments are ignored.
 
-        Without a path it is the public set that the package contains. Raises InputError if the file holds no set or
+        Without a path it is the public set that the package contains. Raises InputError if the file has no set or
         those of several other satellites, or a line's checksum is wrong.
         """
         if path is None:
@@ -206,11 +202,11 @@ class Elements:
             (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
         ]
         if not sets:
-            raise InputError(f"orbit file {named} must hold a line '1 ...' before a line '2 ...'", key="elements")
+            raise InputError(f"orbit file {named} must contain a line '1 ...' before a line '2 ...'", key="elements")
         sets = [(first, second) for first, second in sets if first[2:7] == MAUVE] or sets
         if len(numbers := sorted({first[2:7] for first, _ in sets})) > 1:
             satellites = f"{len(numbers)} satellites ({printable(', '.join(numbers), 80)})"
-            fault = f"orbit file {named} must hold elements of Mauve, {MAUVE}, or of one satellite, not of {satellites}"
+            fault = f"orbit file {named} must have elements of Mauve, {MAUVE}, or of one satellite, not of {satellites}"
             raise InputError(fault, key="elements")
         return max((cls(first, second, source) for first, second in sets), key=lambda elements: elements.epoch_jd)
 
@@ -314,8 +310,8 @@ class Orbit:
         if self.resolved(times) == "mean":
             return [
                 f"The orbit is a mean Sun-synchronous one through the elements ({source}): shares of time and seasons "
-                f"hold, but where the satellite stands in its orbit {days:.0f} days from the epoch is not known: times "
-                "of single windows may be off by an orbit."
+                f"are valid, but the satellite's place in its orbit {days:.0f} days from the epoch is unknown, so that "
+                "times of single windows may be off by an orbit."
             ]
         if days > TRUSTED_D:
             off = self.along_track_km(days)

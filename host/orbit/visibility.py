@@ -167,7 +167,7 @@ class Visibility:
             runs = true_runs(steps)
             for first, last in runs[np.diff(runs)[:, 0] * track.times.step_s < limits.shortest_s]:
                 steps[first:last] = False
-        # The track's own grid holds its times as arrays.
+        # The grid of the track caches its times as arrays, which would be stored with answers.
         return cls(track.orbit, replace(track.times), target, limits, seen.T, kept_by)
 
     @property

@@ -37,7 +37,7 @@ def add(
     """Keep a spectrum from a file, as `Source.read` reads it, under a name: by default that in its header or its own.
 
     Reports state its `origin`, by default the file name. With `replace`, a kept star of the same name is replaced.
-    Raises InputError if the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be
+    Raises InputError if the file contains no usable spectrum, the name is taken or invalid, or the folder cannot be
     written.
     """
     from astropy.table import Table
@@ -164,7 +164,7 @@ def fetch(
 
     A name such as ``"HD 37202"`` is searched for in all collections, ``"ngsl:HD 37202"`` in one, of whose files `base`
     may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end. Raises
-    InputError if the network fails, the star is unknown, or its file holds no usable spectrum.
+    InputError if the network fails, the star is unknown, or its file contains no usable spectrum.
     """
     word, colon, star = map(str.strip, name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
@@ -191,10 +191,10 @@ def fetch(
                 title = f"{collection.title}; {collection.citation}; {url}"
                 return add(local, star, origin=title, replace=replace, extend=extend)
             except InputError as error:
-                fault = f"the file downloaded from {url} must be a whole, usable spectrum, but is not ({error})"
+                fault = f"the file downloaded from {url} must be a complete, usable spectrum, but is not ({error})"
                 raise InputError(fault, key="base") from error
     fault = f"no star {star!r} is in {' or '.join(collection.title for collection in chosen)}"
-    remedy = "give the name that it has there, such as HD 37202, or bring the file: mauvecl library add"
+    remedy = "give the collection's name of the star, such as HD 37202, or add a file: mauvecl library add"
     raise InputError(f"{fault}; {remedy}", key="name")
 
 

@@ -75,7 +75,7 @@ _PHRASES = tuple(
 _DECIDING: tuple[Kind, ...] = (
     "error", "quality", "continuum", "background", "counts", "throughput", "luminosity",
 )  # fmt: skip
-#: Words in the name of a flux that say that it is one per frequency.
+#: Words in the name of a flux density that state that it is per frequency.
 _PER_FREQUENCY = {"fnu", "fν", "photnu", "nu", "ν", "freq", "frequency", "hz", "hertz", "jy"}
 _BRACKETS = re.compile(r"[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]\s*$")
 #: Words in brackets for units that are no flux density, or not a single one.

@@ -1,7 +1,7 @@
 """Spectra of tables: selection of one, and conversion to wavelengths in vacuum and flux densities.
 
-A selection is of a table, of its columns, and of a row if cells contain whole spectra. Users select with
-``FILE[word, ...]``: a table's label, a column's name or a row's identifier.
+Users select with ``FILE[word, ...]``: a table by its label, columns by their names, and a row by its identifier if the
+cells of a table contain entire spectra.
 """
 
 from __future__ import annotations
@@ -303,9 +303,9 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
     nm, flam = _merged(nm, flam, messages)
     unscaled, notes = table.unscaled, table.notes
     if re.search(r"surface\s+flux", table.remarks, re.I):
-        unscaled = unscaled or "its header says that it is the flux at the star's surface"
+        unscaled = unscaled or "its header states that it is the flux at the star's surface"
     if re.search(r"dereddened", table.remarks, re.I) and not any("dereddened" in note for note in notes):
-        notes += ("dereddened, as its header says: counts need it reddened again",)
+        notes += ("dereddened, as its header states: counts need it reddened again",)
     return ReadSpectrum(nm, flam, table.name, table.origin, notes, tuple(messages), unscaled, str(wavelengths.unit))
 
 
@@ -383,9 +383,9 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
         raise InputError.of("flux_unit", str(unit), f"one {usual}")
     if kind == "total" and not role.total:
         fault = f"the unit {unit} is not a flux density (it is not per wavelength or frequency)"
-        fault += f"; use one {usual}, or a column whose name says lambda F_lambda, such as lamFlam"
+        fault += f"; use one {usual}, or a column whose name means lambda F_lambda, such as lamFlam"
     elif kind == "density" and role.total:
-        fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density, but they must agree"
+        fault = f"the column's name means lambda F_lambda and its unit {unit} a flux density, but they must agree"
     elif kind == "surface brightness":
         fault = f"the unit {unit} is per solid angle; use the flux of the whole star, {usual}"
     if fault:

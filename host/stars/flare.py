@@ -240,8 +240,7 @@ class FlareWithLines(FlareSpectrum):
     """Continuum with emission lines.
 
     The flux of a line is a fraction of the continuum's in 200-700 nm, or a flux at the telescope, erg s-1 cm-2, that
-    does not depend on the flare's amplitude. Temperature, surface and messages are those of the continuum, and the
-    nodes include the corners of the lines.
+    does not depend on the flare's amplitude.
     """
 
     continuum: FlareSpectrum
@@ -249,14 +248,37 @@ class FlareWithLines(FlareSpectrum):
     fluxes_cgs: Mapping[str, LineFlux] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        lines = [EmissionLine.named(name).nodes_nm for name in (*self.fractions, *self.fluxes_cgs)]
+        for name in (*self.fractions, *self.fluxes_cgs):
+            EmissionLine.named(name)
         repeated = set(self.fractions) & set(self.fluxes_cgs)
         if repeated:
             raise InputError(f"the line {min(repeated)!r} needs either a fraction or a flux, but has both", key="lines")
-        set_read_only(self, nodes_nm=np.unique(np.concatenate([self.continuum.nodes_nm, *lines])))
-        object.__setattr__(self, "fixed_lines", any(self.fluxes_cgs.values()))
-        for name in ("temperature_k", "surface", "messages"):
-            object.__setattr__(self, name, getattr(self.continuum, name))
+
+    @property
+    def temperature_k(self) -> float | None:  # type: ignore[override]
+        """Temperature of the continuum, K."""
+        return self.continuum.temperature_k
+
+    @property
+    def surface(self) -> bool:  # type: ignore[override]
+        """True if `flux` is that of the flare's surface."""
+        return self.continuum.surface
+
+    @property
+    def messages(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Assumptions of the continuum."""
+        return self.continuum.messages
+
+    @property
+    def fixed_lines(self) -> bool:  # type: ignore[override]
+        """True if some lines have a fixed flux at the telescope."""
+        return any(self.fluxes_cgs.values())
+
+    @property
+    def nodes_nm(self) -> Float:  # type: ignore[override]
+        """Nodes of the continuum and of the lines, nm."""
+        lines = [EmissionLine.named(name).nodes_nm for name in (*self.fractions, *self.fluxes_cgs)]
+        return np.unique(np.concatenate([self.continuum.nodes_nm, *lines]))
 
     @property
     def continuum_flux(self) -> float:
@@ -353,7 +375,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
 
         Without `quiescent` the file has the flare alone. Formats are those of `Source.read`; the units override what
         both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends. Raises
-        InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
+        InputError for files that contain no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
         """
         from mauvecl.host.stars.formats import read_spectrum
 

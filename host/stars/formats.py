@@ -275,7 +275,7 @@ class _Reader:
         return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
 
     def _is_survey_image(self, header: Any) -> bool:
-        """Return whether an image holds a flux in its first row, and its errors and masks in others.
+        """Return whether the first row of an image is a flux, and others are its errors and masks.
 
         LAMOST (https://dr5.lamost.org/v3/doc/data-production-description) and SDSS-I/II
         (https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html) have such files.
@@ -346,7 +346,7 @@ class _Reader:
         header = hdu.header
         shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
         if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
-            fault = f"it holds an image of {' x '.join(map(str, shape))} pixels"
+            fault = f"it contains an image of {' x '.join(map(str, shape))} pixels"
             raise InputError(f"{fault}; use a spectrum of one dimension, rows of spectra, or a table", key="table")
         flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
         if len(flux) == 1:

@@ -153,8 +153,8 @@ def well_known_stars() -> tuple[WellKnown, ...]:
     stars = []
     for row in _rows("well_known.ecsv"):
         other_names = tuple(name.strip() for name in row["other_names"].split(","))
-        numbers = (float(row[key]) for key in ("ra", "dec", "distance", "V"))
-        stars.append(WellKnown(row["name"], other_names, *numbers, row["spectral_type"], row["source"]))
+        ra, dec, distance, v = (float(row[key]) for key in ("ra", "dec", "distance", "V"))
+        stars.append(WellKnown(row["name"], other_names, ra, dec, distance, v, row["spectral_type"], row["source"]))
     return tuple(stars)
 
 
@@ -193,7 +193,7 @@ def _keys() -> dict[str, str]:
 def library_names() -> list[str]:
     """Return the distinct names of all embedded spectra: types, aliases and stars."""
     names = [entry[column] for entry in _index().values() for column in ("name", "alias", "star")]
-    # A collection's name in front of a type says nothing that the type does not.
+    # The name of the collection before a type adds no information.
     return [name for name in dict.fromkeys(names) if name and not name.startswith("Pickles ")]
 
 
@@ -279,7 +279,7 @@ class NamedStar:
 
     name: str
     entry: WellKnown | None = None  # its entry in the list of well-known stars
-    # Its own spectrum, if any: a formula, a star of the user, or an entry of the library's index.
+    # Its spectrum, if it has one: a formula, a star of the user, or an entry of the library's index.
     light: ModelStar | OwnStar | Mapping[str, str] | None = None
 
     @property

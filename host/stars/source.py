@@ -43,7 +43,7 @@ PIVOT_NM = 550.0
 @validated
 @dataclass(frozen=True, eq=False)
 class Source(Drawable, ContentEquality):
-    """A stellar spectrum at the telescope; raises InputError if the arrays do not hold one.
+    """A stellar spectrum at the telescope; raises InputError if the arrays are not one.
 
     Examples
     --------
@@ -131,7 +131,7 @@ class Source(Drawable, ContentEquality):
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
         `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
-        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or holds no usable
+        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or has no usable
         spectrum, or less than a third of 200-700 nm.
 
         Parameters
