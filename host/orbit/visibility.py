@@ -106,17 +106,14 @@ def zodiacal_light(bodies: Bodies, target: Float) -> Float:
 
     The value is NaN near the Sun, where the table has none. One time per day samples a year well enough.
     """
-    pole = bodies.ecliptic_pole
-    latitude = float(np.degrees(np.arcsin(np.clip(target @ pole, -1, 1))))
-    flat = unit(bodies.sun - (bodies.sun @ pole)[:, None] * pole)
-    along = target - (target @ pole) * pole
-    size = float(np.linalg.norm(along))
-    # At the pole the longitude is arbitrary.
-    difference = np.degrees(np.arccos(np.clip(flat @ along / size, -1, 1))) if size > 1e-9 else np.zeros(len(flat))
-    light = np.full(len(flat), np.nan)
-    for k, away in enumerate(elongation_deg(bodies.sun, target)):
+    # Sines of the ecliptic latitudes; the longitude follows from the spherical law of cosines, arbitrary at the pole.
+    sun, star = bodies.sun @ bodies.ecliptic_pole, float(np.clip(target @ bodies.ecliptic_pole, -1, 1))
+    cosine = (bodies.sun @ target - sun * star) / np.sqrt(np.maximum((1 - sun**2) * (1 - star**2), 1e-18))
+    longitude, latitude = np.degrees(np.arccos(np.clip(cosine, -1, 1))), abs(float(np.degrees(np.arcsin(star))))
+    light = np.full(sun.size, np.nan)
+    for k, separation in enumerate(elongation_deg(bodies.sun, target)):
         with contextlib.suppress(InputError):
-            light[k] = zodiacal_brightness(float(difference[k]), abs(latitude), float(away))
+            light[k] = zodiacal_brightness(float(longitude[k]), latitude, float(separation))
     return light
 
 

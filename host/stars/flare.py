@@ -564,23 +564,23 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     if amplitude is None:
         names = shown(", ".join(rows.names), 300)
         raise rows.error(f"it has the columns {names}, but needs one named {', '.join(AMPLITUDES)}", "amplitude")
-    columns = {"amplitude": (amplitude, "1"), "start": (start, "d"), "stop": (stop, "d")}
-    cells = [[rows.number(column, row, unit) for column, unit in columns.values()] for row in range(rows.n)]
-    # AltaiPony's tables have an empty row for a star without flares.
-    filled = [(row, *values) for row, values in enumerate(cells, 1) if any(value is not None for value in values)]
-    if not 0 < len(filled) <= MAX_FLARES:
-        raise rows.error(f"it must have 1 to {MAX_FLARES} flares, not {len(filled)}", "amplitude")
-    for row, value, begin, end in filled:
-        if value is None or not SMALLEST <= value <= LARGEST:
-            cell = "an empty cell" if value is None else f"{value:g}"
+    columns = ((amplitude, "1"), (start, "d"), (stop, "d"))
+    cells = [[rows.number(column, row, unit) for column, unit in columns] for row in range(rows.n)]
+    # Missing numbers are NaN. AltaiPony's tables have an empty row for a star without flares.
+    numbers = np.array(cells, np.float64).reshape(-1, len(columns))
+    filled = np.flatnonzero(~np.isnan(numbers).all(axis=1))
+    if not 0 < filled.size <= MAX_FLARES:
+        raise rows.error(f"it must have 1 to {MAX_FLARES} flares, not {filled.size}", "amplitude")
+    for row, (value, begin, end) in zip(filled + 1, numbers[filled], strict=True):
+        if not SMALLEST <= value <= LARGEST:
+            cell = "an empty cell" if np.isnan(value) else f"{value:g}"
             raise rows.error(f"the amplitude in row {row} must be a rise above 0, not {cell}", "amplitude")
-        if begin is not None and end is not None and end < begin:
+        if end < begin:
             raise rows.error(f"row {row} ends at {end:.10g} d, but must end after {begin:.10g} d", "stop")
-    flares = QTable({"amplitude": [value for _, value, *_ in filled]})
-    for place, (title, (column, unit)) in enumerate(columns.items(), 1):
-        if title != "amplitude" and column is not None:
-            flares[title] = np.array([values[place] for values in filled], float)
-            flares[title].unit = unit
+    flares = QTable({"amplitude": numbers[filled, 0]})
+    for k, title in ((1, "start"), (2, "stop")):
+        if columns[k][0] is not None:
+            flares[title] = numbers[filled, k] * u.d
     flares.meta["comments"] = list(rows.unused([name for name in rows.names if name not in (amplitude, start, stop)]))
     flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
     return flares
