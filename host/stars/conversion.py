@@ -18,7 +18,7 @@ import numpy as np
 
 from mauvecl.host.arrays import Float
 from mauvecl.host.stars.columns import Role, as_typed, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
-from mauvecl.host.stars.spectrum import check_assumed_unit
+from mauvecl.host.stars.spectrum import FLUX_UNIT, check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, marks_in, without_indefinite
 from mauvecl.host.tables.units import Medium, is_stated, unit_and_medium, unit_of, vacuum_wavelengths
@@ -56,8 +56,6 @@ class SpectrumTable:
         """Roles of the columns."""
         return self.known_roles or [role_of(column.name, column.unit, column.ucd) for column in self.columns]
 
-
-FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 
 #: Names of columns that qualify arrays: their step, their length, and the validity of points.
 STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
@@ -293,7 +291,7 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
         # A row without wavelength or flux is not a point.
         nm, unmarked = np.delete(nm, bad), np.delete(unmarked, bad)
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
-        flam = np.asarray(light(unmarked).to_value(FLAM, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
+        flam = np.asarray(light(unmarked).to_value(FLUX_UNIT, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
         segments.append((nm[order], flam[order]))
     nm, flam = _joined(segments, messages)
     if is_assumed_flux:

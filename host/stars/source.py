@@ -18,7 +18,7 @@ from mauvecl.host.arrays import ContentEquality, Float, set_read_only
 from mauvecl.host.stars import library
 from mauvecl.host.stars import spectrum as points
 from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbody, with_flare
-from mauvecl.host.stars.spectrum import NEEDED_NM, SPAN_NM
+from mauvecl.host.stars.spectrum import FLUX_UNIT, NEEDED_NM, SPAN_NM
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     from mauvecl.host.stars.conversion import ReadSpectrum
 
-#: Unit of flux densities.
-FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)
 #: V of the brightest star, Sirius (-1.46, Bessell 1990), and of the Sun (-26.76, Willmer 2018), with margins.
 BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 #: First and last wavelength of formulas, nm, and number of points. They cover all bands; straight lines between them

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 System = Literal["catalogue", "vega", "ab"]
 #: Fraction of a band's throughput that a spectrum must cover.
 COVERAGE = 0.99
+#: Unit of flux densities.
+FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)
 #: Angstrom per nanometre, with astropy's rounding.
 ANGSTROM = float(u.nm.to(u.AA))
 #: h c in erg Angstrom, with astropy's rounding.
@@ -154,15 +156,10 @@ def is_gap(steps: Float) -> Bool:
     return wide
 
 
-def _covered_part(low: float, high: float, unit: str) -> float:
-    """Return the fraction of `NEEDED_NM` that a range in a unit covers."""
-    low_nm, high_nm = np.clip(np.array([low, high]) * _USUAL_UNITS[unit], *NEEDED_NM)
-    return float((high_nm - low_nm) / (NEEDED_NM[1] - NEEDED_NM[0]))
-
-
 def likely_unit(low: float, high: float, unit: str) -> str | None:
     """Return the only unit other than `unit` in which the numbers cover the required range, or None."""
-    shares = {name: _covered_part(low, high, name) for name in _USUAL_UNITS if name != unit}
+    ends = np.array([low, high])
+    shares = {name: measured_part(ends * factor) for name, factor in _USUAL_UNITS.items() if name != unit}
     fitting = [name for name, share in shares.items() if share >= MIN_MEASURED and low > 0.0]
     # Short ultraviolet spectra cover part of the range in Angstrom, but would start in the infrared in nm.
     if not fitting and shares.get("Angstrom", 0.0) > 0.0 and low > 900.0:
@@ -175,9 +172,10 @@ def check_assumed_unit(values: Float, unit: str) -> None:
     finite = values[np.isfinite(values)]
     if not finite.size or unit not in _USUAL_UNITS:
         return
-    low, high, factor = float(finite.min()), float(finite.max()), _USUAL_UNITS[unit]
-    covered, likely = _covered_part(low, high, unit), likely_unit(low, high, unit)
-    in_likely = 0.0 if likely is None else _covered_part(low, high, likely)
+    ends, factor = np.array([finite.min(), finite.max()]), _USUAL_UNITS[unit]
+    low, high = ends
+    covered, likely = measured_part(ends * factor), likely_unit(low, high, unit)
+    in_likely = 0.0 if likely is None else measured_part(ends * _USUAL_UNITS[likely])
     fault = f"wavelengths from {low:g} to {high:g} without a stated unit"
     needed, remedy = f"of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "give their unit: `wavelength_unit"
     if likely is not None and (covered < MIN_MEASURED or in_likely >= max(covered, 1.0 - 1e-9)):
