@@ -143,9 +143,7 @@ _USUAL_UNITS = {"nm": 1.0, "Angstrom": 0.1, "um": 1000.0}
 
 
 def measured_part(nm: Float) -> float:
-    """Return the fraction of `NEEDED_NM` that wavelengths cover, without gaps."""
-    if nm.size < 2:
-        return 0.0
+    """Return the fraction of `NEEDED_NM` that at least two wavelengths cover, without gaps."""
     steps = np.diff(np.clip(nm, *NEEDED_NM))[~is_gap(np.diff(nm))]
     return float(steps.sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
 
