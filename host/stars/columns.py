@@ -78,7 +78,7 @@ _DECIDING: tuple[Kind, ...] = (
 #: Words in the name of a flux density that state that it is per frequency.
 _PER_FREQUENCY = {"fnu", "fν", "photnu", "nu", "ν", "freq", "frequency", "hz", "hertz", "jy"}
 _BRACKETS = re.compile(r"[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]\s*$")
-#: Words in brackets for units that are no flux density, or not a single one.
+#: Words in brackets for units that are not a flux density, or not a single unit.
 _NO_DENSITY = re.compile(
     r"\b(?:cgs|SI|arb|arbitrary|relative|normali[sz]ed|counts?|adu|electrons?|a\.?u\.?)(?:\b|$)", re.IGNORECASE
 )

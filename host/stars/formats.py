@@ -114,7 +114,7 @@ def _names(lines: text_tables.NumberLines) -> tuple[list[str], list[str]]:
         return rows[k], _units(lines, k)
     unmarked = [k for k, (line, is_comment) in enumerate(lines.header) if not is_comment and line]
     if len(unmarked) == 1:
-        # The only line that is no comment may name columns, some of them unknown.
+        # The only line that is not a comment may name columns, some of them unknown.
         cells = rows.get(unmarked[0], [])
         is_marked = bool(re.search(r"[,;|\t]", lines.header[unmarked[0]][0].strip()))
         kinds = {role_of(cell).kind for cell in cells}
@@ -224,7 +224,7 @@ class _Reader:
             raise errors[0]
         if not tables and not images:
             raise InputError("it has no table and no image; give a table with WAVELENGTH and FLUX", key="table")
-        # A table of wavelengths, of lines or of a log is no spectrum.
+        # A table of wavelengths, of lines or of a log is not a spectrum.
         return images if images and not self.words and is_bare else [*tables, *images]
 
     def _table(
@@ -328,7 +328,7 @@ class _Reader:
         unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
         light = Values.of("flux", flux, unit)
         if not {"CRVAL1", "COEFF0", "PS1_0", "WAT2_001"} & {*header, *self.primary}:
-            # The wavelengths may be the only column of a table that has one for each pixel.
+            # The wavelengths may be the only column of a table with one row for each pixel.
             columns = [column for table in self.file.tables for column in self._columns(table)]
             axes = [column for column in columns if role_of(column.name).kind == "wavelength"]
             if len(fit := [axis for axis in axes if np.prod(axis.shape) == flux.shape[-1]]) == 1:

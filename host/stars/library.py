@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 
-#: Names by which they are offered.
+#: Examples of formulas, by name.
 EXAMPLES = ("blackbody 9000 K", "power law -2")
-#: Indices of power laws that are accepted; steeper spectra say nothing of stars (assumed).
+#: Accepted indices of power laws; steeper spectra are no approximation of stars (assumed).
 INDEX = Range(-10, 10)
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _NAME = re.compile(
@@ -42,7 +42,7 @@ _NAME = re.compile(
 class ModelStar:
     """Blackbody of a temperature, or else power law of an index."""
 
-    name: str  # which gives this star again
+    name: str  # by which the star is found again
     origin: str  # formula of the spectrum
     temperature_k: float | None
     index: float = 0.0
@@ -197,7 +197,7 @@ def library_names() -> list[str]:
     return [name for name in dict.fromkeys(names) if name and not name.startswith("Pickles ")]
 
 
-#: Columns of the table of embedded spectra as people read it.
+#: Columns of the printed table of embedded spectra.
 COLUMNS = (
     Column("name", heading="name"),
     Column("alias", heading="also"),
@@ -213,7 +213,7 @@ COLUMNS = (
     Column("noisy_below_nm", heading="noisy below", format=lambda below: f"{below} nm" if below else ""),
     Column("licence", heading="licence"),
 )
-#: Columns of that of the user's own.
+#: Columns of the table of the user's own stars.
 OWN_COLUMNS = (
     Column("name", heading="name"),
     Column("origin", heading="origin"),
@@ -306,7 +306,7 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
             model = ModelStar(f"power law {index:.15g}", origin, None, index)
         return NamedStar(model.name, light=model)
     star = by_key().get(name_key(text))
-    # The library may have the star under another of its names.
+    # The library may list the star under another of its names.
     entries = map(embedded, (text,) if star is None else (text, star.name, *star.other_names))
     light = next(filter(None, entries), None) or (find(text) if own else None)
     if star is not None:
