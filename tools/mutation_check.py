@@ -467,7 +467,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "fluxes per nm": (
         "test_files_are_read_as_they_say[media keyword AIRORVAC air txt]",
-        ("FLAM = u.erg / (u.s * u.cm**2 * u.AA)", "FLAM = u.erg / (u.s * u.cm**2 * u.nm)"),
+        ("FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)", "FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.nm)"),
     ),
     "errors of another flux": (
         "test_the_errors_are_those_of_the_chosen_flux",

@@ -18,6 +18,7 @@ from mauvecl.host.exposure.response import Order, electrons_per_second
 from mauvecl.host.stars import library
 from mauvecl.host.stars.source import Source
 from mauvecl.host.tables import names
+from mauvecl.host.tables.files import parse_numbers
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened, shown
@@ -44,7 +45,7 @@ def parse_time(time: Time | str, name: str = "time") -> Time:
         with contextlib.suppress(ValueError):
             moment = Time(moment.strip().removesuffix("Z"), scale="utc")
     if isinstance(moment, Time) and not moment.isscalar:
-        raise InputError(f"{name} must be a single time, but holds {moment.size} times", key=name)
+        raise InputError(f"{name} must be a single time, but contains {moment.size} times", key=name)
     if not isinstance(moment, Time) or np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
         raise InputError.of(name, time, "a UTC time such as '2026-03-01T12:00:00'")
     year = float(moment.decimalyear)
@@ -71,7 +72,7 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
             raise InputError.of("target", target, expected) from error
     position = SkyCoord(target) if isinstance(target, SkyCoord | BaseCoordinateFrame) else None
     if position is not None and not position.isscalar:
-        raise InputError(f"target must be a single position, but holds {position.size} positions", key="target")
+        raise InputError(f"target must be a single position, but contains {position.size} positions", key="target")
     if position is None or not np.isfinite([position.spherical.lon.deg, position.spherical.lat.deg]).all():
         raise InputError.of("target", target, names.EXPECTED_POSITION)
     return position
@@ -173,12 +174,9 @@ def zodiacal_table() -> Float:
 
     Rows are longitudes from 0 to 180 deg, columns are latitudes from 0 to 90 deg.
     """
-    from astropy.table import Table
-
-    path = resources.files(__package__).joinpath("zodiacal.ecsv")
-    table = Table.read(path.read_text(encoding="utf-8"), format="ascii.ecsv")
-    names = [name for name in table.colnames if name.startswith("latitude_")]
-    return np.stack([np.ma.filled(np.ma.asarray(table[name], np.float64), np.nan) for name in names], axis=1)
+    text = resources.files(__package__).joinpath("zodiacal.ecsv").read_text(encoding="utf-8")
+    table = parse_numbers(text, "the embedded table of the zodiacal light")
+    return np.stack([table[name] for name in table.columns if name.startswith("latitude_")], axis=1)
 
 
 def zodiacal_brightness(
@@ -193,9 +191,9 @@ def zodiacal_brightness(
     row, column = longitude_deg / STEP_DEG, latitude_deg / STEP_DEG
     nearest = float(table[int(np.floor(row + 0.5)), int(np.floor(column + 0.5))])
     if np.isnan(nearest):
-        place = f"helio-ecliptic longitude {longitude_deg:.1f} deg, latitude {latitude_deg:.1f} deg"
+        position = f"helio-ecliptic longitude {longitude_deg:.1f} deg, latitude {latitude_deg:.1f} deg"
         needed = "which must be outside the zone of solar avoidance, some 50 deg"
-        raise InputError(f"the Sun is {separation_deg:.1f} deg from the target ({place}), {needed}", key="target")
+        raise InputError(f"the Sun is {separation_deg:.1f} deg from the target ({position}), {needed}", key="target")
     if lookup == "nearest":
         return nearest
     i, j = (min(int(at), size - 2) for at, size in zip((row, column), table.shape, strict=True))
@@ -206,7 +204,7 @@ def zodiacal_brightness(
     return float(np.sum(weights * np.nan_to_num(corners)) / weights.sum())
 
 
-#: Distance up to which a row of a table may be the target itself, which a message then says, arcsec.
+#: Distance up to which a message warns that a row of a table may be the target itself, arcsec.
 SAME_STAR_ARCSEC = 2.0
 #: Largest number of neighbours that a message names.
 MOST_NAMED = 4
@@ -237,13 +235,13 @@ class Neighbour:
             nearest = library.nearest_spectrum(self.spectral_type)
             return nearest, f"of type {self.spectral_type}: {nearest}, the nearest type of the library"
         if self.temperature_k is not None:
-            wanted = self.temperature_k
-            nearest, (kelvin, _) = min(_typical().items(), key=lambda item: abs(np.log(item[1][0] / wanted)))
-            return nearest, f"of {wanted:.0f} K: {nearest} ({kelvin:.0f} K), the nearest of the library"
+            star_k = self.temperature_k
+            nearest, (kelvin, _) = min(_typical().items(), key=lambda item: abs(np.log(item[1][0] / star_k)))
+            return nearest, f"of {star_k:.0f} K: {nearest} ({kelvin:.0f} K), the nearest of the library"
         if self.bp_rp is not None:
-            wanted = self.bp_rp
-            nearest, (_, colour) = min(_typical().items(), key=lambda item: abs(item[1][1] - wanted))
-            return nearest, f"of BP - RP = {wanted:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
+            bp_rp = self.bp_rp
+            nearest, (_, colour) = min(_typical().items(), key=lambda item: abs(item[1][1] - bp_rp))
+            return nearest, f"of BP - RP = {bp_rp:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
         needed = "needs a spectral type, spectrum file, temperature or colour, since its light enters the fibre"
         raise InputError(f"{self._place}, {needed}", key="neighbours")
 
@@ -382,11 +380,11 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     named = f"table of neighbours {shortened(path.name)}"
     table = Rows(read_table(path, "table of neighbours"), named, "neighbours")
     if not 1 <= table.n <= MOST_ROWS:
-        raise InputError(f"{named} must hold 1 to {MOST_ROWS} stars, not {table.n}", key="neighbours")
+        raise InputError(f"{named} must contain 1 to {MOST_ROWS} stars, not {table.n}", key="neighbours")
     name = table.first(names.STARS)
     titles = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
-    own = None if target is None else next((k for k, title in enumerate(titles) if title == target.strip()), None)
-    separations, notes = _separations(table, own, target)
+    target_row = None if target is None or target.strip() not in titles else titles.index(target.strip())
+    separations, notes = _separations(table, target_row, target)
     bands, kind, file, temperature, colour = map(
         table.first, (names.BANDS, TYPES, SPECTRUM_FILES, TEMPERATURES, COLOURS)
     )
@@ -398,7 +396,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     }
     stars = []
     for k, title in enumerate(titles):
-        if k != own:
+        if k != target_row:
             spectrum = table.text(file, k)
             stars.append(Neighbour(
                 title, float(separations[k]), *_magnitude(table, k, magnitudes, bands), table.text(kind, k),
@@ -415,19 +413,19 @@ def _magnitude(table: Rows, row: int, columns: dict[str, str], bands: str | None
     for name, band in columns.items():
         value = table.number(name, row, "mag")
         if value is not None:
-            stated = band or names.band_in_name(name) or table.text(bands, row) or "V"
+            band = band or names.band_in_name(name) or table.text(bands, row) or "V"
             # Only stars within the fibre need a band with a passband.
             with contextlib.suppress(InputError):
-                return value, library.known_band(stated)
-            return value, stated
+                band = library.known_band(band)
+            return value, band
     return None, "V"
 
 
-def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:
+def _separations(table: Rows, target_row: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:
     """Return the separations from the target, arcsec, shape (n_row,), and statements on how they were found."""
     ra, dec = table.first(names.RIGHT_ASCENSIONS), table.first(names.DECLINATIONS)
     if ra is not None and dec is not None and target is not None:
-        return _from_positions(table, ra, dec, own, target), ()
+        return _from_positions(table, ra, dec, target_row, target), ()
     name = table.first(SEPARATIONS)
     if name is None:
         fault, key = f"{table.named} has the columns {shown(', '.join(table.names), 300)}", "neighbours"
@@ -436,18 +434,18 @@ def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Floa
             fault, key = f"{fault} and no position of the star itself", "neighbours_of"
             needed = "star.neighbours_of: the star's own row by name, or its coordinates"
         raise InputError(f"{fault}, but needs separation (arcsec), or {needed}", key=key)
-    if target is not None and own is None:
+    if target is not None and target_row is None:
         fault = f"{table.named} has no row named {shortened(target)}, and no positions"
         raise InputError(f"{fault}; give the name of a row, which is then left out", key="neighbours_of")
-    stated, key = getattr(table.table[name], "unit", None) is not None, names.key_of(name)
-    if not stated and key == "_r":
+    has_unit, key = getattr(table.table[name], "unit", None) is not None, names.key_of(name)
+    if not has_unit and key == "_r":
         remedy = "use a table with units (ECSV, FITS, VOTable), or the column separation, arcsec"
         raise table.error(f"the column {name} states no unit; {remedy}", name)
     values = _column(table, name, lambda row: table.number(name, row, "arcsec"))
     if (negative := ~(values >= 0)).any():
         row = int(np.argmax(negative))
         raise table.error(f"{name} in row {row + 1} must be 0 or above, not {table.text(name, row)}", name)
-    if stated or key != "dist":
+    if has_unit or key != "dist":
         return values, ()
     # ADQL's DISTANCE is in degrees.
     return values * 3600.0, (
@@ -455,14 +453,14 @@ def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Floa
     )
 
 
-def _from_positions(table: Rows, ra: str, dec: str, own: int | None, target: str) -> Float:
+def _from_positions(table: Rows, ra: str, dec: str, target_row: int | None, target: str) -> Float:
     """Return the separations of the rows' positions from the target's row or coordinates, arcsec, shape (n_row,)."""
     from astropy.coordinates import angular_separation
 
     east = np.radians(_column(table, ra, lambda row: table.degrees(ra, row, right_ascension=True)))
     north = np.radians(_column(table, dec, lambda row: table.degrees(dec, row, right_ascension=False)))
-    if own is not None:
-        place = float(east[own]), float(north[own])
+    if target_row is not None:
+        place = float(east[target_row]), float(north[target_row])
     else:
         try:
             position = parse_position(target)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.arrays import Bool, ContentEquality, Float, true_runs
+from mauvecl.host.arrays import Bool, ContentEquality, Float, set_read_only, true_runs
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.exposure.background import Neighbours, Sky, check_level
 from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
@@ -126,12 +126,11 @@ class Expectation(Drawable, ContentEquality):
     def __post_init__(self) -> None:
         if not self.neighbour_electrons.size:
             object.__setattr__(self, "neighbour_electrons", np.zeros(self.wavelength_nm.shape))
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, np.ndarray):
-                kept = np.array(value, np.int32 if each.name == "element" else np.float64)
-                kept.setflags(write=False)
-                object.__setattr__(self, each.name, kept)
+        arrays = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        element = arrays.pop("element").astype(np.int32)
+        element.setflags(write=False)
+        object.__setattr__(self, "element", element)
+        set_read_only(self, **arrays)
         n_pixel = self.wavelength_nm.shape
         for name in PER_PIXEL:
             values = getattr(self, name)
@@ -418,16 +417,16 @@ def expect(
     electrons = _electrons_per_frame(source, instrument, order)
     nothing = np.zeros(electrons.shape)
     near = nothing if neighbours is None else instrument.frame_s * neighbours.electrons_per_second(instrument, order)
-    asked: dict[str, str] = {"order": order, "signal": signal, "requested exposure": f"{exposure:g} s",
-                             "exposure": f"{n_frames} x {instrument.frame_s:g} s"}  # fmt: skip
-    asked |= {} if neighbours is None else neighbours.provenance(instrument)
+    provenance = _provenance(source, instrument, sky, zodiacal)
+    provenance |= {"order": order, "signal": signal, "requested exposure": f"{exposure:g} s",
+                   "exposure": f"{n_frames} x {instrument.frame_s:g} s"}  # fmt: skip
+    provenance |= {} if neighbours is None else neighbours.provenance(instrument)
     x = Expectation(
         **_detector(instrument),
         source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
         sky_electrons=nothing if zodiacal is None else _electrons_per_frame(zodiacal, instrument, order).clip(0.0),
         neighbour_electrons=_faint_enough(near, "a neighbour"),
-        n_frames=n_frames, signal=signal, name=source.name,
-        provenance=_provenance(source, instrument, sky, zodiacal) | asked,
+        n_frames=n_frames, signal=signal, name=source.name, provenance=provenance,
     )  # fmt: skip
     drawn = np.sqrt(x.variance_dn2) / (n_frames * x.gain_dn_per_electron)
     messages = [*_saturation(x), *(f"{source.name}: {text}." for text in source.messages)]
@@ -449,14 +448,14 @@ def _detector(instrument: Instrument) -> dict[str, Any]:
     width = instrument.resolution_element_nm
     bins = np.floor((instrument.wavelength_nm - instrument.output_min_nm) / width)
     # An array that starts above the output range leaves the first bins empty.
-    held, element = np.unique(bins, return_inverse=True)
+    filled, element = np.unique(bins, return_inverse=True)
     return {name: getattr(instrument, name) for name in same} | {
         "dark_dn": instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
         "bias_dn": instrument.per_pixel("bias_dn", instrument.bias_dn),
         "read_noise_dn": instrument.per_pixel("read_noise_dn", instrument.read_noise_dn),
         "gain_dn_per_electron": instrument.per_pixel("gain", instrument.gain_dn_per_electron),
         "element": element.astype(np.int32),
-        "element_wavelength_nm": instrument.output_min_nm + (held + 0.5) * width,
+        "element_wavelength_nm": instrument.output_min_nm + (filled + 0.5) * width,
         "conditions": {name: getattr(instrument, name) for name in conditions},
         "instrument": instrument.name,
     }
@@ -552,10 +551,10 @@ def _saturation(x: Expectation) -> list[str]:
 def _faint_enough(electrons: Float, name: str) -> Float:
     """Return the mean electrons of a frame; raise InputError if a star is too bright for any pixel."""
     if (electrons > MAX_PER_FRAME).any():
-        why = " (at 1 au it has V = -26.76, Willmer 2018)" if name == "Sun" else ""
+        remark = " (at 1 au it has V = -26.76, Willmer 2018)" if name == "Sun" else ""
         raise InputError(
             f"{name} is too bright: a pixel may have at most {MAX_PER_FRAME:g} electrons in a frame, not "
-            f"{float(electrons.max()):.3g}{why}; `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
+            f"{float(electrons.max()):.3g}{remark}; `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
             key="magnitude",
         )
     return electrons

@@ -87,7 +87,7 @@ def electrons_per_second(
     # Efficiencies act at the wavelength of the light, or else at that of the pixel.
     by_light = instrument if order == "physical" else None
     line = LineSpread.of(instrument)
-    gathered = np.sum([part @ flux for part in _gathering(line, nodes, by_light)], axis=0)
+    gathered = np.sum([term @ flux for term in _gathering(line, nodes, by_light)], axis=0)
     rate = _line_landing(line, _knots(by_light)) @ gathered
     return np.asarray(rate if by_light else rate * _efficiencies(instrument))
 
@@ -108,9 +108,8 @@ def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
 @lru_cache(maxsize=8)
 def _product(line: LineSpread, nodes: bytes, by_light: Instrument | None) -> csr_array:
     """Return the product of both factors; in the paper's order, without the efficiencies."""
-    gathering, *more = _gathering(line, np.frombuffer(nodes, np.float64), by_light)
-    for part in more:
-        gathering = gathering + part
+    first, *terms = _gathering(line, np.frombuffer(nodes, np.float64), by_light)
+    gathering = sum(terms, first)
     return _read_only(csr_array(_line_landing(line, _knots(by_light)) @ gathering))
 
 
@@ -132,8 +131,8 @@ def _line_landing(line: LineSpread, knots: tuple[float, ...]) -> csr_array:
     rows = np.repeat(np.arange(centres.size), count)
     columns = np.arange(indptr[-1]) - np.repeat(indptr[:-1] - first, count)
     values = np.empty(columns.size)
-    for part in (slice(start, start + BLOCK) for start in range(0, columns.size, BLOCK)):
-        values[part] = line.landing(nodes[columns[part]] - centres[rows[part]])
+    for block in (slice(start, start + BLOCK) for start in range(0, columns.size, BLOCK)):
+        values[block] = line.landing(nodes[columns[block]] - centres[rows[block]])
     return _read_only(csr_array((values, columns, indptr), shape=(centres.size, nodes.size)))
 
 

@@ -22,17 +22,17 @@ from mauvecl.schema.fields import Range, Unit
 
 
 @contextmanager
-def _opened(path: str | Path, what: str) -> Iterator[tuple[Numbers, str]]:
+def _opened(path: str | Path, title: str) -> Iterator[tuple[Numbers, str]]:
     """Read an ECSV table of numbers, and the origin of its values, "tag: source", from its metadata.
 
     Errors that are raised in the block begin with the name of the file.
     """
-    table = parse_numbers(*text_and_name(path, what))
+    table = parse_numbers(*text_and_name(path, title))
     source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
     try:
         yield table, f"{table.meta.get('tag', 'A')}: {source}"
     except InputError as error:
-        raise error.within(f"{what} {path}") from None
+        raise error.within(f"{title} {path}") from None
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,11 @@ def _converted(table: Numbers, name: str, *units: u.UnitBase) -> Float:
     text = table.units[name]
     # A is ampere, except in a length.
     unit = unit_of(text) if text and units == (u.nm,) else u.Unit(text.replace("percent", "%"), parse_strict="silent")
-    for wanted in units:
-        if unit.is_equivalent(wanted):
-            return np.asarray((table[name] * unit).to_value(wanted))
-    expected, given = (str(one) or "none" for one in (units[0], unit))
-    raise InputError(f"the unit of column {name!r} must be {expected}, not {given!r}", key=name)
+    for target in units:
+        if unit.is_equivalent(target):
+            return np.asarray((table[name] * unit).to_value(target))
+    expected = str(units[0]) or "none"
+    raise InputError(f"the unit of column {name!r} must be {expected}, not {str(unit) or 'none'!r}", key=name)
 
 
 #: Largest number of pixels of an array.
@@ -120,9 +120,9 @@ class PixelMap(ContentEquality):
     def __post_init__(self) -> None:
         sizes = set()
         for name in COLUMNS:
-            if (given := getattr(self, name)) is None:
+            if getattr(self, name) is None:
                 continue
-            values = np.asarray(given, np.float64)
+            values = np.asarray(getattr(self, name), np.float64)
             if values.ndim != 1:
                 fault = f"{name} of the pixel map must have one value per pixel, not the shape {values.shape}"
                 raise InputError(fault, key=name)
@@ -144,9 +144,11 @@ class PixelMap(ContentEquality):
     @property
     def digest(self) -> str:
         """SHA-256 of the values."""
-        held = ((name, getattr(self, name)) for name in COLUMNS)
-        parts = (name.encode() + values.tobytes() for name, values in held if values is not None)
-        return hashlib.sha256(b"".join(parts)).hexdigest()
+        hashed = hashlib.sha256()
+        for name in COLUMNS:
+            if (values := getattr(self, name)) is not None:
+                hashed.update(name.encode() + values.tobytes())
+        return hashed.hexdigest()
 
     def __repr__(self) -> str:
         # The instrument's digest is computed from representations.
@@ -159,8 +161,8 @@ class PixelMap(ContentEquality):
             names = [name for name in table.columns if name != "pixel"]
             unknown = [name for name in names if name not in COLUMNS]
             if unknown or not names:
-                what = f"the column {unknown[0]!r}" if unknown else "no column of values"
-                raise InputError(f"the table has {what}; use some of {', '.join(COLUMNS)}", key="pixel_map")
+                fault = f"the column {unknown[0]!r}" if unknown else "no column of values"
+                raise InputError(f"the table has {fault}; use some of {', '.join(COLUMNS)}", key="pixel_map")
             if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
                 raise InputError("the column 'pixel' must be 0, 1, 2, ..., every pixel in order", key="pixel")
             return cls(**{name: _converted(table, name, COLUMNS[name]) for name in names}, source=source)
@@ -258,20 +260,21 @@ class ThroughputErrors(ContentEquality):
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
         The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. The
-        first modes hold all errors of weighted sums of the curve, (n_sum, n), such as the light in bands, and of these.
+        first modes contain all errors of weighted sums of the curve, (n_sum, n), such as the light in bands, and of
+        these values.
         """
         n, sd = wavelength_nm.size, np.sqrt(np.diag(covariance))
         scale = np.where(sd > 0, sd, 1.0)
         variances, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
         variances, vectors = np.maximum(variances[::-1], 0.0), vectors[:, ::-1]
-        left = 1.0 - np.cumsum(variances) / max(variances.sum(), np.finfo(float).tiny)
-        n_modes = int((left > LOST_VARIANCE).sum()) + 1
+        lost = 1.0 - np.cumsum(variances) / max(variances.sum(), np.finfo(float).tiny)
+        n_modes = int((lost > LOST_VARIANCE).sum()) + 1
         modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :n_modes]
         first = np.vstack([sums @ modes[:n], modes[n:] / scale[n:, None]])
         # Any rotation of the modes has the same covariance.
         modes = modes @ np.linalg.svd(first)[2].T
-        others = {name: tuple(row[: len(first)]) for name, row in zip(names, modes[n:], strict=True) if row.any()}
-        return cls(wavelength_nm, modes[:n].T, source, others)
+        values = {name: tuple(row[: len(first)]) for name, row in zip(names, modes[n:], strict=True) if row.any()}
+        return cls(wavelength_nm, modes[:n].T, source, values)
 
     @classmethod
     def read(cls, path: str | Path) -> ThroughputErrors:
@@ -289,8 +292,8 @@ class ThroughputErrors(ContentEquality):
     @property
     def digest(self) -> str:
         """SHA-256 of the values."""
-        others = repr(sorted(self.values.items())).encode() if self.values else b""
-        return hashlib.sha256(self.wavelength_nm.tobytes() + self.modes.tobytes() + others).hexdigest()
+        values = repr(sorted(self.values.items())).encode() if self.values else b""
+        return hashlib.sha256(self.wavelength_nm.tobytes() + self.modes.tobytes() + values).hexdigest()
 
     def __repr__(self) -> str:
         # The instrument's digest is computed from representations.

@@ -44,8 +44,8 @@ def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
         if unknown or "value" not in entry:
-            what = f"the unknown key {unknown[0]!r}" if unknown else "no 'value'"
-            raise InputError(f"{path.name}: the table {name} has {what}; use value, tag and source", key=name)
+            fault = f"the unknown key {unknown[0]!r}" if unknown else "no 'value'"
+            raise InputError(f"{path.name}: the table {name} has {fault}; use value, tag and source", key=name)
         tag = entry.get("tag", "A")
         if tag not in TAGS:
             raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
@@ -200,8 +200,8 @@ class Instrument(Section):
         """
         changed = Instrument.build({**self._values(), **changes}, self.name)
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
-        for name, given in changes.items():
-            if isinstance(given, str | Path) and isinstance(curve := getattr(changed, name), SpectralCurve):
+        for name, value in changes.items():
+            if isinstance(value, str | Path) and isinstance(curve := getattr(changed, name), SpectralCurve):
                 marks[name] = curve.source
         sources = {**self.sources, **changes.get("sources", {}), **marks}
         return changed.model_copy(update={"sources": sources})
@@ -215,7 +215,7 @@ class Instrument(Section):
         if not high > low:
             raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
         if self.wavelength_nm.size == 0:
-            fault = f"the output range {low:g}-{high:g} nm needs at least one pixel, but holds none"
+            fault = f"the output range {low:g}-{high:g} nm needs at least one pixel, but contains none"
             raise InputError(fault, key="output_min_nm")
         self._check_curves(low, high)
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
@@ -234,12 +234,12 @@ class Instrument(Section):
             fault = f"pixel_map must have the array's {self.pixels} pixels, not {self.pixel_map.size}"
             raise InputError(fault, key="pixel_map")
         modes = 0 if self.throughput_errors is None else len(self.throughput_errors.modes)
-        if (given := len(self.throughput_amplitudes)) > modes:
-            raise InputError.of("throughput_amplitudes", given, f"at most {modes}, one for each mode")
+        if (amplitudes := len(self.throughput_amplitudes)) > modes:
+            raise InputError.of("throughput_amplitudes", amplitudes, f"at most {modes}, one for each mode")
         if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
-            what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm, and all S/N are 0"
-            raise InputError(f"some pixel must have a throughput above 0, but {what}", key="throughput")
+            fault = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm, and all S/N are 0"
+            raise InputError(f"some pixel must have a throughput above 0, but {fault}", key="throughput")
 
     def _check_curves(self, low: float, high: float) -> None:
         """Raise InputError unless all curves cover the output range with possible values."""
@@ -415,7 +415,7 @@ class Instrument(Section):
         values = {
             name: (value.wavelength_nm, value.value) if isinstance(value, SpectralCurve) else value
             for name, value in self._values().items()
-            # Files without a calibration keep the digest that they had before there was one.
+            # Files without a calibration keep the digest that they had before calibrations were added.
             if name not in LABELS and not (name.startswith("throughput_") and not value)
         }
         return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()
@@ -434,8 +434,8 @@ class Instrument(Section):
 
 
 def _from_file(name: str | Path) -> Instrument:
-    """Read a file, whose values and sources go before those of the file that it extends."""
-    path = given = instrument_path(name, Path())
+    """Read a file, whose values and sources have precedence over those of the file that it extends."""
+    path = file = instrument_path(name, Path())
     entries: dict[str, tuple[Any, str]] = {}
     for _ in range(MAX_EXTENDED):
         content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
@@ -459,7 +459,7 @@ def _from_file(name: str | Path) -> Instrument:
     else:
         fault = f"{path.name} is extended by {MAX_EXTENDED} files one after another, or by itself; the chain must end"
         raise InputError(fault, key="extends")
-    read = Instrument.build({name: value for name, (value, _) in entries.items()}, given.name)
+    read = Instrument.build({name: value for name, (value, _) in entries.items()}, file.name)
     sources = {name: text or getattr(read, name).source for name, (_, text) in entries.items() if name not in LABELS}
     return read.model_copy(update={"sources": sources})
 
@@ -529,14 +529,14 @@ class LineSpread:
     def panel_edges(self, knots: Float) -> Float:
         """Return the edges of panels, also at `knots`, in which each pixel's `landing` is smooth, (n_panel + 1,)."""
         low, high = self.centres[0] - self.reach, self.centres[-1] + self.reach
-        parts = [np.array([low, high]), knots[(knots > low) & (knots < high)]]
+        corners = [np.array([low, high]), knots[(knots > low) & (knots < high)]]
         if self.sigma > 0:
-            parts.append(np.linspace(low, high, int(np.ceil((high - low) / (PANEL_SIGMA * self.sigma))) + 1))
+            corners.append(np.linspace(low, high, int(np.ceil((high - low) / (PANEL_SIGMA * self.sigma))) + 1))
         else:
             # Without a Gaussian `landing` is a trapezoid, linear between these corners.
             ends = np.append(np.asarray(self.centres) - self.pixel / 2, self.centres[-1] + self.pixel / 2)
-            parts += [ends - self.top_hat / 2, ends + self.top_hat / 2]
-        edges = np.unique(np.concatenate(parts))
+            corners += [ends - self.top_hat / 2, ends + self.top_hat / 2]
+        edges = np.unique(np.concatenate(corners))
         # Knots that differ only by rounding would make empty panels.
         distinct: Float = edges[np.append(True, np.diff(edges) > 1e-9)]
         return distinct

@@ -81,13 +81,9 @@ class TimeGrid:
     def first(self) -> tuple[float, float]:
         """Julian date of the start, UTC: the preceding midnight and the fraction of the day."""
         with offline():
-            time = parse_time(self.start, "start")
-            day, rest = float(time.utc.jd1), float(time.utc.jd2)
-        midnight = np.floor(day - 0.5) + 0.5
-        fraction = (day - midnight) + rest
-        # Astropy's second part lies within half a day on either side.
-        midnight += np.floor(fraction)
-        return float(midnight), float(fraction - np.floor(fraction))
+            time = parse_time(self.start, "start").utc
+        midnight = float(np.floor(time.jd - 0.5)) + 0.5
+        return midnight, float((time.jd1 - midnight) + time.jd2)
 
     @cached_property
     def seconds(self) -> Float:
@@ -181,8 +177,8 @@ class Elements:
                 fault = f"orbital elements {shortened(line)} must end in the checksum {checksum}, not {line[68]!r}"
                 raise InputError(f"{fault}; one is wrong", key="elements")
         if self.first[2:7] != self.second[2:7]:
-            both = f"{self.first[2:7]!r} and {self.second[2:7]!r}"
-            fault = f"both lines of the orbital elements must be of one satellite, but are of {both}"
+            numbers = f"{self.first[2:7]!r} and {self.second[2:7]!r}"
+            fault = f"both lines of the orbital elements must be of one satellite, but are of {numbers}"
             raise InputError(fault, key="elements")
         if self.satellite.error:
             fault = f"orbital elements {shortened(self.second)} must be those of an orbit around the Earth"
@@ -192,7 +188,7 @@ class Elements:
     def read(cls, path: str | Path | None = None) -> Elements:
         """Read the newest set of Mauve in a file, or of its only satellite; titles and comments are ignored.
 
-        Without a path it is the public set that the package contains. Raises InputError if the file holds no set or
+        Without a path it is the public set that the package contains. Raises InputError if the file has no set or
         those of several other satellites, or a line's checksum is wrong.
         """
         if path is None:
@@ -206,11 +202,11 @@ class Elements:
             (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
         ]
         if not sets:
-            raise InputError(f"orbit file {named} must hold a line '1 ...' before a line '2 ...'", key="elements")
+            raise InputError(f"orbit file {named} must contain a line '1 ...' before a line '2 ...'", key="elements")
         sets = [(first, second) for first, second in sets if first[2:7] == MAUVE] or sets
         if len(numbers := sorted({first[2:7] for first, _ in sets})) > 1:
-            held = f"{len(numbers)} satellites ({printable(', '.join(numbers), 80)})"
-            fault = f"orbit file {named} must hold elements of Mauve, {MAUVE}, or of one satellite, not of {held}"
+            satellites = f"{len(numbers)} satellites ({printable(', '.join(numbers), 80)})"
+            fault = f"orbit file {named} must have elements of Mauve, {MAUVE}, or of one satellite, not of {satellites}"
             raise InputError(fault, key="elements")
         return max((cls(first, second, source) for first, second in sets), key=lambda elements: elements.epoch_jd)
 
@@ -314,8 +310,8 @@ class Orbit:
         if self.resolved(times) == "mean":
             return [
                 f"The orbit is a mean Sun-synchronous one through the elements ({source}): shares of time and seasons "
-                f"hold, but where the satellite stands in its orbit {days:.0f} days from the epoch is not known: times "
-                "of single windows may be off by an orbit."
+                f"are valid, but the satellite's place in its orbit {days:.0f} days from the epoch is unknown, so that "
+                "times of single windows may be off by an orbit."
             ]
         if days > TRUSTED_D:
             off = self.along_track_km(days)
@@ -381,8 +377,8 @@ class Track:
     velocity_km_s: Float
 
     @cached_property
-    def _to_j2000(self) -> Float:
-        """Matrices from SGP4's frame (true equator, mean equinox of date) to J2000, shape (n, 3, 3).
+    def _from_j2000(self) -> Float:
+        """Matrices from J2000 to SGP4's frame (true equator, mean equinox of date), shape (n, 3, 3).
 
         Precession and nutation of 1976 and 1980 (Vallado et al. 2006, AIAA 2006-6753) are computed once a day and
         interpolated linearly.
@@ -391,25 +387,21 @@ class Track:
         low = np.floor(days.min())
         nodes = np.arange(low, np.ceil(days.max()) + 2)
         terrestrial = nodes + 69.2 / DAY_S
-        of_date = erfa.pnm80(midnight, terrestrial)
-        # Equation of the equinoxes: from the mean to the true equinox of date.
-        turn = -np.asarray(erfa.eqeq94(midnight, terrestrial))
-        zero, one = np.zeros_like(turn), np.ones_like(turn)
-        spin = np.array([[np.cos(turn), np.sin(turn), zero], [-np.sin(turn), np.cos(turn), zero], [zero, zero, one]])
-        at_nodes = np.einsum("nji,jkn->nik", of_date, spin)
-        place = np.clip((days - low).astype(int), 0, nodes.size - 2)
-        part = (days - low - place)[:, None, None]
-        return np.asarray((1 - part) * at_nodes[place] + part * at_nodes[place + 1])
+        # The equation of the equinoxes turns from the true to the mean equinox of date.
+        at_nodes = erfa.rz(erfa.eqeq94(midnight, terrestrial), erfa.pnm80(midnight, terrestrial))
+        day = np.clip((days - low).astype(int), 0, nodes.size - 2)
+        fraction = (days - low - day)[:, None, None]
+        return np.asarray((1 - fraction) * at_nodes[day] + fraction * at_nodes[day + 1])
 
     @cached_property
     def position_km(self) -> Vectors:
         """Position in the frame of star catalogues (J2000), shape (n, 3)."""
-        return np.asarray(np.einsum("nij,nj->ni", self._to_j2000, self.of_date_km))
+        return np.asarray(np.einsum("nji,nj->ni", self._from_j2000, self.of_date_km))
 
     @cached_property
     def normal(self) -> Vectors:
         """Unit vectors along the orbit's angular momentum in the frame of star catalogues, shape (n, 3)."""
-        return unit(np.einsum("nij,nj->ni", self._to_j2000, np.cross(self.of_date_km, self.velocity_km_s)))
+        return unit(np.einsum("nji,nj->ni", self._from_j2000, np.cross(self.of_date_km, self.velocity_km_s)))
 
     @cached_property
     def subsatellite_deg(self) -> tuple[Float, Float]:
@@ -440,8 +432,8 @@ class Track:
         distance = np.linalg.norm(self.position_km, axis=1)
         cosine = -np.einsum("ni,ni->n", self.position_km, self.bodies.sun) / distance
         disk = np.arcsin(SUN_KM / self.bodies.sun_km)
-        seen = np.arccos(np.clip(cosine, -1, 1)) - self.limb_angle_rad + disk
-        return np.asarray(np.clip(seen / (2 * disk), 0, 1))
+        visible = np.arccos(np.clip(cosine, -1, 1)) - self.limb_angle_rad + disk
+        return np.asarray(np.clip(visible / (2 * disk), 0, 1))
 
     @property
     def beta_deg(self) -> Float:
@@ -495,8 +487,8 @@ class Target:
             remedy = f"give a name such as {like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD"
             raise InputError(f"target {shortened(text)} is not in the embedded list; {remedy}", key="target")
         with offline():
-            place = parse_position(text).icrs
-        return cls(name or text.strip(), float(place.ra.deg), float(place.dec.deg), "given")
+            position = parse_position(text).icrs
+        return cls(name or text.strip(), float(position.ra.deg), float(position.dec.deg), "given")
 
     @property
     def direction(self) -> Float:

@@ -10,6 +10,7 @@ from importlib import resources
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.host.arrays import Bool, Float, true_runs
 from mauvecl.host.exposure.background import zodiacal_brightness
@@ -105,24 +106,19 @@ def zodiacal_light(bodies: Bodies, target: Float) -> Float:
 
     The value is NaN near the Sun, where the table has none. One time per day samples a year well enough.
     """
-    pole = bodies.ecliptic_pole
-    latitude = float(np.degrees(np.arcsin(np.clip(target @ pole, -1, 1))))
-    flat = unit(bodies.sun - (bodies.sun @ pole)[:, None] * pole)
-    along = target - (target @ pole) * pole
-    size = float(np.linalg.norm(along))
-    # At the pole the longitude is arbitrary.
-    difference = np.degrees(np.arccos(np.clip(flat @ along / size, -1, 1))) if size > 1e-9 else np.zeros(len(flat))
-    light = np.full(len(flat), np.nan)
-    for k, away in enumerate(elongation_deg(bodies.sun, target)):
+    # Sines of the ecliptic latitudes; the longitude follows from the spherical law of cosines, arbitrary at the pole.
+    sun, star = bodies.sun @ bodies.ecliptic_pole, float(np.clip(target @ bodies.ecliptic_pole, -1, 1))
+    cosine = (bodies.sun @ target - sun * star) / np.sqrt(np.maximum((1 - sun**2) * (1 - star**2), 1e-18))
+    longitude, latitude = np.degrees(np.arccos(np.clip(cosine, -1, 1))), abs(float(np.degrees(np.arcsin(star))))
+    light = np.full(sun.size, np.nan)
+    for k, separation in enumerate(elongation_deg(bodies.sun, target)):
         with contextlib.suppress(InputError):
-            light[k] = zodiacal_brightness(float(difference[k]), abs(latitude), float(away))
+            light[k] = zodiacal_brightness(float(longitude[k]), latitude, float(separation))
     return light
 
 
-#: A limit as a function of a slice of steps that returns which targets are allowed, shape (steps or 1, k or 1).
-Rule = Callable[[slice], Bool]
-#: Steps evaluated at once, which keeps the arrays of a hundred targets within tens of MB.
-CHUNK = 1 << 16
+#: A limit as a function of a target's unit vector that returns the steps in which it allows the target, shape (n,).
+Rule = Callable[[Float], Bool]
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,23 +154,18 @@ class Visibility:
     def of(cls, track: Track, target: Vectors, limits: Limits | None = None) -> Visibility:
         """Compute the visibility of targets, unit vectors in the frame of star catalogues of shape (k, 3)."""
         limits = limits or Limits()
-        n, k = track.times.n, len(target)
-        seen, kept_by = np.ones((n, k), bool), {}
-        for name, rule in _rules(track, target, limits).items():
-            count = np.zeros(k)
-            for first in range(0, n, CHUNK):
-                part = slice(first, min(first + CHUNK, n))
-                flags = rule(part)
-                seen[part] &= flags
-                count += np.broadcast_to(flags, (part.stop - part.start, k)).sum(axis=0)
-            kept_by[name] = count / n
-        if limits.shortest_s > 0:
-            for column in seen.T:
-                for first, last in true_runs(column):
-                    if (last - first) * track.times.step_s < limits.shortest_s:
-                        column[first:last] = False
-        # The track's own grid holds its times as arrays.
-        return cls(track.orbit, replace(track.times), target, limits, seen, kept_by)
+        rules = _rules(track, limits)
+        seen, kept_by = np.ones((len(target), track.times.n), bool), {name: np.empty(len(target)) for name in rules}
+        for k, (star, steps) in enumerate(zip(target, seen, strict=True)):
+            for name, rule in rules.items():
+                allowed = rule(star)
+                steps &= allowed
+                kept_by[name][k] = np.count_nonzero(allowed) / allowed.size
+            runs = true_runs(steps)
+            for first, last in runs[np.diff(runs)[:, 0] * track.times.step_s < limits.shortest_s]:
+                steps[first:last] = False
+        # The grid of the track caches its times as arrays, which would be stored with answers.
+        return cls(track.orbit, replace(track.times), target, limits, seen.T, kept_by)
 
     @property
     def track(self) -> Track:
@@ -231,41 +222,41 @@ class Visibility:
         return self.track.times.step_s / 3600 * self.limits.duty_cycle
 
 
-def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
-    """Return the limits in force by name."""
-    at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
-    stars = target.T.astype(np.float32)
+def _by_axis(directions: Vectors) -> NDArray[np.float32]:
+    """Return unit vectors as an array of shape (3, n), whose products with a target are several times as fast."""
+    return np.ascontiguousarray(directions.T, np.float32)
 
-    def far_from(directions: Vectors, angle_rad: Float | float) -> Bool:
-        """Return whether targets are at least an angle from directions, unit vectors of shape (n, 3)."""
-        return np.asarray(directions.astype(np.float32) @ stars <= np.float32(np.cos(angle_rad)))
+
+def _rules(track: Track, limits: Limits) -> dict[str, Rule]:
+    """Return the limits in force by name."""
+    at, rules = track.position_km, dict[str, Rule]()
+
+    def far_from(directions: Vectors, angle_rad: Float | np.float64) -> Rule:
+        """Return the rule that a target is at least an angle from directions, unit vectors of shape (n, 3)."""
+        axes, cosine = _by_axis(directions), np.cos(angle_rad).astype(np.float32)
+        return lambda star: star.astype(np.float32) @ axes <= cosine
 
     if limits.earth_limb_deg is not None:
-        limb = track.limb_angle_rad[:, None] + np.radians(limits.earth_limb_deg)
-        rules["earth_limb"] = lambda part: far_from(-unit(at[part]), limb[part])
+        rules["earth_limb"] = far_from(-unit(at), track.limb_angle_rad + np.radians(limits.earth_limb_deg))
     if limits.sun_deg is not None:
-        sun = np.radians(limits.sun_deg)
-        rules["sun"] = lambda part: far_from(bodies.sun[part], sun)
+        rules["sun"] = far_from(track.bodies.sun, np.radians(limits.sun_deg))
     if limits.moon_deg is not None:
-        moon = np.radians(limits.moon_deg)
-        rules["moon"] = lambda part: far_from(unit(bodies.moon_km[part] - at[part]), moon)
+        rules["moon"] = far_from(unit(track.bodies.moon_km - at), np.radians(limits.moon_deg))
     if limits.declination_deg is not None:
-        low, high = limits.declination_deg
-        declination = np.degrees(np.arcsin(np.clip(target[:, 2], -1, 1)))
-        regarded = (declination >= low) & (declination <= high)
-        rules["declination"] = lambda part: regarded[None, :]
+        low, high = np.sin(np.radians(limits.declination_deg))
+        rules["declination"] = lambda star: np.array(low <= star[2] <= high)
     if limits.normal_cone_deg is not None:
-        cone = np.float32(np.cos(np.radians(limits.normal_cone_deg)))
-        rules["normal_cone"] = lambda part: np.abs(track.normal[part].astype(np.float32) @ stars) >= cone
+        normal, cone = _by_axis(track.normal), np.cos(np.radians(limits.normal_cone_deg))
+        rules["normal_cone"] = lambda star: np.abs(star.astype(np.float32) @ normal) >= cone
     if limits.eclipse != "any":
-        allowed = (track.sunlight < 0.5) == (limits.eclipse == "only")
-        rules["eclipse"] = lambda part: allowed[part, None]
+        in_light = (track.sunlight < 0.5) == (limits.eclipse == "only")
+        rules["eclipse"] = lambda star: in_light
     if limits.anomaly or limits.proton_flux is not None:
         if limits.anomaly:
             outside = ~_in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
         else:
             outside = proton_flux(track, above_mev=10) <= (limits.proton_flux or 0.0)
-        rules["anomaly"] = lambda part: outside[part, None]
+        rules["anomaly"] = lambda star: outside
     return rules
 
 

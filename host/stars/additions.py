@@ -17,7 +17,7 @@ from pathlib import Path
 from urllib.parse import urljoin, urlsplit
 
 from mauvecl.host import VERSION
-from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept
+from mauvecl.host.stars.library import OwnStar, embedded, find, folder, user_stars
 from mauvecl.host.stars.source import Source, check_covers
 from mauvecl.host.tables.files import limit_bytes, read_bytes, without_columns, write_whole
 from mauvecl.host.tables.names import key_of
@@ -37,7 +37,7 @@ def add(
     """Keep a spectrum from a file, as `Source.read` reads it, under a name: by default that in its header or its own.
 
     Reports state its `origin`, by default the file name. With `replace`, a kept star of the same name is replaced.
-    Raises InputError if the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be
+    Raises InputError if the file contains no usable spectrum, the name is taken or invalid, or the folder cannot be
     written.
     """
     from astropy.table import Table
@@ -47,7 +47,7 @@ def add(
     source = Source.read(path, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
     check_covers(source)
     name = (name or source.name).strip()
-    place = _place_of(name, replace=replace)
+    target = _path_of(name, replace=replace)
     table = Table(source.table)
     table.meta = {
         "name": name,
@@ -64,7 +64,7 @@ def add(
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
     try:
-        write_whole(place, text.getvalue().encode(), shared=True)
+        write_whole(target, text.getvalue().encode(), shared=True)
     except InputError as error:
         raise error.within("star folder (MAUVECL_DATA_DIR sets another)") from error
     star = find(name)
@@ -72,24 +72,23 @@ def add(
     return star
 
 
-def _place_of(name: str, *, replace: bool) -> Path:
+def _path_of(name: str, *, replace: bool) -> Path:
     """Return the file of a star to keep; raises InputError if the name is invalid or taken."""
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
         raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
     if embedded(name) is not None:
         raise InputError(f"star name {name!r} is one of the embedded library's: give another with `name`", key="name")
-    there = find(name)
-    if there is not None:
+    if (star := find(name)) is not None:
         if not replace:
             raise InputError(f"star {name!r} is kept already: give another name, or use `replace=True`", key="name")
-        return there.path
-    if any(key_of(star.name) == key_of(name) for star in kept()):
+        return star.path
+    if any(key_of(star.name) == key_of(name) for star in user_stars()):
         raise InputError(f"star name {name!r} is too much like another kept star's: give another", key="name")
-    place = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
-    if place.exists():
+    path = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
+    if path.exists():
         # Letters that file names cannot have, such as Greek ones, are equal in them: the digest of the name differs.
-        place = place.with_stem(f"{place.stem}-{hashlib.sha256(name.casefold().encode()).hexdigest()[:8]}")
-    return place
+        path = path.with_stem(f"{path.stem}-{hashlib.sha256(name.casefold().encode()).hexdigest()[:8]}")
+    return path
 
 
 #: Timeout of a connection, s.
@@ -165,9 +164,9 @@ def fetch(
 
     A name such as ``"HD 37202"`` is searched for in all collections, ``"ngsl:HD 37202"`` in one, of whose files `base`
     may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end. Raises
-    InputError if the network fails, the star is unknown, or its file holds no usable spectrum.
+    InputError if the network fails, the star is unknown, or its file contains no usable spectrum.
     """
-    word, colon, star = (part.strip() for part in name.partition(":"))
+    word, colon, star = map(str.strip, name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
     if not chosen:
         raise InputError.of("collection", word, f"one of {', '.join(c.name for c in COLLECTIONS)}")
@@ -184,18 +183,18 @@ def fetch(
             content = _download(url, limit_bytes("MAUVECL_LARGEST_FILE_MIB"), show_progress)
         except FileNotFoundError:
             continue
-        with tempfile.TemporaryDirectory(prefix="mauvecl-fetch-") as place:
+        with tempfile.TemporaryDirectory(prefix="mauvecl-fetch-") as directory:
             # Messages and notes use the archive's file name.
-            local = Path(place) / url.rsplit("/", 1)[1]
+            local = Path(directory) / url.rsplit("/", 1)[1]
             local.write_bytes(content)
             try:
                 title = f"{collection.title}; {collection.citation}; {url}"
                 return add(local, star, origin=title, replace=replace, extend=extend)
             except InputError as error:
-                fault = f"the file downloaded from {url} must be a whole, usable spectrum, but is not ({error})"
+                fault = f"the file downloaded from {url} must be a complete, usable spectrum, but is not ({error})"
                 raise InputError(fault, key="base") from error
     fault = f"no star {star!r} is in {' or '.join(collection.title for collection in chosen)}"
-    remedy = "give the name that it has there, such as HD 37202, or bring the file: mauvecl library add"
+    remedy = "give the collection's name of the star, such as HD 37202, or add a file: mauvecl library add"
     raise InputError(f"{fault}; {remedy}", key="name")
 
 
@@ -203,8 +202,8 @@ def _folder(address: str) -> str:
     """Return an address that ends in a slash; raises InputError unless it is a URL of a supported scheme."""
     is_address = False
     with contextlib.suppress(ValueError):
-        parts = urlsplit(address)
-        is_address = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
+        url = urlsplit(address)
+        is_address = url.scheme in SCHEMES and bool(url.hostname) and url.port != 0
     if not (is_address and address.isprintable() and " " not in address):
         raise InputError.of("base", address, "one such as https://host/folder/")
     return address if address.endswith("/") else address + "/"
@@ -224,12 +223,12 @@ def _download(url: str, max_bytes: int, show_progress: bool) -> bytes:
 
     latest, content = time.monotonic() + MAX_DOWNLOAD_S, bytearray()
     request = urllib.request.Request(url, headers={"User-Agent": f"mauvecl/{VERSION}"})
-    shown = sys.stderr if show_progress else io.StringIO()
+    terminal = sys.stderr if show_progress else io.StringIO()
     try:
         with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
             length = answer.headers.get("Content-Length", "")
             size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else 0
-            with ProgressBarOrSpinner(size or None, f"Fetching {url}", file=shown) as bar:
+            with ProgressBarOrSpinner(size or None, f"Fetching {url}", file=terminal) as bar:
                 while max(size, len(content)) <= max_bytes and (piece := answer.read1(1 << 16)):
                     content += piece
                     bar.update(len(content))

@@ -75,10 +75,10 @@ _PHRASES = tuple(
 _DECIDING: tuple[Kind, ...] = (
     "error", "quality", "continuum", "background", "counts", "throughput", "luminosity",
 )  # fmt: skip
-#: Words in the name of a flux that say that it is one per frequency.
+#: Words in the name of a flux density that state that it is per frequency.
 _PER_FREQUENCY = {"fnu", "fν", "photnu", "nu", "ν", "freq", "frequency", "hz", "hertz", "jy"}
 _BRACKETS = re.compile(r"[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]\s*$")
-#: Words in brackets for units that are no flux density, or not a single one.
+#: Words in brackets for units that are not a flux density, or not a single unit.
 _NO_DENSITY = re.compile(
     r"\b(?:cgs|SI|arb|arbitrary|relative|normali[sz]ed|counts?|adu|electrons?|a\.?u\.?)(?:\b|$)", re.IGNORECASE
 )
@@ -109,12 +109,11 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     words = words_of(base)
     kind, score = _kind_of(words)
     if kind == "magnitude" and (system := set(words) & {"ab", "abmag", "st", "stmag"}):
-        # AB and ST magnitudes have zero points that are fluxes; others have not.
+        # Only the zero points of AB and ST magnitudes are fluxes.
         kind, score, unit_in_name = "flux", 0, "ABmag" if system & {"ab", "abmag"} else "STmag"
-    stated = unit if is_stated(unit) else None
-    if stated is None or (unit_in_name is not None and re.search("mag", stated, re.IGNORECASE)):
-        stated = unit_in_name
-    is_known, spectral, flux = _kinds_of_unit(stated)
+    if not is_stated(unit) or (unit_in_name is not None and re.search("mag", str(unit), re.IGNORECASE)):
+        unit = unit_in_name
+    is_known, spectral, flux = _kinds_of_unit(unit)
     if kind == "magnitude" and flux == "density":
         kind = "flux"
     if kind == "unknown" and ucd:
@@ -122,10 +121,10 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     if kind == "unknown" and not words:
         # A name that is only a unit, as in a line "nm, flam".
         kind, score = ("wavelength", 3) if spectral else ("flux", 3) if flux != "other" else (kind, 0)
-    if kind == "unknown" and stated is not None and flux == "density":
+    if kind == "unknown" and flux == "density":
         kind, score = "flux", 1
     # A unit of another kind contradicts the name; an unknown unit raises InputError at conversion.
-    if kind in ("flux", "model") and (is_known or (stated is not None and NO_FLUX.search(stated))):
+    if kind in ("flux", "model") and (is_known or (unit is not None and NO_FLUX.search(unit))):
         score += 1 if flux in ("density", "total") else -6
     if is_known and kind == "wavelength":
         score += 1 if spectral else -6
@@ -134,9 +133,9 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
         score -= 1
     total = any(_WORDS.get(word) == "total" for word in words)
     per_frequency = kind in ("flux", "model") and not total and bool(_PER_FREQUENCY & set(words))
-    # VOTable says so by the second word of a UCD, as in phot.flux.density;em.freq.
+    # VOTable states it by the second word of a UCD, as in phot.flux.density;em.freq.
     per_frequency |= kind == "flux" and ucd.lower().startswith("phot.flux.density;em.freq")
-    return Role(name, kind, score, logarithm, total, per_frequency, stated)
+    return Role(name, kind, score, logarithm, total, per_frequency, unit)
 
 
 def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
@@ -158,17 +157,17 @@ def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
         return "counts", 0
     if "width" in has:
         return "width", 0
-    others = has - {"flux", "total", "wave", "other axis", "vacuum", "air", "neutral"}
+    qualifiers = has - {"flux", "total", "wave", "other axis", "vacuum", "air", "neutral"}
     if is_flux or ("weak flux" in has and not is_axis):
         # Limits of a flux are those of its confidence interval.
         if has & {"low", "high"}:
             return "error", 0
-        score = 3 if is_axis or others - {"weak flux"} else 5 if words in (("flux",), ("fluxes",)) else 4
+        score = 3 if is_axis or qualifiers - {"weak flux"} else 5 if words in (("flux",), ("fluxes",)) else 4
         return "flux", score if is_flux else score - 2
     if has & {"low", "high"} and (is_axis or "bin" in has):
         return ("lower edge" if "low" in has else "upper edge"), 1
     if is_axis:
-        score = (4 if "wave" in has else 2) - (2 if others else 0) - (1 if "air" in has else 0)
+        score = (4 if "wave" in has else 2) - (2 if qualifiers else 0) - (1 if "air" in has else 0)
         # A "w" may be a weight.
         return "wavelength", 0 if words == ("w",) else score
     if "magnitude" in has and words != ("st",):
@@ -206,7 +205,7 @@ def flux_kind(unit: Any) -> FluxKind:
 
     unit = linear(unit)
     per_area = (u.W / u.m**2, u.photon / (u.s * u.m**2))
-    densities = tuple(one / per for one in per_area for per in (u.m, u.Hz))
+    densities = tuple(flux / interval for flux in per_area for interval in (u.m, u.Hz))
     if unit.is_equivalent(densities):
         return "density"
     if unit.is_equivalent(per_area):
@@ -227,8 +226,8 @@ def divided(name: str) -> tuple[str, str | None]:
         inner = match[1].strip()
         if is_unit(inner) or re.search(r"\d|\^|/", inner) or _NO_DENSITY.search(inner):
             base, unit = name[: match.start()], inner
-    elif found := _after_underscore(name.split("_")):
-        base, unit = found
+    elif division := _after_underscore(name.split("_")):
+        base, unit = division
     elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and is_unit(match[1] or match[2]):
         base, unit = name[: match.start()], match[1] or match[2]
     elif (match := SCALE.search(name)) and match.start() > 0:
@@ -288,8 +287,8 @@ def _unglued(chunk: str) -> list[str] | None:
         return [chunk]
     for word in _GLUED:
         if chunk.startswith(word):
-            rest = chunk[len(word) :]
-            if (rest in _WORDS or len(rest) > 1) and (words := _unglued(rest)):
+            remainder = chunk[len(word) :]
+            if (remainder in _WORDS or len(remainder) > 1) and (words := _unglued(remainder)):
                 return [word, *words]
     # wmin, efluxes
     if chunk[:1] == "w" and _WORDS.get(chunk[1:]) in ("low", "high"):
@@ -345,22 +344,21 @@ _NO_FLUX = re.compile(
 def stated_units(header: str, *, wavelength: bool, flux: bool, is_named: bool) -> tuple[str | None, str | None]:
     """Return the requested units of wavelength and flux that a header states, as text.
 
-    Without names of columns (`is_named`), a header that mentions counts or magnitudes implies that there is no flux.
+    If the columns have no names (`is_named` is false), counts or magnitudes in a header mean that there is no flux.
     """
     text = header[:20_000]
-    found = [_spelt(match[0].strip()) for match in _FLUX.finditer(text)]
-    distinct = _distinct(found) if flux else []
+    distinct = _distinct([_spelt(match[0].strip()) for match in _FLUX.finditer(text)]) if flux else []
     next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
     if len(distinct) > 1 and next_to is not None:
         distinct = [_spelt(next_to[1].strip())]
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
-        fault = f"its header speaks of {match[1] or match[2]!r}, but must speak of a flux density"
+        fault = f"its header mentions {match[1] or match[2]!r}, but must state a flux density"
         raise InputError(f"{fault}: `flux_unit` names its unit", key="flux_unit")
     lengths = _lengths(_FLUX.sub(" FLUXUNIT ", text)) if wavelength else []
-    for what, several in (("flux", distinct), ("wavelength", lengths)):
-        if len(several) > 1:
-            fault = f"its header names several units of the {what}: {', '.join(several)}"
-            raise InputError(f"{fault}; use `{what}_unit` to say which", key=f"{what}_unit")
+    for quantity, units in (("flux", distinct), ("wavelength", lengths)):
+        if len(units) > 1:
+            fault = f"its header names several units of the {quantity}: {', '.join(units)}"
+            raise InputError(f"{fault}; use `{quantity}_unit` to say which", key=f"{quantity}_unit")
     return next(iter(lengths), None), next(iter(distinct), None)
 
 
@@ -420,36 +418,36 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
 
 
-def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str:
+def as_typed(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
     typed = TYPED.fullmatch(word) is not None and word.isprintable()
-    alone = sum(key_of(one) == key_of(word) for one in names) < 2
-    return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
+    is_unique = sum(key_of(other) == key_of(word) for other in names) < 2
+    return f"FILE[{word}]" if typed and is_unique else f"FILE[{kind} {index + 1}]"
 
 
-def choose(roles: Sequence[Role], asked: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
-    """Choose the columns of wavelength, or of both edges of each bin, and of flux, of which the user may name some."""
+def choose(roles: Sequence[Role], words: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
+    """Choose the columns of wavelength, or of both edges of each bin, and of flux; the user's words may name some."""
     names = [role.name for role in roles]
-    wanted = [_named(name, names) for name in asked]
-    axes = [i for i in wanted if roles[i].kind in AXES] or (wanted[:1] if len(wanted) == 2 else [])
+    selected = [_named(word, names) for word in words]
+    axes = [i for i in selected if roles[i].kind in AXES] or (selected[:1] if len(selected) == 2 else [])
     best, low, high = (_best(kind, roles) for kind in AXES)
     wavelength: tuple[int, ...] = tuple(axes[:1])
     if not axes and (best or not (low or high)):
         wavelength = (_only("wavelength", names, best),)
     elif not axes:
         wavelength = _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
-    rest = [i for i in wanted if i not in wavelength]
-    if len(rest) > 1:
-        raise InputError.of("columns", asked, "one flux, and one wavelength at most")
-    return wavelength, rest[0] if rest else _flux(roles, names, wavelength)
+    fluxes = [i for i in selected if i not in wavelength]
+    if len(fluxes) > 1:
+        raise InputError.of("columns", words, "one flux, and one wavelength at most")
+    return wavelength, fluxes[0] if fluxes else _flux(roles, names, wavelength)
 
 
 def _named(name: str, names: Sequence[str]) -> int:
-    indices = [i for i, one in enumerate(names) if one.strip() == name]
-    if not indices and (place := numbered("column", name, len(names))) is not None:
-        return place
-    indices = indices or [i for i, one in enumerate(names) if key_of(one) == key_of(name)]
+    indices = [i for i, column in enumerate(names) if column.strip() == name]
+    if not indices and (index := numbered("column", name, len(names))) is not None:
+        return index
+    indices = indices or [i for i, column in enumerate(names) if key_of(column) == key_of(name)]
     if len(indices) != 1:
         fault = f"{'several columns are' if indices else 'no column is'} named {shortened(name)}"
         raise InputError(f"{fault}; give one of {listed(names)}", key="columns")
@@ -459,29 +457,29 @@ def _named(name: str, names: Sequence[str]) -> int:
 def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ...]) -> int:
     if best := _best("flux", roles, wavelength) or _best("model", roles, wavelength):
         return _only("flux", names, best)
-    rest = [i for i in range(len(names)) if i not in wavelength]
-    unknown = [i for i in rest if roles[i].kind == "unknown"]
-    if len(rest) == len(unknown) == 1:
+    candidates = [i for i in range(len(names)) if i not in wavelength]
+    unknown = [i for i in candidates if roles[i].kind == "unknown"]
+    if len(candidates) == len(unknown) == 1:
         return unknown[0]
-    shown = (unknown or rest or [0])[0]
-    held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
-    fault = f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}"
+    shown = (unknown or candidates or [0])[0]
+    descriptions = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in candidates]
+    fault = f"no column is recognised as a star's flux, only {listed(descriptions) or 'the wavelength'}"
     raise InputError(f"{fault}; give the column as in {as_typed(names[shown], 'column', shown, names)}", key="columns")
 
 
 def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list[int]:
     """Return the columns of a kind that have the highest score."""
-    found = [i for i, role in enumerate(roles) if role.kind == kind and i not in without]
-    most = max((roles[i].score for i in found), default=0)
-    return [i for i in found if roles[i].score == most]
+    columns = [i for i, role in enumerate(roles) if role.kind == kind and i not in without]
+    highest = max((roles[i].score for i in columns), default=0)
+    return [i for i in columns if roles[i].score == highest]
 
 
-def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
+def _only(quantity: str, names: Sequence[str], indices: Sequence[int]) -> int:
     if len(indices) == 1:
         return indices[0]
     if not indices:
-        fault = f"no column is recognised as the {what} among {listed(names) or 'none'}"
+        fault = f"no column is recognised as the {quantity} among {listed(names) or 'none'}"
         raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     several = [names[i].strip() for i in indices]
-    fault = f"{len(several)} columns may be the {what}: {listed(several)}"
+    fault = f"{len(several)} columns may be the {quantity}: {listed(several)}"
     raise InputError(f"{fault}; give one as in {as_typed(several[-1], 'column', indices[-1], names)}", key="columns")

@@ -1,7 +1,7 @@
 """Spectra of tables: selection of one, and conversion to wavelengths in vacuum and flux densities.
 
-A selection is of a table, of its columns, and of a row if cells contain whole spectra. Users select with
-``FILE[word, ...]``: a table's label, a column's name or a row's identifier.
+Users select with ``FILE[word, ...]``: a table by its label, columns by their names, and a row by its identifier if the
+cells of a table contain entire spectra.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from mauvecl.host.arrays import Float
 from mauvecl.host.stars.columns import Role, as_typed, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
-from mauvecl.host.stars.spectrum import check_assumed_unit
+from mauvecl.host.stars.spectrum import FLUX_UNIT, check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, marks_in, without_indefinite
 from mauvecl.host.tables.units import Medium, is_stated, unit_and_medium, unit_of, vacuum_wavelengths
@@ -54,10 +54,8 @@ class SpectrumTable:
     @property
     def roles(self) -> Sequence[Role]:
         """Roles of the columns."""
-        return self.known_roles or [role_of(one.name, one.unit, one.ucd) for one in self.columns]
+        return self.known_roles or [role_of(column.name, column.unit, column.ucd) for column in self.columns]
 
-
-FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 
 #: Names of columns that qualify arrays: their step, their length, and the validity of points.
 STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
@@ -68,57 +66,59 @@ LENGTHS = ("npoints", "n_points", "nelem", "npts")
 WEIGHTS = ("dq_wgt",)
 
 
-def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> SpectrumTable:
-    """Return the table with the spectrum of a file, or with the selected one of several."""
+def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> SpectrumTable:
+    """Return the table with the spectrum of a file, or with the one of several that the user's words select."""
     if not tables:
         raise InputError("it has no table, but needs one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
-    named: list[int] = []
-    rest: list[str] = []
-    for word in asked:
-        place = numbered("table", word, len(tables))
-        fits = [i for i, label in enumerate(labels) if label == word.lower()] if place is None else [place]
-        named += fits
-        rest += [] if fits else [word]
-    found: list[SpectrumTable] = []
+    selected: list[int] = []
+    of_columns_and_rows: list[str] = []
+    for word in words:
+        index = numbered("table", word, len(tables))
+        matches = [i for i, label in enumerate(labels) if label == word.lower()] if index is None else [index]
+        selected += matches
+        of_columns_and_rows += [] if matches else [word]
+    spectra: list[SpectrumTable] = []
     errors: list[InputError] = []
-    for table in [tables[i] for i in dict.fromkeys(named)] or tables:
+    for table in [tables[i] for i in dict.fromkeys(selected)] or tables:
         try:
-            found.append(_spectrum_of(table, rest))
+            spectra.append(_spectrum_of(table, of_columns_and_rows))
         except InputError as error:
             errors.append(error)
-    if errors and any(one.group for one in found):
+    if errors and any(spectrum.group for spectrum in spectra):
         # A missing part would go unnoticed.
         raise errors[0]
-    if not found:
-        # The message that offers a choice is the most helpful.
+    if not spectra:
+        # A message that offers a choice is the most helpful.
         raise next((error for error in errors if "FILE[" in str(error)), errors[0])
-    if not named:
+    if not selected:
         # SDSS: the sum of all exposures, next to each of them.
-        found = [one for one in found if one.label.strip().lower() == "coadd"] or found
+        spectra = [spectrum for spectrum in spectra if spectrum.label.strip().lower() == "coadd"] or spectra
         # A legend beside the spectrum has no column of fluxes.
-        found = [one for one in found if one.light.kind == "flux"] or found
-    if len(found) == 1:
-        return found[0]
-    held = [one.label for one in found]
-    if found[0].group is not None and len({one.group for one in found}) == 1:
-        segments, said = [segment for one in found for segment in one.segments], f"its parts {listed(held)} are joined"
-        return replace(found[0], segments=segments, messages=(*found[0].messages, said))
-    first = as_typed(held[0], "table", labels.index(held[0].strip().lower()), labels)
-    raise InputError(f"{len(held)} tables hold a spectrum: {listed(held)}; give one as in {first}", key="table")
+        spectra = [spectrum for spectrum in spectra if spectrum.light.kind == "flux"] or spectra
+    first = spectra[0]
+    if len(spectra) == 1:
+        return first
+    titles = [spectrum.label for spectrum in spectra]
+    if first.group is not None and len({spectrum.group for spectrum in spectra}) == 1:
+        segments = [segment for spectrum in spectra for segment in spectrum.segments]
+        message = f"its parts {listed(titles)} are joined"
+        return replace(first, segments=segments, messages=(*first.messages, message))
+    example = as_typed(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
+    raise InputError(f"{len(titles)} tables have a spectrum: {listed(titles)}; give one as in {example}", key="table")
 
 
-def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> SpectrumTable:
+def _spectrum_of(table: SpectrumTable, words: Sequence[str]) -> SpectrumTable:
     roles = table.roles
     names = [role.name for role in roles]
-    known = {key_of(name) for name in names} | {key_of(f"column {place + 1}") for place in range(len(names))}
+    columns = {key_of(name) for name in names} | {key_of(f"column {i + 1}") for i in range(len(names))}
     # Words that do not name a column may name a row.
-    rest = [word for word in asked if key_of(word) not in known]
+    of_rows = [word for word in words if key_of(word) not in columns]
     try:
-        axes, light = choose(roles, [word for word in asked if key_of(word) in known])
+        axes, light = choose(roles, [word for word in words if key_of(word) in columns])
     except InputError as error:
-        raise (_no_such(rest[0], names) if rest else error) from error
-    messages = []
+        raise (_no_such(of_rows[0], names) if of_rows else error) from error
+    messages = list(table.messages)
     if len(axes) == 2:
         edges = " and ".join(names[i] for i in axes)
         if len({roles[i].unit for i in axes}) > 1:
@@ -127,12 +127,11 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> SpectrumTable:
     cells = [table.columns[i].cells for i in (*axes, light)]
     rows = [cells]
     if np.ndim(cells[-1]) > 1 or any(np.ndim(cell) > 0 for cell in cells[-1][:1]):
-        rows, identifier, said = _selected_rows(table, {*axes, light}, cells, rest)
-        messages += said
+        rows, identifier = _selected_rows(table, {*axes, light}, cells, of_rows, messages)
         if table.row_title and identifier:
             table = replace(table, name=table.row_title.format(identifier[:30]))
-    elif rest:
-        raise _no_such(rest[0], names)
+    elif of_rows:
+        raise _no_such(of_rows[0], names)
     segments = []
     for row in rows:
         *waves, flux = (_numbers(cell, names[i].strip()) for cell, i in zip(row, (*axes, light), strict=True))
@@ -142,14 +141,13 @@ def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> SpectrumTable:
         segments.append((sum(waves[1:], waves[0]) / len(waves), flux))
     if sum(flux.size for _, flux in segments) < 2:
         raise InputError("it must have at least two points to be a spectrum", key="flux")
-    said = (*table.messages, *messages)
-    return replace(table, segments=segments, axis=roles[axes[0]], light=roles[light], messages=said)
+    return replace(table, segments=segments, axis=roles[axes[0]], light=roles[light], messages=tuple(messages))
 
 
 def _numbers(cells: Any, name: str) -> Float:
     """Return cells as numbers; NaN for missing measurements."""
     if np.asanyarray(cells).dtype.kind == "b":
-        raise InputError(f"{name} must hold real numbers, not true and false", key=name)
+        raise InputError(f"{name} must contain real numbers, not true and false", key=name)
     return without_indefinite(Values.of(name, cells, what="its table").numbers())
 
 
@@ -159,9 +157,9 @@ def _no_such(word: str, names: Sequence[str]) -> InputError:
 
 
 def _selected_rows(
-    table: SpectrumTable, chosen: set[int], cells: list[Any], asked: Sequence[str]
-) -> tuple[list[list[Any]], str, tuple[str, ...]]:
-    """Return the selected row, or all rows if they are segments of one spectrum, the name of one, and messages.
+    table: SpectrumTable, chosen: set[int], cells: list[Any], words: Sequence[str], messages: list[str]
+) -> tuple[list[list[Any]], str]:
+    """Return the selected row and its name, or all rows if they are segments of one spectrum, with a message.
 
     The cells are those of the chosen columns; wavelengths of shape (n,) apply to all rows of fluxes, (n_row, n).
     """
@@ -170,36 +168,35 @@ def _selected_rows(
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
         raise InputError(f"it needs {n} rows of wavelengths, as many as of fluxes, not {len(cells[0])}", key="flux")
-    held = {key_of(column.name): column for column in reversed(table.columns)}
+    columns = {key_of(column.name): column for column in reversed(table.columns)}
     identifiers = _identifiers(table, chosen, n)
     identifier = ""
-    messages: tuple[str, ...] = ()
-    if n > 1 and not asked and {*held} & {"segment", "sporder", "order", "stripe"}:
+    if n > 1 and not words and {*columns} & {"segment", "sporder", "order", "stripe"}:
         # The segments of a detector, or echelle orders.
         rows = list(range(n))
         labels = [(identifiers[row] or [str(row + 1)])[0] for row in rows]
-        messages = (f"its {n} segments ({listed(labels)}) are joined",)
+        messages.append(f"its {n} segments ({listed(labels)}) are joined")
     else:
-        rows = [_row_asked(identifiers, asked, [*held])]
+        rows = [_selected_row(identifiers, words, [*columns])]
         identifier = (identifiers[rows[0]] or [""])[0]
-    steps, starts, lengths, weights = (
-        next((held[name].cells for name in wanted if name in held), None)
-        for wanted in (STEPS, STARTS, LENGTHS, WEIGHTS)
-    )
-    found = []
+    spectra = []
     for row in rows:
-        first = 0 if starts is None else max(0, int(np.ravel(starts[row])[0]) - 1)
-        arrays = _arrays([cell[row] for cell in cells], None if steps is None else steps[row], first)
-        kept = np.arange(arrays[-1].size) >= first
-        if lengths is not None and 1 < (count := int(np.ravel(lengths[row])[0])) < kept.size:
-            kept[first + count :] = False
-        if weights is not None and np.shape(weights[row]) == kept.shape:
-            kept &= np.asarray(weights[row]) != 0
-        if kept.any():
-            found.append([array[kept] for array in arrays])
-    if not found:
+        step, start, length, weight = (
+            next((columns[name].cells[row] for name in names if name in columns), None)
+            for names in (STEPS, STARTS, LENGTHS, WEIGHTS)
+        )
+        first = 0 if start is None else max(0, int(np.ravel(start)[0]) - 1)
+        arrays = _arrays([cell[row] for cell in cells], step, first)
+        valid = np.arange(arrays[-1].size) >= first
+        if length is not None and 1 < (count := int(np.ravel(length)[0])) < valid.size:
+            valid[first + count :] = False
+        if weight is not None and np.shape(weight) == valid.shape:
+            valid &= np.asarray(weight) != 0
+        if valid.any():
+            spectra.append([array[valid] for array in arrays])
+    if not spectra:
         raise InputError("its rows contain no valid point, but need at least one", key="rows")
-    return found, identifier, messages
+    return spectra, identifier
 
 
 def _arrays(cells: list[Any], step: Any, first: int) -> list[Any]:
@@ -216,22 +213,22 @@ def _arrays(cells: list[Any], step: Any, first: int) -> list[Any]:
 def _identifiers(table: SpectrumTable, without: set[int], n: int) -> list[list[str]]:
     """Return the possible names of each row: its short texts and integers, the most specific first."""
     columns = [list(table.row_names)] if len(table.row_names) == n else []
-    for place, column in enumerate(table.columns):
-        if place in without:
+    for i, column in enumerate(table.columns):
+        if i in without:
             continue
         values = column.cells
         if np.shape(values) == (n,) and np.asarray(values).dtype.kind in "SUiuO" and np.ndim(values[0]) == 0:
-            columns.append(column.texts() or [str(one) for one in values])
+            columns.append(column.texts() or [str(value) for value in values])
     columns.sort(key=lambda texts: len(set(texts)) < n)
     return [[texts[row] for texts in columns] for row in range(n)]
 
 
-def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names: Sequence[str]) -> int:
+def _selected_row(identifiers: Sequence[Sequence[str]], words: Sequence[str], names: Sequence[str]) -> int:
     """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
     fitting = list(range(len(identifiers)))
-    for word in asked:
-        place = numbered("row", word, len(identifiers))
-        fitting = [row for row in fitting if (word.strip() in identifiers[row] if place is None else row == place)]
+    for word in words:
+        index = numbered("row", word, len(identifiers))
+        fitting = [row for row in fitting if (word.strip() in identifiers[row] if index is None else row == index)]
         if not fitting:
             raise _no_such(word, names)
     if len(fitting) == 1:
@@ -239,7 +236,7 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     numbers = [f"row {row + 1}" for row in fitting]
     labels = [(identifiers[row] or [""])[0] or number for row, number in zip(fitting, numbers, strict=True)]
     labels = labels if len(set(labels)) == len(labels) else numbers
-    fault = f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})"
+    fault = f"it contains {len(fitting)} spectra, one in each row ({listed(labels)})"
     raise InputError(f"{fault}; give one as in {as_typed(labels[0], 'row', fitting[0], labels)}", key="rows")
 
 
@@ -274,27 +271,27 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
     medium: Medium | None = None
     if isinstance(wavelength_unit, str):
         wavelength_unit, medium = unit_and_medium(wavelength_unit)
-    stated, in_unit = unit_and_medium(table.axis.unit or "")
+    axis_unit, in_unit = unit_and_medium(table.axis.unit or "")
     implied = table.implied_units or (None, None)
-    axis, is_assumed = _scale("wavelength", replace(table.axis, unit=stated), wavelength_unit, implied[0], messages)
+    axis, is_assumed = _scale("wavelength", replace(table.axis, unit=axis_unit), wavelength_unit, implied[0], messages)
     light, is_assumed_flux = _scale("flux", table.light, flux_unit, implied[1], messages)
-    waves, fluxes = (np.concatenate(parts) for parts in zip(*table.segments, strict=True))
-    whole = axis(waves)
+    waves, fluxes = (np.concatenate(arrays) for arrays in zip(*table.segments, strict=True))
+    wavelengths = axis(waves)
     if is_assumed:
-        check_assumed_unit(whole.value, str(whole.unit))
-    marks, said = marks_in(fluxes, "fluxes")
-    messages += said
+        check_assumed_unit(wavelengths.value, str(wavelengths.unit))
+    marks, remarks = marks_in(fluxes, "fluxes")
+    messages += remarks
     segments = []
     for values, flux in table.segments:
-        kept = np.where(np.isin(flux, marks), np.nan, flux)
+        unmarked = np.where(np.isin(flux, marks), np.nan, flux)
         nm = np.asarray(axis(values).to_value(u.nm, u.spectral()), np.float64)
         bad = np.flatnonzero(~np.isfinite(nm))
-        if bad.size and (bad.size == nm.size or np.isfinite(kept[bad]).any()):
+        if bad.size and (bad.size == nm.size or np.isfinite(unmarked[bad]).any()):
             raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
         # A row without wavelength or flux is not a point.
-        nm, kept = np.delete(nm, bad), np.delete(kept, bad)
+        nm, unmarked = np.delete(nm, bad), np.delete(unmarked, bad)
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
-        flam = np.asarray(light(kept).to_value(FLAM, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
+        flam = np.asarray(light(unmarked).to_value(FLUX_UNIT, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
         segments.append((nm[order], flam[order]))
     nm, flam = _joined(segments, messages)
     if is_assumed_flux:
@@ -304,43 +301,44 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
     nm, flam = _merged(nm, flam, messages)
     unscaled, notes = table.unscaled, table.notes
     if re.search(r"surface\s+flux", table.remarks, re.I):
-        unscaled = unscaled or "its header says that it is the flux at the star's surface"
+        unscaled = unscaled or "its header states that it is the flux at the star's surface"
     if re.search(r"dereddened", table.remarks, re.I) and not any("dereddened" in note for note in notes):
-        notes += ("dereddened, as its header says: counts need it reddened again",)
-    return ReadSpectrum(nm, flam, table.name, table.origin, notes, tuple(messages), unscaled, str(whole.unit))
+        notes += ("dereddened, as its header states: counts need it reddened again",)
+    return ReadSpectrum(nm, flam, table.name, table.origin, notes, tuple(messages), unscaled, str(wavelengths.unit))
 
 
 #: Conversion of a column's numbers to quantities on a linear scale.
 Scale = Callable[[Float], u.Quantity]
 
 
-def _scale(what: str, role: Role, asked: Any, implied: str | None, messages: list[str]) -> tuple[Scale, bool]:
+def _scale(quantity: str, role: Role, user_unit: Any, implied: str | None, messages: list[str]) -> tuple[Scale, bool]:
     """Return the scale of a column, and whether its unit is assumed: neither the user's nor stated by the file."""
-    unit, said = _stated(what, role, asked)
-    messages += said
-    is_bare_logarithm = unit is not None and str(unit) in ("dex", "dex(1)")
+    unit = _stated_unit(quantity, role, user_unit, messages)
+    is_bare_logarithm = str(unit) in ("dex", "dex(1)")
     is_assumed = unit is None or is_bare_logarithm
     if is_assumed:
         if implied is None:
-            usual = "nm" if what == "wavelength" else "erg / (s cm2 Angstrom)"
-            fault = f"column {role.name} names no unit; use `{what}_unit` to give one such as {usual}"
-            raise InputError(fault, key=f"{what}_unit")
+            usual = "nm" if quantity == "wavelength" else "erg / (s cm2 Angstrom)"
+            fault = f"column {role.name} names no unit; use `{quantity}_unit` to give one such as {usual}"
+            raise InputError(fault, key=f"{quantity}_unit")
         # Logarithms of wavelength are of Angstrom everywhere (SDSS, LAMOST, DESI).
         is_logarithm = is_bare_logarithm or role.logarithm
-        per_frequency = what == "flux" and role.per_frequency
-        unit = unit_of("Angstrom" if what == "wavelength" and is_logarithm else "fnu" if per_frequency else implied)
-        why = f", and {role.name} is one per frequency" if per_frequency else ""
-        named = divided_unit(role.name)[1]
-        why += f" ({named!r} in the name of its column is not one)" if named and not is_bare_logarithm else ""
-        messages.append(f"ASSUMED: {what} in {unit}, because its file states no unit{why}; --{what}-unit names another")
-    if what == "flux":
+        per_frequency = quantity == "flux" and role.per_frequency
+        is_angstrom = quantity == "wavelength" and is_logarithm
+        unit = unit_of("Angstrom" if is_angstrom else "fnu" if per_frequency else implied)
+        reason = f", and {role.name} is one per frequency" if per_frequency else ""
+        suffix = divided_unit(role.name)[1]
+        reason += f" ({suffix!r} in the name of its column is not one)" if suffix and not is_bare_logarithm else ""
+        assumed = f"ASSUMED: {quantity} in {unit}, because its file states no unit{reason}"
+        messages.append(f"{assumed}; --{quantity}-unit names another")
+    if quantity == "flux":
         _check_flux_unit(unit, role)
     elif not is_spectral(unit):
         raise InputError.of("wavelength_unit", str(unit), "a length or a frequency")
     base = role.logarithm or ("10" if is_bare_logarithm or str(unit).startswith("dex") else "")
     to_linear: Callable[[Float], Float] = np.asarray
     if base:
-        values, limits = ("wavelengths", LOG_WAVELENGTHS) if what == "wavelength" else ("fluxes", LOG_FLUXES)
+        values, limits = ("wavelengths", LOG_WAVELENGTHS) if quantity == "wavelength" else ("fluxes", LOG_FLUXES)
         power = "e" if base == "e" else "ten"
         messages.append(f"its {values} are logarithms ({role.name}), raised to powers of {power}")
         to_linear = partial(_power, base=base, limits=limits, column=role.name)
@@ -350,18 +348,19 @@ def _scale(what: str, role: Role, asked: Any, implied: str | None, messages: lis
     return (lambda numbers: u.Quantity(to_linear(numbers), linear(unit))), is_assumed
 
 
-def _stated(what: str, role: Role, asked: Any) -> tuple[Any, list[str]]:
-    """Return the user's unit, else that of the file, else None; and messages."""
+def _stated_unit(quantity: str, role: Role, user_unit: Any, messages: list[str]) -> Any:
+    """Return the user's unit, with a message if it contradicts the file; else that of the file, or None."""
     try:
-        if asked is None:
-            return (unit_of(role.unit) if role.unit is not None and is_stated(role.unit) else None), []
-        unit = unit_of(asked) if isinstance(asked, str) else asked
+        if user_unit is None:
+            return unit_of(role.unit) if role.unit is not None and is_stated(role.unit) else None
+        unit = unit_of(user_unit) if isinstance(user_unit, str) else user_unit
     except InputError as error:
-        raise error.within(f"{what} ({role.name})") from error
+        raise error.within(f"{quantity} ({role.name})") from error
     with contextlib.suppress(InputError):
         if not is_stated(role.unit) or unit_of(str(role.unit)) == unit:
-            return unit, []
-    return unit, [f"the unit of its {what} is {unit} as asked, not {role.unit!s:.40} as its file says"]
+            return unit
+    messages.append(f"the unit of its {quantity} is {unit} as requested, not {role.unit!s:.40} as its file states")
+    return unit
 
 
 def _power(values: Float, base: str, limits: tuple[float, float], column: str) -> Float:
@@ -370,8 +369,8 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
     # Linear fluxes under a wrong name are all but zero.
     if finite.size and (finite.min() < limits[0] or finite.max() > limits[1] or np.abs(finite).max() < 1e-3):
         low, high = values[np.isfinite(values)].min(), values[np.isfinite(values)].max()
-        fault = f"column {column} is named as a logarithm and holds {low:g} to {high:g}"
-        raise InputError(f"{fault}, but must hold logarithms from {limits[0]:g} to {limits[1]:g}", key=column)
+        fault = f"column {column} is named as a logarithm and has values from {low:g} to {high:g}"
+        raise InputError(f"{fault}, but must have logarithms from {limits[0]:g} to {limits[1]:g}", key=column)
     return np.asarray(10.0**logarithms)
 
 
@@ -382,9 +381,9 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
         raise InputError.of("flux_unit", str(unit), f"one {usual}")
     if kind == "total" and not role.total:
         fault = f"the unit {unit} is not a flux density (it is not per wavelength or frequency)"
-        fault += f"; use one {usual}, or a column whose name says lambda F_lambda, such as lamFlam"
+        fault += f"; use one {usual}, or a column whose name means lambda F_lambda, such as lamFlam"
     elif kind == "density" and role.total:
-        fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density, but they must agree"
+        fault = f"the column's name means lambda F_lambda and its unit {unit} a flux density, but they must agree"
     elif kind == "surface brightness":
         fault = f"the unit {unit} is per solid angle; use the flux of the whole star, {usual}"
     if fault:
@@ -414,11 +413,11 @@ def _check_assumed_flux(flux: Float, remarks: str) -> None:
     if not finite.size:
         return
     low, high = float(finite.min()), float(finite.max())
-    said = _THROUGHPUT.search(remarks.replace("_", " "))
+    mention = _THROUGHPUT.search(remarks.replace("_", " "))
     if low >= LIKELY_MAGNITUDES[0] and high <= LIKELY_MAGNITUDES[1]:
         fault = f"fluxes of {low:g} to {high:g} without a unit look like magnitudes, but must be a flux density"
-    elif said and low >= 0.0 and 1e-3 <= high <= 1.0:
-        fault = f"values of {low:g} to {high:g} without a unit and the word {said[0]!r} speak of a throughput"
+    elif mention and low >= 0.0 and 1e-3 <= high <= 1.0:
+        fault = f"values of {low:g} to {high:g} without a unit and the word {mention[0]!r} suggest a throughput"
         fault += ", but must be a star's flux"
     else:
         return
@@ -429,10 +428,10 @@ def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:
     """Merge points of equal wavelength into one with their mean flux."""
     if nm.size < 2 or (np.diff(nm) > 0).all() or (np.diff(nm) < 0).any():
         return nm, flux
-    kept, first, count = np.unique(nm, return_index=True, return_counts=True)
+    distinct, first, count = np.unique(nm, return_index=True, return_counts=True)
     total = np.add.reduceat(flux, first)
     least, most = np.minimum.reduceat(flux, first), np.maximum.reduceat(flux, first)
     unequal = int(np.count_nonzero(most - least > 1e-9 * np.abs(most)))
-    shown = f"; {unequal} of them differ in flux and are averaged" if unequal else ", equal in flux"
-    messages.append(f"{int((count > 1).sum())} wavelengths that occur more than once are merged{shown}")
-    return kept, np.where(count > 1, total / count, flux[first])
+    difference = f"; {unequal} of them differ in flux and are averaged" if unequal else ", equal in flux"
+    messages.append(f"{int((count > 1).sum())} wavelengths that occur more than once are merged{difference}")
+    return distinct, np.where(count > 1, total / count, flux[first])

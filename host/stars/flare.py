@@ -212,9 +212,10 @@ class EmissionLine:
 
         Raises InputError for an unknown name, or a wavelength outside 100 to 1000 nm.
         """
-        names, wanted = (*LINE_GROUPS, *LINES_NM), name.strip().casefold().replace("_", " ")
-        if (known := next((one for one in names if wanted == one.casefold()), None)) is not None:
-            return cls(known, tuple(LINES_NM[line] for line in LINE_GROUPS.get(known, (known,))))
+        names, key = (*LINE_GROUPS, *LINES_NM), name.strip().casefold().replace("_", " ")
+        for title in names:
+            if title.casefold() == key:
+                return cls(title, tuple(LINES_NM[line] for line in LINE_GROUPS.get(title, (title,))))
         try:
             nm = float(name)
         except ValueError:
@@ -249,9 +250,9 @@ class FlareWithLines(FlareSpectrum):
     def __post_init__(self) -> None:
         for name in (*self.fractions, *self.fluxes_cgs):
             EmissionLine.named(name)
-        both = set(self.fractions) & set(self.fluxes_cgs)
-        if both:
-            raise InputError(f"the line {min(both)!r} needs either a fraction or a flux, but has both", key="lines")
+        repeated = set(self.fractions) & set(self.fluxes_cgs)
+        if repeated:
+            raise InputError(f"the line {min(repeated)!r} needs either a fraction or a flux, but has both", key="lines")
 
     @property
     def temperature_k(self) -> float | None:  # type: ignore[override]
@@ -374,7 +375,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
 
         Without `quiescent` the file has the flare alone. Formats are those of `Source.read`; the units override what
         both files state. A blackbody of the temperature `continue_at_k` continues the spectrum where it ends. Raises
-        InputError for files that hold no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
+        InputError for files that contain no spectra or do not overlap, or a spectrum that does not cover 200-700 nm.
         """
         from mauvecl.host.stars.formats import read_spectrum
 
@@ -390,13 +391,13 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             nm, messages = nm[inside], (*messages, *star.messages)
             quiet = np.interp(nm, star.wavelength_nm, star.flux_flam)
             flux = flux[inside] - quiet
-            left, rounding = np.trapezoid([flux, ROUNDING * np.abs(quiet)], nm)
-            if not left > rounding:
+            excess, rounding = np.trapezoid([flux, ROUNDING * np.abs(quiet)], nm)
+            if not excess > rounding:
                 fault = f"the spectrum {read.name} must be brighter than {star.name}, which is subtracted from it"
                 remedy = "give the star with its flare, and the same star without it"
                 raise InputError(f"{fault}: {remedy}", key="quiescent")
-        own = tuple(f"{read.name}: {text}" for text in messages)
-        return cls.from_arrays(nm, flux, name=read.name, continue_at_k=continue_at_k, messages=own)
+        messages = tuple(f"{read.name}: {text}" for text in messages)
+        return cls.from_arrays(nm, flux, name=read.name, continue_at_k=continue_at_k, messages=messages)
 
     @property
     def nodes_nm(self) -> Float:  # type: ignore[override]
@@ -423,10 +424,10 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
             continue
         join = np.abs(nm - end) <= JOIN_NM
         body = blackbody(nm[join], kelvin)
-        # A coarse spectrum may have its last point alone within that width.
-        alone = body.size == 1
-        own, model = (light[0] if alone else np.trapezoid(light, nm[join]) for light in (flux[join], body))
-        scale = float(own / model)
+        # A coarse spectrum may have only its last point within that width.
+        lights = flux[join], body
+        level, model = (light[0] if body.size == 1 else np.trapezoid(light, nm[join]) for light in lights)
+        scale = float(level / model)
         if not scale > 0.0:
             fault = f"the flare spectrum {name} has no light near {end:g} nm, but needs some to scale a blackbody to"
             raise InputError(fault, key="continue_at_k")
@@ -563,23 +564,23 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     if amplitude is None:
         names = shown(", ".join(rows.names), 300)
         raise rows.error(f"it has the columns {names}, but needs one named {', '.join(AMPLITUDES)}", "amplitude")
-    columns = {"amplitude": (amplitude, "1"), "start": (start, "d"), "stop": (stop, "d")}
-    cells = [[rows.number(held, row, unit) for held, unit in columns.values()] for row in range(rows.n)]
-    # AltaiPony's tables have an empty row for a star without flares.
-    filled = [(row, *values) for row, values in enumerate(cells, 1) if any(value is not None for value in values)]
-    if not 0 < len(filled) <= MAX_FLARES:
-        raise rows.error(f"it must have 1 to {MAX_FLARES} flares, not {len(filled)}", "amplitude")
-    for row, value, begin, end in filled:
-        if value is None or not SMALLEST <= value <= LARGEST:
-            given = "an empty cell" if value is None else f"{value:g}"
-            raise rows.error(f"the amplitude in row {row} must be a rise above 0, not {given}", "amplitude")
-        if begin is not None and end is not None and end < begin:
+    columns = ((amplitude, "1"), (start, "d"), (stop, "d"))
+    cells = [[rows.number(column, row, unit) for column, unit in columns] for row in range(rows.n)]
+    # Missing numbers are NaN. AltaiPony's tables have an empty row for a star without flares.
+    numbers = np.array(cells, np.float64).reshape(-1, len(columns))
+    filled = np.flatnonzero(~np.isnan(numbers).all(axis=1))
+    if not 0 < filled.size <= MAX_FLARES:
+        raise rows.error(f"it must have 1 to {MAX_FLARES} flares, not {filled.size}", "amplitude")
+    for row, (value, begin, end) in zip(filled + 1, numbers[filled], strict=True):
+        if not SMALLEST <= value <= LARGEST:
+            cell = "an empty cell" if np.isnan(value) else f"{value:g}"
+            raise rows.error(f"the amplitude in row {row} must be a rise above 0, not {cell}", "amplitude")
+        if end < begin:
             raise rows.error(f"row {row} ends at {end:.10g} d, but must end after {begin:.10g} d", "stop")
-    flares = QTable({"amplitude": [value for _, value, *_ in filled]})
-    for place, (title, (held, unit)) in enumerate(columns.items(), 1):
-        if title != "amplitude" and held is not None:
-            flares[title] = np.array([values[place] for values in filled], float)
-            flares[title].unit = unit
+    flares = QTable({"amplitude": numbers[filled, 0]})
+    for k, title in ((1, "start"), (2, "stop")):
+        if columns[k][0] is not None:
+            flares[title] = numbers[filled, k] * u.d
     flares.meta["comments"] = list(rows.unused([name for name in rows.names if name not in (amplitude, start, stop)]))
     flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
     return flares

@@ -37,7 +37,7 @@ GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
 
 
 def table_of_text(
-    text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
+    text: str, name: str, origin: str, words: Sequence[str], wavelength: bool, flux: bool
 ) -> SpectrumTable:
     """Read the table of a text file, and the units of wavelength and flux in its header if requested."""
     lines = text_tables.NumberLines(text, "wavelength and flux")
@@ -46,7 +46,7 @@ def table_of_text(
     names, units = _names(lines)
     titles = names or [str(k + 1) for k in range(max(lines.n, 2))]
     columns = [lines.column(k, title, units[k] if units else "") for k, title in enumerate(titles)]
-    roles = [role_of(one.name, one.unit) for one in columns] if names else _roles_by_number(lines, asked)
+    roles = [role_of(c.name, c.unit) for c in columns] if names else _roles_by_number(lines, words)
     if titles[:2] == ["wavelength", "flux"] and np.array_equal(columns[0].numbers(), GAIA_NM):
         roles = [replace(roles[0], unit="nm"), replace(roles[1], unit=GAIA_FLUX), *roles[2:]]
     # The header may state the units that are not next to the names; an unknown column may be the flux.
@@ -55,8 +55,8 @@ def table_of_text(
     axis_unit, flux_unit = stated_units(
         lines.comments, wavelength=wavelength and not has_axis, flux=flux and not has_flux, is_named=bool(names)
     )
-    said = dict.fromkeys(AXES, axis_unit) | dict.fromkeys(lights, flux_unit)
-    roles = [role if role.unit else replace(role, unit=said.get(role.kind)) for role in roles]
+    units_by_kind = dict.fromkeys(AXES, axis_unit) | dict.fromkeys(lights, flux_unit)
+    roles = [role if role.unit else replace(role, unit=units_by_kind.get(role.kind)) for role in roles]
     keywords = text_tables.keywords_of([f"# {line}" for line, _ in lines.header])
     return SpectrumTable(
         columns, name, origin, implied_units=TEXT_UNITS, remarks=lines.comments, messages=tuple(lines.messages),
@@ -64,13 +64,13 @@ def table_of_text(
     )  # fmt: skip
 
 
-def _roles_by_number(lines: text_tables.NumberLines, asked: Sequence[str]) -> list[Role]:
-    """Return the roles of columns without names: the first two are the spectrum, or those whose numbers are asked."""
+def _roles_by_number(lines: text_tables.NumberLines, words: Sequence[str]) -> list[Role]:
+    """Return the roles of columns without names: the spectrum is the first two, or those that the user numbers."""
     n = lines.n
-    indices = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
-    if len(indices) != len(asked) or len(indices) > 2:
-        raise InputError.of("columns", asked, f"their numbers, 1 to {n}")
-    if not asked and n > 2:
+    indices = [int(word) - 1 for word in words if word.isascii() and word.isdigit() and 1 <= int(word[:6]) <= n]
+    if len(indices) != len(words) or len(indices) > 2:
+        raise InputError.of("columns", words, f"their numbers, 1 to {n}")
+    if not words and n > 2:
         lines.messages.append(f"the first two of its {n} columns are used, which have no names")
     wave, value = indices if len(indices) == 2 else (0, *(indices or [1]))
     roles = [Role(str(k + 1), "unknown") for k in range(max(n, 2))]
@@ -81,7 +81,7 @@ def _roles_by_number(lines: text_tables.NumberLines, asked: Sequence[str]) -> li
 
 def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable:
     """Return a table whose cells contain arrays such as ``(1.0, 2.0)``, with a spectrum per row, as in Gaia's files."""
-    columns = [file.find(one) for one in file.names]
+    columns = [file.find(title) for title in file.names]
     for k, column in enumerate(columns):
         texts = column.cells.tolist()
         if all(text[:1] in ("(", "[") for text in texts):
@@ -90,10 +90,10 @@ def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable
             is_image = len({row.size for row in rows}) == 1
             arrays = np.array(rows) if is_image else np.array([*rows, None], object)[:-1]
             columns[k] = Values.of(column.name, arrays, column.unit)
-    known = {column.name.lower(): column for column in columns}
-    if not {"source_id", "flux"} <= {*known} or "wavelength" in known or known["flux"].shape[1:] != GAIA_NM.shape:
+    by_name = {column.name.lower(): column for column in columns}
+    if not {"source_id", "flux"} <= {*by_name} or "wavelength" in by_name or by_name["flux"].shape[1:] != GAIA_NM.shape:
         return SpectrumTable(columns, name, origin, implied_units=TEXT_UNITS)
-    columns = [known["source_id"], Values.of("wavelength", GAIA_NM, "nm"), replace(known["flux"], unit=GAIA_FLUX)]
+    columns = [by_name["source_id"], Values.of("wavelength", GAIA_NM, "nm"), replace(by_name["flux"], unit=GAIA_FLUX)]
     return SpectrumTable(
         columns, name, f"{origin}, Gaia DR3 sampled XP spectrum", row_title="Gaia DR3 {}",
         notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
@@ -103,9 +103,9 @@ def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable
 def _names(lines: text_tables.NumberLines) -> tuple[list[str], list[str]]:
     """Return the names of columns and the units below them; empty if there are none."""
     # Lines such as "column 2: flux"; columns without such a line are named by number.
-    found = text_tables.numbered_names((line for line, _ in lines.header), lines.n)
-    numbered = [found.get(k, str(k + 1)) for k in range(lines.n)]
-    if len(found) > 1 and _recognised(numbered):
+    by_number = text_tables.numbered_names((line for line, _ in lines.header), lines.n)
+    numbered = [by_number.get(k, str(k + 1)) for k in range(lines.n)]
+    if len(by_number) > 1 and _recognised(numbered):
         return numbered, []
     rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := text_tables.divided_names(line, lines.n))}
     # The last of the lines that name most columns.
@@ -114,14 +114,13 @@ def _names(lines: text_tables.NumberLines) -> tuple[list[str], list[str]]:
         return rows[k], _units(lines, k)
     unmarked = [k for k, (line, is_comment) in enumerate(lines.header) if not is_comment and line]
     if len(unmarked) == 1:
-        # The only line that is no comment may name columns, some of them unknown.
+        # The only line that is not a comment may name columns, some of them unknown.
         cells = rows.get(unmarked[0], [])
         is_marked = bool(re.search(r"[,;|\t]", lines.header[unmarked[0]][0].strip()))
         kinds = {role_of(cell).kind for cell in cells}
         if len(cells) == 2:
             # A light curve has no wavelengths.
-            times = [one.lower() == "phase" or time_in_name(f"time {one}") or "time" in words_of(one) for one in cells]
-            is_named = is_marked and (bool(kinds & set(AXES)) or any(times))
+            is_named = is_marked and (bool(kinds & set(AXES)) or any(map(_is_time, cells)))
         else:
             is_named = is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
         if is_named:
@@ -129,13 +128,18 @@ def _names(lines: text_tables.NumberLines) -> tuple[list[str], list[str]]:
     return _of_another_length(lines), []
 
 
+def _is_time(name: str) -> bool:
+    """Return whether a column's name is that of times."""
+    return name.lower() == "phase" or "time" in words_of(name) or time_in_name(f"time {name}") is not None
+
+
 def _recognised(cells: Sequence[str]) -> int:
     """Count the cells that name a spectrum's columns; 0 without a wavelength and another column."""
     kinds = [role_of(cell).kind for cell in cells]
     is_named = any(kind in AXES and not is_unit(cell) for cell, kind in zip(cells, kinds, strict=True))
     # "resolution 5 nm" does not name columns; "nm error flux" does.
-    others = {*kinds} - {*AXES, "unknown"} if is_named else {*kinds} & {"flux", "model", "magnitude", "counts"}
-    if not others or not {*kinds} & {*AXES}:
+    companions = {*kinds} - {*AXES, "unknown"} if is_named else {*kinds} & {"flux", "model", "magnitude", "counts"}
+    if not companions or not {*kinds} & {*AXES}:
         return 0
     # Names have precedence over the units below them.
     return sum(1 if is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
@@ -166,8 +170,8 @@ def _of_another_length(lines: text_tables.NumberLines) -> list[str]:
         is_plain = set(kinds) <= {"wavelength", "flux", "unknown"} and not any(role_of(c).logarithm for c in cells)
         in_order = is_plain and kinds.index("flux") > kinds.index("wavelength")
         if is_comment and len(cells) < lines.n:
-            said = f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
-            lines.messages.append(said)
+            message = f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
+            lines.messages.append(message)
             return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
         if not is_comment or not in_order:
             fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
@@ -188,8 +192,8 @@ _FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
 class _Reader:
     """Reader of the tables of an open FITS file, including images of spectra."""
 
-    def __init__(self, hdus: Any, name: str, origin: str, asked: Sequence[str]) -> None:
-        self.hdus, self.name, self.origin, self.asked = hdus, name, origin, asked
+    def __init__(self, hdus: Any, name: str, origin: str, words: Sequence[str]) -> None:
+        self.hdus, self.name, self.origin, self.words = hdus, name, origin, words
         self.file = FitsTables(hdus, "it")
         self.primary = hdus[0].header
         self.telescope = text_at(self.primary, "TELESCOP").upper()
@@ -209,19 +213,19 @@ class _Reader:
                 images.append(self._of_image(number))
             except InputError as error:
                 errors.append(error)
-        if not self.asked:
-            images = [one for one in images if one.label.strip().lower() in ("flux", "sci", "spectrum")] or images
+        if not self.words:
+            images = [image for image in images if image.label.strip().lower() in ("flux", "sci", "spectrum")] or images
         kinds = [{role.kind for role in table.roles} for table in tables]
-        named = {image.label.strip().lower() for image in images} & {word.lower() for word in self.asked}
-        if any("flux" in kind and kind & {"wavelength", "lower edge"} for kind in kinds) and not named:
+        selected = {image.label.strip().lower() for image in images} & {word.lower() for word in self.words}
+        if any("flux" in kind and kind & {"wavelength", "lower edge"} for kind in kinds) and not selected:
             return tables
         is_bare = not any(kind & {"flux", "model", "magnitude"} for kind in kinds)
-        if errors and not images and (not tables or (is_bare and not self.asked)):
+        if errors and not images and (not tables or (is_bare and not self.words)):
             raise errors[0]
         if not tables and not images:
             raise InputError("it has no table and no image; give a table with WAVELENGTH and FLUX", key="table")
-        # A table of wavelengths, of lines or of a log is no spectrum.
-        return images if images and not self.asked and is_bare else [*tables, *images]
+        # A table of wavelengths, of lines or of a log is not a spectrum.
+        return images if images and not self.words and is_bare else [*tables, *images]
 
     def _table(
         self, number: int, columns: Sequence[Values], label: str = "", remarks: str = "",
@@ -230,39 +234,39 @@ class _Reader:
         """Return the table of an extension, which users select by its number if they do so, else by its name."""
         header, primary = self.hdus[number].header, self.primary
         headers = [primary] if primary is header else [primary, header]
-        said = [text_at(one, key) for one in headers for key in _REMARKS]
+        comments = [text_at(source, key) for source in headers for key in _REMARKS]
         # Comments beside the names and units of columns and axes, as in "TTYPE1 = 'WAVE' / in air".
         cards = [key for key in header if re.fullmatch(r"T(?:TYPE|UNIT)\d+|C(?:TYPE|UNIT|RVAL)1", key)]
-        said += [str(header.comments[key]) for key in cards]
-        said += [text_at(header, key) for key in header if "TCOMM" in key]
-        stated = {key: text_at(primary, key) or text_at(header, key) for key in ("DATAQUAL", "OFFSETPX")}
-        own = [f"{key} = {text[:60]}" for key, text in stated.items() if text]
+        comments += [str(header.comments[key]) for key in cards]
+        comments += [text_at(header, key) for key in header if "TCOMM" in key]
+        quality = {key: text_at(primary, key) or text_at(header, key) for key in ("DATAQUAL", "OFFSETPX")}
+        header_notes = [f"{key} = {text[:60]}" for key, text in quality.items() if text]
         if "lowlib" in self.origin.lower():
-            own.append("dereddened and at zero velocity: counts need it reddened again")
-        titles = [text_at(one, key)[:80] for key in ("TARGNAME", "TARGETID", "OBJECT") for one in (primary, header)]
+            header_notes.append("dereddened and at zero velocity: counts need it reddened again")
+        titles = [text_at(keys, key)[:80] for key in ("TARGNAME", "TARGETID", "OBJECT") for keys in (primary, header)]
         # LAMOST DR5, "Data production description", section 1: fluxes are calibrated relatively.
         unscaled = "LAMOST calibrates fluxes relative to each other" if self.telescope.startswith("LAMOST") else ""
-        label = label or (str(number) if str(number) in self.asked else text_at(header, "EXTNAME") or str(number))
+        label = label or (str(number) if str(number) in self.words else text_at(header, "EXTNAME") or str(number))
         return SpectrumTable(
             columns, next(filter(None, titles), self.name), self.origin, label, FITS_UNITS,
-            remarks="\n".join(said)[:100_000] + remarks, headers=(primary, header), notes=(*own, *notes), group=group,
-            unscaled=unscaled, row_names=row_names,
+            remarks="\n".join(comments)[:100_000] + remarks, headers=(primary, header), notes=(*header_notes, *notes),
+            group=group, unscaled=unscaled, row_names=row_names,
         )  # fmt: skip
 
     def _columns(self, number: int) -> list[Values]:
-        found = [self.file.column(number, str(title)) for title in self.hdus[number].columns.names]
-        return [one for one in found if one is not None]
+        columns = [self.file.column(number, str(title)) for title in self.hdus[number].columns.names]
+        return [column for column in columns if column is not None]
 
     def _of_table(self, number: int) -> SpectrumTable:
         # The units of the file apply to columns that state none (SDSS).
         flux, wave = (unit_at(keys, self.primary, self.hdus[number].header) for keys in (FLUX_UNITS, WAVE_UNITS))
-        whole = dict.fromkeys(("flux", "model"), flux) | dict.fromkeys(AXES, wave)
+        units_by_kind = dict.fromkeys(("flux", "model"), flux) | dict.fromkeys(AXES, wave)
         columns = []
         for column in self._columns(number):
             role = role_of(column.name)
-            own = column.unit or role.unit
-            columns.append(column if own else replace(column, unit=whole.get(role.kind, "")))
-        return self._table(number, columns, remarks="\n" + " ".join(one.ucd for one in columns if one.ucd))
+            has_unit = column.unit or role.unit
+            columns.append(column if has_unit else replace(column, unit=units_by_kind.get(role.kind, "")))
+        return self._table(number, columns, remarks="\n" + " ".join(column.ucd for column in columns if column.ucd))
 
     def _may_hold_fluxes(self, number: int) -> bool:
         """Return whether an extension is an image that may contain fluxes."""
@@ -271,7 +275,7 @@ class _Reader:
         return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
 
     def _is_survey_image(self, header: Any) -> bool:
-        """Return whether an image holds a flux in its first row, and its errors and masks in others.
+        """Return whether the first row of an image is a flux, and others are its errors and masks.
 
         LAMOST (https://dr5.lamost.org/v3/doc/data-production-description) and SDSS-I/II
         (https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html) have such files.
@@ -286,16 +290,17 @@ class _Reader:
         """
         images = [k for k, hdu in enumerate(self.hdus) if getattr(hdu, "is_image", False)]
         named = {text_at(self.hdus[k].header, "EXTNAME").upper(): k for k in images}
-        found: list[SpectrumTable] = []
+        tables: list[SpectrumTable] = []
         for name, axis in named.items():
             if (match := _AXIS_NAME.fullmatch(name)) is None:
                 continue
             arm = match[1] or ""
-            fluxes = [named[one] for kind in _FLUX_NAMES if (one := f"{arm}_{kind}".lstrip("_")) in named]
+            titles = [f"{arm}_{kind}".lstrip("_") for kind in _FLUX_NAMES]
+            fluxes = [named[title] for title in titles if title in named]
             if not arm and not fluxes and name != "LAMBDA":
                 # An image of as many pixels without wavelengths of its own, such as the first of the file.
                 n = self.hdus[axis].header.get("NAXIS1")
-                alike = [k for k, one in enumerate(self.hdus) if one.header.get("NAXIS1") == n]
+                alike = [k for k, hdu in enumerate(self.hdus) if hdu.header.get("NAXIS1") == n]
                 fluxes = [k for k in alike if self._may_hold_fluxes(k) and "CRVAL1" not in self.hdus[k].header]
             if len(fluxes) == 1:
                 title = text_at(self.hdus[axis].header, "EXTNAME").removeprefix(f"{arm}_")
@@ -304,8 +309,8 @@ class _Reader:
                 rows = self.file.named("FIBERMAP/TARGETID")
                 names = () if rows is None else tuple(map(str, rows.cells.tolist()))
                 group = "arms" if arm else None
-                found.append(self._table(fluxes[0], columns, arm or "flux", row_names=names, group=group))
-        return found
+                tables.append(self._table(fluxes[0], columns, arm or "flux", row_names=names, group=group))
+        return tables
 
     def _of_image(self, number: int) -> SpectrumTable:
         hdu = self.hdus[number]
@@ -323,25 +328,25 @@ class _Reader:
         unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", unit_at(FLUX_UNITS, header, self.primary))
         light = Values.of("flux", flux, unit)
         if not {"CRVAL1", "COEFF0", "PS1_0", "WAT2_001"} & {*header, *self.primary}:
-            # The wavelengths may be the only column of a table that has one for each pixel.
-            held = [one for table in self.file.tables for one in self._columns(table)]
-            axes = [one for one in held if role_of(one.name).kind == "wavelength"]
-            if len(fit := [one for one in axes if np.prod(one.shape) == flux.shape[-1]]) == 1:
-                axis = Values.of(fit[0].name, fit[0].numbers().ravel(), fit[0].unit)
-                return self._table(number, [axis, light], notes=notes, row_names=names)
-        own, said = self.file.wavelengths(number)
-        columns = [replace(own, name="wavelength"), light]
-        return self._table(number, columns, remarks=f"\n{own.name}", notes=(*said, *notes), row_names=names)
+            # The wavelengths may be the only column of a table with one row for each pixel.
+            columns = [column for table in self.file.tables for column in self._columns(table)]
+            axes = [column for column in columns if role_of(column.name).kind == "wavelength"]
+            if len(fit := [axis for axis in axes if np.prod(axis.shape) == flux.shape[-1]]) == 1:
+                wave = Values.of(fit[0].name, fit[0].numbers().ravel(), fit[0].unit)
+                return self._table(number, [wave, light], notes=notes, row_names=names)
+        wave, remarks = self.file.wavelengths(number)
+        columns = [replace(wave, name="wavelength"), light]
+        return self._table(number, columns, remarks=f"\n{wave.name}", notes=(*remarks, *notes), row_names=names)
 
     def _rows(self, hdu: Any) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
         """Return the fluxes of an image, the names of its rows if it has several, and a note.
 
-        Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, if no part is asked for.
+        Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless a part is selected.
         """
         header = hdu.header
         shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
         if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
-            fault = f"it holds an image of {' x '.join(map(str, shape))} pixels"
+            fault = f"it contains an image of {' x '.join(map(str, shape))} pixels"
             raise InputError(f"{fault}; use a spectrum of one dimension, rows of spectra, or a table", key="table")
         flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
         if len(flux) == 1:
@@ -349,7 +354,7 @@ class _Reader:
         if self._is_survey_image(header):
             return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
         bands = shape[2] if len(shape) > 2 else shape[1]
-        if not self.asked and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
+        if not self.words and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
             return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)
         return flux, tuple(text_at(header, f"BANDID{k + 1}") for k in range(len(flux))), ()
 
@@ -393,52 +398,54 @@ def read_spectrum(
     state their units. Given units override those of the file; one of wavelength may end in " air" or " vacuum". With
     `ignore_checksum`, a FITS file is read that its CHECKSUM or DATASUM contradicts.
     """
-    place, asked = without_columns(path)
-    check_size(place, "spectrum file")
-    shown = place.name if len(place.name) <= 80 else shortened(place.name)
+    file, words = without_columns(path)
+    check_size(file, "spectrum file")
+    title = file.name if len(file.name) <= 80 else shortened(file.name)
     try:
         # Overflows become infinities, which the check of points rejects.
         with (
             parsing("it", "give a spectrum"),
-            open_content(place, "it", "spectrum file") as (form, content),
+            open_content(file, "it", "spectrum file") as (form, content),
             np.errstate(all="ignore"),
         ):
             # The name without the extensions of compression and format.
-            name = re.sub(r"\.(gz|bz2|xz)$", "", place.name, flags=re.I).rsplit(".", 1)[0][:80] or place.name
-            origin = f"file {shown}"
+            name = re.sub(r"\.(gz|bz2|xz)$", "", file.name, flags=re.I).rsplit(".", 1)[0][:80] or file.name
+            origin = f"file {title}"
             if form == "FITS":
                 hdus = open_fits(content, check=not ignore_checksum)
                 with reading("it", WHOLE):
-                    tables = _Reader(hdus, name, origin, asked).tables()
+                    tables = _Reader(hdus, name, origin, words).tables()
             elif form == "VOTable":
-                tables = [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
-                          for number, one in enumerate(votables(content.read(), "it"), 1)]  # fmt: skip
+                tables = []
+                for number, table in enumerate(votables(content.read(), "it"), 1):
+                    label = table.header.get("name") or table.header.get("ID") or number
+                    tables.append(_in_memory(table, name, origin, str(label)))
             else:
                 text = text_in(form, content.read(), "it")
                 if form == "ECSV" or text_tables.is_described(text):
                     table = MemoryTable(text_tables.text_table(text, "it", commas=False), "it")
-                    own = table.header.get("name")
-                    name = own.strip()[:80] if isinstance(own, str) and own.strip() else name
+                    header_name = table.header.get("name")
+                    name = (header_name.strip()[:80] if isinstance(header_name, str) else "") or name
                     tables = [_in_memory(table, name, origin)]
                 else:
                     no_units = wavelength_unit is None, flux_unit is None
-                    tables = [table_of_text(text, name, f"text {origin}", asked, *no_units)]
-            return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
+                    tables = [table_of_text(text, name, f"text {origin}", words, *no_units)]
+            return converted(spectrum_in(tables, words), wavelength_unit, flux_unit)
     except InputError as error:
-        raise error.within(shown) from error
+        raise error.within(title) from error
 
 
 def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> SpectrumTable:
     """Return the table of an ECSV file or a VOTable."""
-    columns = [file.find(one) for one in file.names]
-    said = [f"{one.ucd} {one.description}" for one in columns]
+    columns = [file.find(title) for title in file.names]
+    remarks = [*_texts(file.header.get("comments")), *(f"{column.ucd} {column.description}" for column in columns)]
     return SpectrumTable(
-        columns, name, origin, label, remarks="\n".join((*_texts(file.header.get("comments")), *said))[:MAX_REMARKS],
+        columns, name, origin, label, remarks="\n".join(remarks)[:MAX_REMARKS],
         headers=(file.header,), messages=_texts(file.header.get("told")),
     )  # fmt: skip
 
 
-def _texts(given: Any) -> tuple[str, ...]:
+def _texts(entry: Any) -> tuple[str, ...]:
     """Return the short texts of a list; an empty tuple for anything else."""
-    held = given[:MAX_NOTES] if isinstance(given, list) else ()
-    return tuple(one for one in held if isinstance(one, str) and len(one) <= MAX_NOTE_LENGTH)
+    texts = entry[:MAX_NOTES] if isinstance(entry, list) else ()
+    return tuple(text for text in texts if isinstance(text, str) and len(text) <= MAX_NOTE_LENGTH)

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 
-#: Names by which they are offered.
+#: Examples of formulas, by name.
 EXAMPLES = ("blackbody 9000 K", "power law -2")
-#: Indices of power laws that are accepted; steeper spectra say nothing of stars (assumed).
+#: Accepted indices of power laws; steeper spectra are no approximation of stars (assumed).
 INDEX = Range(-10, 10)
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _NAME = re.compile(
@@ -42,7 +42,7 @@ _NAME = re.compile(
 class ModelStar:
     """Blackbody of a temperature, or else power law of an index."""
 
-    name: str  # which gives this star again
+    name: str  # by which the star is found again
     origin: str  # formula of the spectrum
     temperature_k: float | None
     index: float = 0.0
@@ -66,19 +66,19 @@ def folder() -> Path:
     """Return the folder of kept stars, below ``MAUVECL_DATA_DIR`` or the user's data folder."""
     import platformdirs
 
-    given = os.environ.get("MAUVECL_DATA_DIR")
-    return (Path(given) if given else platformdirs.user_data_path("mauvecl")) / "stars"
+    directory = os.environ.get("MAUVECL_DATA_DIR")
+    return (Path(directory) if directory else platformdirs.user_data_path("mauvecl")) / "stars"
 
 
-def kept() -> list[OwnStar]:
+def user_stars() -> list[OwnStar]:
     """Return all kept stars, sorted by file name."""
     return [star for path in sorted(folder().glob("*.ecsv")) if (star := _described(path)) is not None]
 
 
 def find(name: str) -> OwnStar | None:
     """Return a kept star by name in any case, or None."""
-    wanted = name.strip().casefold()
-    return next((star for star in kept() if star.name.casefold() == wanted), None)
+    key = name.strip().casefold()
+    return next((star for star in user_stars() if star.name.casefold() == key), None)
 
 
 def _described(path: Path) -> OwnStar | None:
@@ -94,18 +94,19 @@ def _described(path: Path) -> OwnStar | None:
 
 def remove(name: str) -> None:
     """Delete a kept star; raises InputError for an unknown name."""
-    wanted = name.strip().casefold()
-    # A damaged file has no name but that of the file; whole ones have precedence.
-    stem, found = re.sub(r"[^a-z0-9.+-]", "_", wanted), []
+    key = name.strip().casefold()
+    # A damaged file has no name but that of the file; undamaged ones have precedence.
+    stem, matches = re.sub(r"[^a-z0-9.+-]", "_", key), []
     for path in folder().glob("*.ecsv"):
         star = None
         with contextlib.suppress(InputError):
             star = _described(path)
-        if (path.stem.casefold() == stem) if star is None else (star.name.casefold() == wanted):
-            found.append((star is None, path))
-    if not found:
-        raise InputError.of("name", name, f"one of: {', '.join(star.name for star in kept()) or 'no star is kept'}")
-    min(found)[1].unlink()
+        if (path.stem.casefold() == stem) if star is None else (star.name.casefold() == key):
+            matches.append((star is None, path))
+    if not matches:
+        names = ", ".join(star.name for star in user_stars())
+        raise InputError.of("name", name, f"one of: {names or 'no star is kept'}")
+    min(matches)[1].unlink()
 
 
 #: Abbreviations of Greek letters in catalogues.
@@ -118,7 +119,7 @@ class WellKnown:
     """Star of the embedded list."""
 
     name: str
-    others: tuple[str, ...]  # its other names
+    other_names: tuple[str, ...]
     ra_deg: float  # ICRS, as the declination
     dec_deg: float
     distance_pc: float
@@ -151,16 +152,16 @@ def well_known_stars() -> tuple[WellKnown, ...]:
     """Return the stars of the list."""
     stars = []
     for row in _rows("well_known.ecsv"):
-        others = tuple(name.strip() for name in row["other_names"].split(","))
+        other_names = tuple(name.strip() for name in row["other_names"].split(","))
         ra, dec, distance, v = (float(row[key]) for key in ("ra", "dec", "distance", "V"))
-        stars.append(WellKnown(row["name"], others, ra, dec, distance, v, row["spectral_type"], row["source"]))
+        stars.append(WellKnown(row["name"], other_names, ra, dec, distance, v, row["spectral_type"], row["source"]))
     return tuple(stars)
 
 
 @cache
 def by_key() -> Mapping[str, WellKnown]:
     """Return every star by each of its normalised names."""
-    return {name_key(name): star for star in well_known_stars() for name in (star.name, *star.others)}
+    return {name_key(name): star for star in well_known_stars() for name in (star.name, *star.other_names)}
 
 
 def name_key(name: str) -> str:
@@ -183,20 +184,20 @@ def _keys() -> dict[str, str]:
     keys: dict[str, str] = {}
     for key, entry in _index().items():
         keys[name_key(key)] = key
-        for other in (entry["alias"], entry["star"]):
-            keys.setdefault(name_key(other), key)
+        for alias in (entry["alias"], entry["star"]):
+            keys.setdefault(name_key(alias), key)
     keys.pop("", None)
     return keys
 
 
 def library_names() -> list[str]:
     """Return the distinct names of all embedded spectra: types, aliases and stars."""
-    each = [entry[column] for entry in _index().values() for column in ("name", "alias", "star")]
-    # A collection's name in front of a type says nothing that the type does not.
-    return [name for name in dict.fromkeys(each) if name and not name.startswith("Pickles ")]
+    names = [entry[column] for entry in _index().values() for column in ("name", "alias", "star")]
+    # The name of the collection before a type adds no information.
+    return [name for name in dict.fromkeys(names) if name and not name.startswith("Pickles ")]
 
 
-#: Columns of the table of embedded spectra as people read it.
+#: Columns of the printed table of embedded spectra.
 COLUMNS = (
     Column("name", heading="name"),
     Column("alias", heading="also"),
@@ -207,12 +208,12 @@ COLUMNS = (
         "uv_quality",
         heading="UV at 190-210, 240-260, 290-310 nm",
         # The ratios in "190-210: 0.1 (S/N 5), ...; ...".
-        format=lambda text: ", ".join(part.split()[0] for part in text.split("; ")[0].split(": ")[1].split(", ")),
+        format=lambda text: ", ".join(ratio.split()[0] for ratio in text.split("; ")[0].split(": ")[1].split(", ")),
     ),
     Column("noisy_below_nm", heading="noisy below", format=lambda below: f"{below} nm" if below else ""),
     Column("licence", heading="licence"),
 )
-#: Columns of that of the user's own.
+#: Columns of the table of the user's own stars.
 OWN_COLUMNS = (
     Column("name", heading="name"),
     Column("origin", heading="origin"),
@@ -231,19 +232,19 @@ def library_table() -> Table:
     table = Table.read(library_text("index.ecsv"), format="ascii.ecsv")
     table.remove_columns(["file", "source_file"])
     table["kept"] = "embedded"
-    own = [
+    rows = [
         {"name": star.name, "star": star.name, "origin": star.origin, "treatment": "; ".join(star.notes),
-         "kept": "yours"} for star in kept()
+         "kept": "yours"} for star in user_stars()
     ]  # fmt: skip
-    # Empty text of the file, and what is not known of own stars, is masked.
-    return vstack([table, Table(own)] if own else [table]).filled("")
+    # Empty texts of the file, and unknown values of the user's stars, are masked.
+    return vstack([table, Table(rows)] if rows else [table]).filled("")
 
 
 def embedded(name: str) -> dict[str, str] | None:
     """Return the index entry of a spectrum by name (of a type also as "M3" for M3V), alias or star, or None."""
     key = name_key(name)
-    found = _keys().get(key) or _keys().get(f"{key}v")
-    return None if found is None else _index()[found]
+    entry = _keys().get(key) or _keys().get(f"{key}v")
+    return None if entry is None else _index()[entry]
 
 
 @lru_cache(8)
@@ -267,9 +268,9 @@ def subtype(spectral_type: str) -> float:
 
 def nearest_spectrum(spectral_type: str) -> str:
     """Return the name of the embedded spectrum of the nearest type; the first in the library if there are several."""
-    wanted = subtype(spectral_type)
+    number = subtype(spectral_type)
     typed = [entry for entry in _index().values() if _TYPE.match(entry["spectral_type"])]
-    return min(typed, key=lambda entry: abs(subtype(entry["spectral_type"]) - wanted))["name"]
+    return min(typed, key=lambda entry: abs(subtype(entry["spectral_type"]) - number))["name"]
 
 
 @dataclass(frozen=True)
@@ -277,8 +278,8 @@ class NamedStar:
     """Star or spectral type that was found by name."""
 
     name: str
-    known: WellKnown | None = None  # its entry in the list of well-known stars
-    # Its own spectrum, if any: a formula, a star of the user, or an entry of the library's index.
+    entry: WellKnown | None = None  # its entry in the list of well-known stars
+    # Its spectrum, if it has one: a formula, a star of the user, or an entry of the library's index.
     light: ModelStar | OwnStar | Mapping[str, str] | None = None
 
     @property
@@ -286,7 +287,7 @@ class NamedStar:
         """Name of its own spectrum, or of that of the nearest type in the library."""
         if self.light is not None:
             return self.light["name"] if isinstance(self.light, Mapping) else self.light.name
-        return nearest_spectrum(self.name if self.known is None else self.known.spectral_type)
+        return nearest_spectrum(self.name if self.entry is None else self.entry.spectral_type)
 
 
 def resolve(text: str, *, own: bool = True) -> NamedStar | None:
@@ -305,16 +306,16 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
             model = ModelStar(f"power law {index:.15g}", origin, None, index)
         return NamedStar(model.name, light=model)
     star = by_key().get(name_key(text))
-    # The library may have the star under another of its names.
-    entries = map(embedded, (text,) if star is None else (text, star.name, *star.others))
+    # The library may list the star under another of its names.
+    entries = map(embedded, (text,) if star is None else (text, star.name, *star.other_names))
     light = next(filter(None, entries), None) or (find(text) if own else None)
     if star is not None:
         return NamedStar(star.name, star, light)
     if light is not None:
         return NamedStar(light["name"] if isinstance(light, Mapping) else light.name, light=light)
     # Types of dwarfs and subgiants, such as "m3.5" for M3.5V.
-    found = re.fullmatch(rf"d?([{CLASSES}])(\d(?:\.\d+)?)(IV|V)?", "".join(text.split()), flags=re.IGNORECASE)
-    return None if found is None else NamedStar(f"{found[1]}{found[2]}{found[3] or 'V'}".upper())
+    match = re.fullmatch(rf"d?([{CLASSES}])(\d(?:\.\d+)?)(IV|V)?", "".join(text.split()), flags=re.IGNORECASE)
+    return None if match is None else NamedStar(f"{match[1]}{match[2]}{match[3] or 'V'}".upper())
 
 
 def named_star(text: str, key: str = "star", *, own: bool = True) -> NamedStar:
@@ -343,14 +344,14 @@ def listed_note(name: str, **used: float | None) -> str:
         return ""
     texts = []
     if star.light is None:
-        wanted = star.name if star.known is None else star.known.spectral_type
-        exact = star.nearest == wanted
-        texts.append(f"spectrum of {f'type {wanted}' if exact else f'{star.nearest}, the nearest to type {wanted}'}")
-    elif star.known is not None:
+        kind = star.name if star.entry is None else star.entry.spectral_type
+        exact = star.nearest == kind
+        texts.append(f"spectrum of {f'type {kind}' if exact else f'{star.nearest}, the nearest to type {kind}'}")
+    elif star.entry is not None:
         texts.append(f"as {star.name}")
     listed = {key: value for key, value in listed_values(name).items() if used.get(key) == value}
     texts += [f"V = {value:g}" if key == "magnitude" else f"{value:g} pc" for key, value in listed.items()]
-    source = f", from {star.known.source.partition(',')[0]}" if star.known is not None and listed else ""
+    source = f", from {star.entry.source.partition(',')[0]}" if star.entry is not None and listed else ""
     return ", ".join(texts) + source if listed or star.light is None else ""
 
 
@@ -364,7 +365,7 @@ def near_names(text: str, *, stars_only: bool = False) -> list[str]:
     names = {key: star.name for key, star in by_key().items()}
     if not stars_only:
         names |= {name_key(name): name for name in library_names()}
-        names |= {name_key(star.name): star.name for star in kept()}
+        names |= {name_key(star.name): star.name for star in user_stars()}
     near = difflib.get_close_matches(name_key(text), names, n=4, cutoff=0.5)
     return list(dict.fromkeys(names[key] for key in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)
 
@@ -385,8 +386,8 @@ ALIASES = {
 
 def known_band(name: str) -> str:
     """Return the name of a band, given its name or alias in any case."""
-    wanted = name.strip().casefold()
-    for band, others in ALIASES.items():
-        if wanted in (band.casefold(), *(other.casefold() for other in others)):
+    key = name.strip().casefold()
+    for band, aliases in ALIASES.items():
+        if key in map(str.casefold, (band, *aliases)):
             return band
     raise InputError.of("band", name, f"one of {', '.join(ALIASES)}")

@@ -18,7 +18,7 @@ from mauvecl.host.arrays import ContentEquality, Float, set_read_only
 from mauvecl.host.stars import library
 from mauvecl.host.stars import spectrum as points
 from mauvecl.host.stars.flare import Blackbody, FlareSpectrum, Geometry, blackbody, with_flare
-from mauvecl.host.stars.spectrum import NEEDED_NM, SPAN_NM
+from mauvecl.host.stars.spectrum import FLUX_UNIT, NEEDED_NM, SPAN_NM
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Drawable
 from mauvecl.schema.errors import InputError, missing_package
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     from mauvecl.host.stars.conversion import ReadSpectrum
 
-#: Unit of flux densities.
-FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)
 #: V of the brightest star, Sirius (-1.46, Bessell 1990), and of the Sun (-26.76, Willmer 2018), with margins.
 BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 #: First and last wavelength of formulas, nm, and number of points. They cover all bands; straight lines between them
@@ -43,7 +41,7 @@ PIVOT_NM = 550.0
 @validated
 @dataclass(frozen=True, eq=False)
 class Source(Drawable, ContentEquality):
-    """A stellar spectrum at the telescope; raises InputError if the arrays do not hold one.
+    """A stellar spectrum at the telescope; raises InputError if the arrays are not one.
 
     Examples
     --------
@@ -102,12 +100,12 @@ class Source(Drawable, ContentEquality):
             return cls(nm, flux, light.name, light.origin, unscaled=level, temperature_k=light.temperature_k)
         if isinstance(light, library.OwnStar):
             nm, flux = (np.asarray(light.table[key], np.float64) for key in ("wavelength", "flux"))
-            own = cls(nm, flux, light.name, light.origin, light.notes, messages=light.messages,
-                      measured_nm=light.measured_nm, unscaled=light.unscaled)  # fmt: skip
-            if own.digest != light.table.meta["spectrum_sha256"]:
+            source = cls(nm, flux, light.name, light.origin, light.notes, messages=light.messages,
+                         measured_nm=light.measured_nm, unscaled=light.unscaled)  # fmt: skip
+            if source.digest != light.table.meta["spectrum_sha256"]:
                 fault = f"kept star {light.name!r} must be unchanged, but its digest differs: add or fetch it again"
                 raise InputError(fault, key="name")
-            return own
+            return source
         table, noisy = library.spectrum_table(light["file"]), light["noisy_below_nm"]
         limit = f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit"
         quality = f"library spectrum {light['name']} is {light['star']}; {light['uv_quality']}"
@@ -131,7 +129,7 @@ class Source(Drawable, ContentEquality):
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
         `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
-        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or holds no usable
+        180-750 nm are continued at their level. Raises InputError if the file is missing, unreadable or has no usable
         spectrum, or less than a third of 200-700 nm.
 
         Parameters
@@ -150,7 +148,7 @@ class Source(Drawable, ContentEquality):
         read = read_spectrum(
             Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit, ignore_checksum=ignore_checksum
         )
-        star = cls._made(read, extend)
+        star = cls._of_points(read, extend)
         with contextlib.suppress(InputError):
             v = star.magnitude("V")
             if not star.unscaled and v <= BRIGHTEST_V and not SUN_V[0] < v < SUN_V[1]:
@@ -158,31 +156,29 @@ class Source(Drawable, ContentEquality):
         return star
 
     @classmethod
-    def _made(cls, given: ReadSpectrum, extend: str | Source | None) -> Self:
+    def _of_points(cls, read: ReadSpectrum, extend: str | Source | None) -> Self:
         """Check a user's spectrum, drop undefined ends, continue others, and make it a source."""
-        name, wavelength, flux = given.name, given.wavelength_nm, given.flux_flam
+        name, wavelength, flux, messages = read.name, read.wavelength_nm, read.flux_flam, read.messages
         points.check_points(name, wavelength, flux)
-        points.check_measured(name, wavelength, given.axis_unit or "nm")
+        points.check_measured(name, wavelength, read.axis_unit or "nm")
         wavelength, flux, cut = points.without_undefined_ends(name, wavelength, flux)
-        messages = given.messages
-        if given.axis_unit or extend is not None:
-            part = points.measured_part(wavelength)
-            share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+        if read.axis_unit or extend is not None:
+            covered = points.measured_part(wavelength)
+            share = "" if covered > 1 - 1e-9 else f", {covered:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
             messages += (f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}",)
         messages += points.remarks(wavelength, flux)
         if extend is not None:
-            other = cls.from_library(extend) if isinstance(extend, str) else extend
-            ultraviolet = other.messages if isinstance(extend, str) else ()
-            wavelength, flux, added = points.extended(
-                name, wavelength, flux, (other.name, other.wavelength_nm, other.flux_flam), ultraviolet=ultraviolet
-            )
+            longer = cls.from_library(extend) if isinstance(extend, str) else extend
+            ultraviolet = longer.messages if isinstance(extend, str) else ()
+            extension = longer.name, longer.wavelength_nm, longer.flux_flam
+            wavelength, flux, added = points.extended(name, wavelength, flux, extension, ultraviolet=ultraviolet)
             messages += added
         points.check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
         wavelength, flux, added = points.continued(name, wavelength, flux, dark_only=True)
         return cls(
-            wavelength, flux, name, given.origin, (*given.notes, *cut), messages=(*messages, *added),
-            measured_nm=measured if added else None, unscaled=given.unscaled,
+            wavelength, flux, name, read.origin, (*read.notes, *cut), messages=(*messages, *added),
+            measured_nm=measured if added else None, unscaled=read.unscaled,
         )  # fmt: skip
 
     def binned(self, width_nm: BinWidth) -> Self:
@@ -212,8 +208,8 @@ class Source(Drawable, ContentEquality):
 
         try:
             nm, values = (
-                given if isinstance(given, u.Quantity) else np.asarray(given) * unit
-                for given, unit in ((wavelength, u.nm), (flux, FLUX_UNIT))
+                array if isinstance(array, u.Quantity) else np.asarray(array) * unit
+                for array, unit in ((wavelength, u.nm), (flux, FLUX_UNIT))
             )
             nm = nm.to(u.nm, u.spectral())
             values = values.to(FLUX_UNIT, u.spectral_density(nm))
@@ -223,7 +219,7 @@ class Source(Drawable, ContentEquality):
         if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
             # Rising frequencies or energies are falling wavelengths.
             axis, density = axis[::-1], density[::-1]
-        return cls._made(ReadSpectrum(np.asarray(axis, float), np.asarray(density, float), name, origin), extend)
+        return cls._of_points(ReadSpectrum(np.asarray(axis, float), np.asarray(density, float), name, origin), extend)
 
     @classmethod
     def from_synphot(cls, spectrum: Any, *, name: str = "synphot spectrum") -> Self:
@@ -232,11 +228,11 @@ class Source(Drawable, ContentEquality):
 
         if not hasattr(spectrum, "waveset"):
             raise InputError.of("spectrum", spectrum, "a SourceSpectrum of synphot")
-        own = spectrum.waveset
-        if own is None:
+        waveset = spectrum.waveset
+        if waveset is None:
             raise InputError(f"{name} defines no wavelengths; use a spectrum with a waveset", key="spectrum")
         # A point of the grid within 1e-3 nm of one of the spectrum's own adds no information.
-        grid = points.supplemented(np.unique(own.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
+        grid = points.supplemented(np.unique(waveset.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
         flux = spectrum(grid * u.nm, flux_unit=FLAM).value
         return cls.from_arrays(grid, flux, name=name, origin=f"synphot {type(spectrum).__name__}")
 
@@ -389,6 +385,6 @@ def listed_star(name: str) -> Source:
 
 def with_listed_note(source: Source, name: str, **used: float | None) -> Source:
     """Return a source with a message on the values of the embedded list that are used; see `listed_note`."""
-    others = (text for text in source.messages if text != library.listed_note(name))
+    messages = [text for text in source.messages if text != library.listed_note(name)]
     note = library.listed_note(name, **used)
-    return replace(source, messages=(*([note] if note else []), *others))
+    return replace(source, messages=(note, *messages) if note else tuple(messages))

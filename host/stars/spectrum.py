@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 System = Literal["catalogue", "vega", "ab"]
 #: Fraction of a band's throughput that a spectrum must cover.
 COVERAGE = 0.99
+#: Unit of flux densities.
+FLUX_UNIT = u.erg / (u.s * u.cm**2 * u.AA)
 #: Angstrom per nanometre, with astropy's rounding.
 ANGSTROM = float(u.nm.to(u.AA))
 #: h c in erg Angstrom, with astropy's rounding.
@@ -49,10 +51,10 @@ def band(name: str) -> Numbers:
 
 def scale(name: str, system: System = "catalogue") -> str:
     """Return a sentence that explains the magnitudes of a system in a band."""
-    told = band(name).meta
-    meaning = "AB" if told["system"] == "AB" else f"Vega has {told['vega']:g}"
+    meta = band(name).meta
+    meaning = "AB" if meta["system"] == "AB" else f"Vega has {meta['vega']:g}"
     meanings = {"vega": "have Vega at 0, unlike catalogues'", "ab": "are AB"}
-    return f"Magnitudes in {told['name']} {meanings.get(system, f'are as in catalogues: {meaning}')}."
+    return f"Magnitudes in {meta['name']} {meanings.get(system, f'are as in catalogues: {meaning}')}."
 
 
 @array_cache(256)
@@ -90,12 +92,12 @@ def _covered(wavelength_nm: Float, name: str) -> Numbers:
     """Return a band; raises InputError if the spectrum does not cover it."""
     chosen = band(name)
     inside = (chosen["wavelength"] >= wavelength_nm[0]) & (chosen["wavelength"] <= wavelength_nm[-1])
-    seen, whole = np.trapezoid([chosen["throughput"] * inside, chosen["throughput"]], chosen["wavelength"])
-    share = seen / whole
+    covered, total = np.trapezoid([chosen["throughput"] * inside, chosen["throughput"]], chosen["wavelength"])
+    share = covered / total
     if share < COVERAGE:
-        band_nm, own_nm = (f"({nm[0]:.0f}-{nm[-1]:.0f} nm)" for nm in (chosen["wavelength"], wavelength_nm))
+        band_nm, star_nm = (f"({nm[0]:.0f}-{nm[-1]:.0f} nm)" for nm in (chosen["wavelength"], wavelength_nm))
         needed = f"{COVERAGE:.0%} of the band {chosen.meta['name']} {band_nm}"
-        raise InputError(f"the spectrum must cover {needed}, but covers {share:.0%} {own_nm}", key="band")
+        raise InputError(f"the spectrum must cover {needed}, but covers {share:.0%} {star_nm}", key="band")
     return chosen
 
 
@@ -106,8 +108,8 @@ def _photon_density(wavelength_nm: Float, flux_flam: Float, chosen: Numbers) -> 
     """
     at = wavelength_nm * ANGSTROM
     light = flux_flam * at / HC
-    seen = chosen["wavelength"][chosen["throughput"] > 0.0] * ANGSTROM
-    if at[0] <= seen[0] and seen[-1] <= at[-1]:
+    transmitted = chosen["wavelength"][chosen["throughput"] > 0.0] * ANGSTROM
+    if at[0] <= transmitted[0] and transmitted[-1] <= at[-1]:
         return at, light
     before, after = at[0] ** 2 / at[1], at[-1] ** 2 / at[-2]
     return np.array([before, *at, after]), np.array([0.0, *light, 0.0])
@@ -141,9 +143,7 @@ _USUAL_UNITS = {"nm": 1.0, "Angstrom": 0.1, "um": 1000.0}
 
 
 def measured_part(nm: Float) -> float:
-    """Return the fraction of `NEEDED_NM` that wavelengths cover, without gaps."""
-    if nm.size < 2:
-        return 0.0
+    """Return the fraction of `NEEDED_NM` that at least two wavelengths cover, without gaps."""
     steps = np.diff(np.clip(nm, *NEEDED_NM))[~is_gap(np.diff(nm))]
     return float(steps.sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
 
@@ -154,17 +154,13 @@ def is_gap(steps: Float) -> Bool:
     return wide
 
 
-def _part(low: float, high: float) -> float:
-    shared = min(high, NEEDED_NM[1]) - max(low, NEEDED_NM[0])
-    return max(0.0, shared / (NEEDED_NM[1] - NEEDED_NM[0]))
-
-
 def likely_unit(low: float, high: float, unit: str) -> str | None:
     """Return the only unit other than `unit` in which the numbers cover the required range, or None."""
-    parts = {other: _part(low * factor, high * factor) for other, factor in _USUAL_UNITS.items() if other != unit}
-    fitting = [other for other, part in parts.items() if part >= MIN_MEASURED and low > 0.0]
+    ends = np.array([low, high])
+    shares = {name: measured_part(ends * factor) for name, factor in _USUAL_UNITS.items() if name != unit}
+    fitting = [name for name, share in shares.items() if share >= MIN_MEASURED and low > 0.0]
     # Short ultraviolet spectra cover part of the range in Angstrom, but would start in the infrared in nm.
-    if not fitting and parts.get("Angstrom", 0.0) > 0.0 and low > 900.0:
+    if not fitting and shares.get("Angstrom", 0.0) > 0.0 and low > 900.0:
         fitting = ["Angstrom"]
     return fitting[0] if len(fitting) == 1 else None
 
@@ -172,20 +168,20 @@ def likely_unit(low: float, high: float, unit: str) -> str | None:
 def check_assumed_unit(values: Float, unit: str) -> None:
     """Raise InputError if another unit of the wavelengths is as likely as the assumed one."""
     finite = values[np.isfinite(values)]
-    factor = _USUAL_UNITS.get(unit)
-    if not finite.size or factor is None:
+    if not finite.size or unit not in _USUAL_UNITS:
         return
-    low, high = float(finite.min()), float(finite.max())
-    own, other = _part(low * factor, high * factor), likely_unit(low, high, unit)
-    elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
+    ends, factor = np.array([finite.min(), finite.max()]), _USUAL_UNITS[unit]
+    low, high = ends
+    covered, likely = measured_part(ends * factor), likely_unit(low, high, unit)
+    in_likely = 0.0 if likely is None else measured_part(ends * _USUAL_UNITS[likely])
     fault = f"wavelengths from {low:g} to {high:g} without a stated unit"
     needed, remedy = f"of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "give their unit: `wavelength_unit"
-    if other is not None and (own < MIN_MEASURED or elsewhere >= max(own, 1.0 - 1e-9)):
-        fault += f" look like {other}, in which they cover {elsewhere:.0%} {needed}, and {own:.0%} in {unit}"
-        also = f" or `wavelength_unit={unit!r}`" if own >= MIN_MEASURED else ""
-        raise InputError(f"{fault}; {remedy}={other!r}`{also}", key="wavelength_unit")
-    if own < MIN_MEASURED:
-        fault += f" cover {own:.0%} {needed}, not at least a third, in {unit}"
+    if likely is not None and (covered < MIN_MEASURED or in_likely >= max(covered, 1.0 - 1e-9)):
+        fault += f" look like {likely}, in which they cover {in_likely:.0%} {needed}, and {covered:.0%} in {unit}"
+        alternative = f" or `wavelength_unit={unit!r}`" if covered >= MIN_MEASURED else ""
+        raise InputError(f"{fault}; {remedy}={likely!r}`{alternative}", key="wavelength_unit")
+    if covered < MIN_MEASURED:
+        fault += f" cover {covered:.0%} {needed}, not at least a third, in {unit}"
     elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
         fault += f" extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}"
     else:
@@ -233,13 +229,13 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
 
 def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     """Raise InputError if a spectrum itself covers less than a third of 200-700 nm; `unit` is that of its file."""
-    part = measured_part(wavelength)
-    if part >= MIN_MEASURED - 1e-9:
+    covered = measured_part(wavelength)
+    if covered >= MIN_MEASURED - 1e-9:
         return
     low, high = float(wavelength[0]), float(wavelength[-1])
     likely = likely_unit(low, high, "nm") if unit == "nm" else None
     meant = f"; as numbers these look like {likely}: `wavelength_unit={likely!r}`" if likely else ""
-    fault = f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+    fault = f"spectrum {name} covers {low:g}-{high:g} nm, {covered:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
     raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
@@ -271,8 +267,8 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
         fault = f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A"
         raise InputError(f"{fault}, but fluxes must reach {FAINTEST:g} and not exceed {BRIGHTEST:g}", key="flux")
     if most <= 0.0:
-        what = "every flux is zero" if not flux.any() else f"the highest flux there is {most:g}"
-        raise InputError(f"spectrum {name} must have light in 200-700 nm, but {what}", key="flux")
+        reason = "every flux is zero" if not flux.any() else f"the highest flux there is {most:g}"
+        raise InputError(f"spectrum {name} must have light in 200-700 nm, but {reason}", key="flux")
     if least < -most:
         at = wavelength[inside][int(np.argmin(flux[inside]))]
         fault = f"flux {least:g} at {at:g} nm must not lie farther below zero than any in 200-700 nm lies above"
@@ -292,18 +288,16 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
             f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; `bin_nm` bins it"
         )
     # Runs of at least three zeros are not measurements.
-    runs = [
-        (a, b)
-        for a, b in true_runs(values == 0.0)
-        if b - a >= 3 and nm[b - 1] >= NEEDED_NM[0] and nm[a] <= NEEDED_NM[1]
-    ]
-    if runs:
-        where = ", ".join(f"{nm[a]:.1f}-{nm[b - 1]:.1f}" for a, b in runs[:3])
+    first, stop = true_runs(values == 0.0).T
+    runs = zip(nm[first], nm[stop - 1], stop - first, strict=True)
+    dark = [(low, high) for low, high, n in runs if n >= 3 and high >= NEEDED_NM[0] and low <= NEEDED_NM[1]]
+    if dark:
+        where = ", ".join(f"{low:.1f}-{high:.1f}" for low, high in dark[:3])
         messages.append(f"its flux is exactly zero at {where} nm: no data, or no light")
     steps = np.diff(nm)
     if steps.size and (wide := is_gap(steps)).any():
         i = int(np.argmax(np.where(wide, steps, 0.0)))
-        messages.append(f"it has no point between {nm[i]:.1f} and {nm[i + 1]:.1f} nm, where a straight line is taken")
+        messages.append(f"it has no point between {nm[i]:.1f} and {nm[i + 1]:.1f} nm, where its flux is interpolated")
     return tuple(messages)
 
 
@@ -360,12 +354,12 @@ def attached(values: Float, more: Float | float, before: bool) -> Float:
     return np.append(more, values) if before else np.append(values, more)
 
 
-def supplemented(nm: Float, others: Float, apart_nm: float) -> Float:
-    """Return wavelengths supplemented by those others within their range that are not next to one of them."""
-    inside = others[(others > nm[0]) & (others < nm[-1])]
+def supplemented(nm: Float, more_nm: Float, apart_nm: float) -> Float:
+    """Return wavelengths supplemented by more within their range that are not next to one of them."""
+    inside = more_nm[(more_nm > nm[0]) & (more_nm < nm[-1])]
     after = np.searchsorted(nm, inside)
-    alone = np.minimum(nm[after] - inside, inside - nm[after - 1]) > apart_nm
-    return np.union1d(nm, inside[alone]) if alone.any() else nm
+    is_new = np.minimum(nm[after] - inside, inside - nm[after - 1]) > apart_nm
+    return np.union1d(nm, inside[is_new]) if is_new.any() else nm
 
 
 def means(wavelength: Float, flux: Float, edges: Float) -> Float:
@@ -378,14 +372,14 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, other: tuple[str, Float, Float], *, ultraviolet: tuple[str, ...] = ()
+    name: str, wavelength: Float, flux: Float, extension: tuple[str, Float, Float], *, ultraviolet: tuple[str, ...] = ()
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
 
-    The messages on the ultraviolet of the other spectrum are returned if it continues the spectrum to the blue. Raises
+    The messages on the ultraviolet of the extension are returned if it continues the spectrum to the blue. Raises
     InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
     """
-    longer, nm, others = other
+    longer, nm, level = extension
     messages = []
     # Consecutive zeros at an end are missing data.
     light = np.flatnonzero(flux != 0.0)
@@ -398,32 +392,32 @@ def extended(
         more = nm < end if blue else nm > end
         if not more.any():
             continue
-        join, scale = _join(f"spectrum {name} and its extension {longer}", (wavelength, flux), (nm, others), blue)
+        join, scale = _join(f"spectrum {name} and its extension {longer}", (wavelength, flux), (nm, level), blue)
         messages.append(
             f"{'below' if blue else 'above'} {end:g} nm it is continued by {longer}, scaled by {scale:.4g} to "
             f"agree at {join[0]:g}-{join[1]:g} nm"
         )
         if blue:
             messages += [f"in {longer}, {message}" for message in ultraviolet]
-        wavelength, flux = attached(wavelength, nm[more], blue), attached(flux, others[more] * scale, blue)
+        wavelength, flux = attached(wavelength, nm[more], blue), attached(flux, level[more] * scale, blue)
     return wavelength, flux, tuple(messages) or (f"its extension {longer} reaches no farther and is not used",)
 
 
-def _join(both: str, first: tuple[Float, Float], second: tuple[Float, Float], blue: bool) -> tuple[Float, float]:
+def _join(title: str, first: tuple[Float, Float], second: tuple[Float, Float], blue: bool) -> tuple[Float, float]:
     """Return the range in which two spectra are compared, widened by the noise of the first, and their ratio there."""
     low, high = max(first[0][0], second[0][0]), min(first[0][-1], second[0][-1])
     if not low < high:
         spans = (f"{nm[0]:g}-{nm[-1]:g} nm" for nm, _ in (first, second))
-        raise InputError(f"{both} must overlap, but span {' and '.join(spans)}", key="extend")
+        raise InputError(f"{title} must overlap, but span {' and '.join(spans)}", key="extend")
     noise = point_noise(first[1])
     for width in JOIN_NM * 2.0 ** np.arange(6):
         join = np.clip([low, low + width] if blue else [high - width, high], low, high)
-        own, others = (float(means(nm, light, join)[0]) for nm, light in (first, second))
+        level, longer = (float(means(nm, light, join)[0]) for nm, light in (first, second))
         near = (first[0] >= join[0]) & (first[0] <= join[1])
         error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
-        if own > MIN_JOIN_SNR * error and others > 0.0 and np.isfinite(own / others):
-            return join, own / others
-    fault = f"{both} must both have light to scale by, but have mean fluxes of {own:g} and {others:g}"
+        if level > MIN_JOIN_SNR * error and longer > 0.0 and np.isfinite(level / longer):
+            return join, level / longer
+    fault = f"{title} must both have light to scale by, but have mean fluxes of {level:g} and {longer:g}"
     raise InputError(f"{fault} at {join[0]:g}-{join[1]:g} nm", key="extend")
 
 

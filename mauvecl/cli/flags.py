@@ -207,12 +207,12 @@ def whole_number(text: str, flag: str, reach: Range) -> int:
 
 def complete_star(incomplete: str) -> list[str]:
     """Return names of stars, and files, that continue the last of the stars with commas between them."""
-    from mauvecl.host.stars.library import EXAMPLES, all_names, kept
+    from mauvecl.host.stars.library import EXAMPLES, all_names, user_stars
 
     before, comma, last = incomplete.rpartition(",")
     # Shells take a blank for the end of a word; names are known without blanks.
     names = [name.replace(" ", "") for name in all_names() if name not in EXAMPLES]
-    names += [star.name for star in kept() if " " not in star.name]
+    names += [star.name for star in user_stars() if " " not in star.name]
     return [f"{before}{comma}{word}" for word in _continued(last, names)]
 
 

@@ -251,10 +251,10 @@ def known(state: State) -> dict[str, Any]:
     about: dict[str, Any] = {"about": "", "given": {}, "offer": ""}
     text = state.entered["star"]
     star = None if text == UPLOADED else resolve(text, own=False)
-    if star is not None and star.known is not None:
-        magnitude = f"{star.known.magnitude:g}"
+    if star is not None and star.entry is not None:
+        magnitude = f"{star.entry.magnitude:g}"
         given = {"magnitude": magnitude, "band": "V", "target": star.name}
-        about = {"about": star.known.about, "given": given, "offer": f"Use V = {magnitude}"}
+        about = {"about": star.entry.about, "given": given, "offer": f"Use V = {magnitude}"}
     elif star is not None and star.light is None:
         about["about"] = listed_note(text)
     rows: tuple[dict[str, Any], ...] = ()
