@@ -253,9 +253,11 @@ Whiten = Callable[[Float], Float]
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
 #: Number of fits after the first, each with the covariances of the previous fit.
 REFITS = 3
-#: Number of steps to the end of an interval, and of those without damping; largest length of a step and of the last,
-#: relative to the root of the rise of chi-squared; relative regularisation of degenerate parameters.
-NEWTON_STEPS, UNDAMPED, LONGEST, CONVERGED, RIDGE = 30, 8, 1.5, 1e-3, 1e-10
+#: Number of steps to the end of an interval; largest length of a step and of the last, relative to the root of the rise
+#: of chi-squared; relative regularisation of degenerate parameters.
+NEWTON_STEPS, LONGEST, CONVERGED, RIDGE = 40, 1.5, 1e-3, 1e-10
+#: Factors on the lengths of steps after one that turns back, and after another one.
+SHORTER, LONGER = 0.5, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -462,8 +464,8 @@ def fit_cooling(
     slopes = scale[:, None] * slopes[:, free]
     spread = slopes @ covariance @ slopes.T
     rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
-    each = [fit.end(sign, rise, quantity) for sign, rise, quantity in product((-1.0, 1.0), rises, quantities)]
-    low, high = np.reshape(each, (2, len(rises), 1, len(quantities)))
+    ends = [fit.end(sign * rise, quantity) for sign, rise, quantity in product((-1.0, 1.0), rises, quantities)]
+    low, high = np.reshape(ends, (2, len(rises), 1, len(quantities)))
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     none = float(np.sum(data.whitening(theta, none=True)(data.sums[None]) ** 2))
     return Measurement(
@@ -622,33 +624,67 @@ class _BestFit:
             theta = with_free(solution.x)
         return cls(data, whiten, theta, free, limits, 2 * float(solution.cost))
 
-    def end(self, sign: float, rise: float, quantity: _Quantity) -> float:
-        """Return the end of an interval on one side; infinite if chi-squared does not rise that far within the limits.
+    def end(self, rise: float, quantity: _Quantity) -> float:
+        """Return the end of an interval at a rise of chi-squared, as `interval_end` does; infinite if it is open."""
 
-        Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals. A
-        parameter that reaches a limit stays there.
-        """
-        data, free, (low, high), there = self.data, self.free, self.limits, self.theta.copy()
-        allowed = self.chi2 + rise
-        for number in range(NEWTON_STEPS):
-            residuals, every = data.residuals(there, self.whiten), data.jacobian(there, self.whiten)
-            # A flare that does not cool leaves the cooling time without any effect.
-            power = np.sum(every**2, axis=0)
-            free = free[power[free] > 0.0]
-            jacobian, slope = every[:, free], quantity.at(there, data)[1][free]
-            information = jacobian.T @ jacobian + np.diag(RIDGE * power[free])
-            back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
-            if not slope @ along > 0.0:
-                break
-            room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
-            step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
-            length = float(np.linalg.norm(jacobian @ step)) / np.sqrt(rise)
-            # Steps across a kink, where the peak changes frames, would not become shorter.
-            share = min(1.0, LONGEST / length) * 0.5 ** max(0, number - UNDAMPED)
-            there[free] += share * step
-            outside = (there < low) | (there > high)
-            if outside[free].any():
-                there, free = np.clip(there, low, high), free[~outside[free]]
-            elif share * length < CONVERGED:
-                return quantity.at(there, data)[0]
-        return sign * np.inf
+        def linearised(theta: Float) -> tuple[Float, Float]:
+            return self.data.residuals(theta, self.whiten), self.data.jacobian(theta, self.whiten)
+
+        def value_and_slope(theta: Float) -> tuple[float, Float]:
+            return quantity.at(theta, self.data)
+
+        end, closed = interval_end(linearised, value_and_slope, self.theta, self.limits, self.chi2, rise, self.free)
+        return end if closed else float(np.copysign(np.inf, rise))
+
+
+def interval_end(
+    linearised: Callable[[Float], tuple[Float, Float]], quantity: Callable[[Float], tuple[float, Float]], theta: Float,
+    limits: tuple[Float, Float], chi2: float, rise: float, free: NDArray[np.intp] | None = None,
+) -> tuple[float, bool]:  # fmt: skip
+    """Return the end of a quantity's interval on one side, where the smallest chi-squared has risen by `rise`.
+
+    The end is the lower one if `rise` is negative. The second value is False if chi-squared does not rise that far
+    within the limits of the parameters; the end is then where the search for it stops. Each step goes to where the
+    quantity is extreme on the surface of equal chi-squared, of linearised residuals. A parameter that reaches a limit
+    stays there.
+
+    Parameters
+    ----------
+    linearised
+        Function of the parameters that returns residuals, (n,), and their derivatives, (n, n_parameter).
+    quantity
+        Function of the parameters that returns the quantity and its derivatives, (n_parameter,).
+    theta, chi2
+        Best fit.
+    limits
+        Smallest and largest parameters.
+    free
+        Numbers of the parameters that change, all by default.
+    """
+    (low, high), there, unit = limits, theta.copy(), np.sqrt(abs(rise))
+    free = np.arange(theta.size) if free is None else free
+    damping, last_change = 1.0, np.zeros(1)
+    for _ in range(NEWTON_STEPS):
+        residuals, derivatives = linearised(there)
+        # A parameter without any effect, such as the cooling time of a flare that does not cool, keeps its value.
+        power = np.sum(derivatives**2, axis=0)
+        free = free[power[free] > 0.0]
+        jacobian, slope = derivatives[:, free], quantity(there)[1][free]
+        information = jacobian.T @ jacobian + np.diag(RIDGE * power[free])
+        back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
+        if not slope @ along > 0.0:
+            break
+        room = chi2 + abs(rise) - float(residuals @ residuals + residuals @ jacobian @ back)
+        step = back + np.sign(rise) * np.sqrt(max(room, 0.0) / (slope @ along)) * along
+        change = jacobian @ step
+        # Steps across a kink, where the peak changes frames, would not become shorter.
+        damping = min(1.0, damping * (SHORTER if np.sum(change * last_change) < 0.0 else LONGER))
+        length, last_change = float(np.linalg.norm(change)) / unit, change
+        share = min(1.0, LONGEST / length) * damping
+        there[free] += share * step
+        outside = (there < low) | (there > high)
+        if outside[free].any():
+            there, free = np.clip(there, low, high), free[~outside[free]]
+        elif share * length < CONVERGED:
+            return quantity(there)[0], True
+    return quantity(there)[0], False

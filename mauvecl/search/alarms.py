@@ -22,7 +22,6 @@ from mauvecl.search.flare_fits import (
     KELVIN,
     PEAK,
     WIDTH,
-    BetterFitError,
     BlendFit,
     Block,
     Factor,
@@ -114,17 +113,13 @@ def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor 
         changed = set(new)
         for _ in range(TURNS):
             changed = search.fitted(changed)
-    for number, block in enumerate(search.blocks(), 1):
-        theta, measured = _thetas(block), list[Measured]()
-        rows = search.sums.block(theta, _thetas(search.found))
-        best = rows.fit(theta)
-        while not measured:
-            try:
-                measured = [_measured(rows, best, j, energy) for j in range(len(block))]
-            except BetterFitError as better:
-                best = rows.fit(better.theta)
-        for candidate, values in zip(block, measured, strict=True):
-            found.append(Alarm(candidate.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
+    for number, group in enumerate(search.blocks(), 1):
+        theta = _thetas(group)
+        block = search.sums.block(theta, search.others(group))
+        best = block.fit(theta)
+        for j, candidate in enumerate(group):
+            measured = _measured(block, best, j, energy)
+            found.append(Alarm(candidate.rho, *measured, number, len(group), best.chi2, best.dof, best.p_value))
     return sorted(found, key=lambda alarm: -alarm.rho)
 
 
@@ -150,6 +145,10 @@ class _StareSearch:
             reach = max(reach, last)
         n = MAX_FLARES_PER_FIT
         return [block[k : k + n] for block in blocks for k in range(0, len(block), n)]
+
+    def others(self, group: Collection[Candidate]) -> Float:
+        """Return the parameters of the found flares outside of a group."""
+        return _thetas(candidate for candidate in self.found if candidate not in group)
 
     def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Callable[[int], Candidate]]]:
         """Yield per row the largest excess over fit residuals and the peak time of each onset, and its candidate."""
@@ -227,7 +226,7 @@ class _StareSearch:
     def _improves(self, block: list[Candidate], candidate: Candidate) -> bool:
         """Return whether a further flare improves a block significantly, and update the flares to the better fit."""
         before, with_it = _thetas(block), [*block, candidate]
-        rows = self.sums.block(_thetas(with_it), _thetas([*self.found, candidate]))
+        rows = self.sums.block(_thetas(with_it), self.others(block))
         best = self._best(rows, with_it, [candidate])
         # The other flares alone may fit better from their new parameters.
         alone = min((rows.fit(before), rows.without(best, len(block))), key=lambda fit: fit.chi2)
@@ -279,10 +278,10 @@ class _StareSearch:
         return moved
 
     def _fit(self, block: list[Candidate], new: Collection[Candidate]) -> set[Candidate]:
-        best = self._best(self.sums.block(_thetas(block), _thetas(self.found)), block, new)
+        others = self.others(block)
+        best = self._best(self.sums.block(_thetas(block), others), block, new)
         # The noise depends on the fitted flares.
-        others = _thetas(candidate for candidate in self.found if candidate not in block)
-        rows = self.sums.block(best.theta, np.vstack([others, best.theta]))
+        rows = self.sums.block(best.theta, others)
         best, left = rows.fit(best.theta), list(block)
         while len(left) > 1:
             falls = [rows.without(best, j) for j in range(len(left))]
@@ -317,7 +316,7 @@ Measured = tuple[FittedFlares, dict[str, tuple[float, float]], str]
 
 
 def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Measured:
-    """Measure a flare; raises BetterFitError if profiling finds a better fit of its block."""
+    """Measure a flare of a block."""
     sums, theta, (low, high) = rows.sums, best.theta[j], rows.sums.bounds
     snr = float(np.sqrt(max(rows.without(best, j).chi2 - best.chi2, 0.0)))
     at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))
