@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 #: Values of a fit without a measurement.
-UNMEASURED = FittedFlares(**{each.name: np.full(1, np.nan) for each in fields(FittedFlares)})
+UNMEASURED = FittedFlares(**{field.name: np.full(1, np.nan) for field in fields(FittedFlares)})
 #: Share of a flare's S/N that may remain in nearby residuals without an alarm, because its shape or temperature differs
 #: from that of the fit.
 LEFT_BEHIND = 0.05
@@ -157,9 +157,9 @@ class _StareSearch:
         # Flares at the bounds of the fit may remain in the residuals entirely.
         at_end = np.minimum(theta - low, high - theta) <= AT_BOUND * (high - low)
         wrong = self.sums.light(theta[at_end[:, [PEAK, WIDTH]].any(axis=1)])
-        both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
+        residuals = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
         search = self.sums.survey.search
-        for row, rho in search.values(both.astype(np.float32)):
+        for row, rho in search.values(residuals.astype(np.float32)):
             peaks = search.peaks_s(row)
             rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
             # Statistics of flares within reach of the templates.
@@ -207,7 +207,7 @@ class _StareSearch:
         if not blocks:
             return []
         overlaps = [[self.sums.overlap(candidate.theta) for candidate in block] for block in blocks]
-        spans = [(min(a for a, _ in each), max(b for _, b in each)) for each in overlaps]
+        spans = [(min(a for a, _ in ends), max(b for _, b in ends)) for ends in overlaps]
         best: list[list[tuple[float, Candidate]]] = [[] for _ in blocks]
         for excess, peaks, candidate_at in self._values():
             for several, (first, last) in zip(best, spans, strict=True):
@@ -232,15 +232,15 @@ class _StareSearch:
         alone = min((rows.fit(before), rows.without(best, len(block))), key=lambda fit: fit.chi2)
         fall = alone.chi2 - best.chi2
         # The other flares may have another shape, which changes their overlap with this one.
-        mine, others = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
-        seen = abs(float(mine @ others)) / max(float(np.linalg.norm(mine)), 1e-300)
-        rests = max(LEFT_UNSEEN * seen, LEFT_BEHIND * max(each.rho for each in block))
-        improves = bool(fall >= (self.threshold + rests) ** 2)
+        light, other_light = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
+        response = abs(float(light @ other_light)) / max(float(np.linalg.norm(light)), 1e-300)
+        allowed = max(LEFT_UNSEEN * response, LEFT_BEHIND * max(flare.rho for flare in block))
+        improves = bool(fall >= (self.threshold + allowed) ** 2)
         if improves:
             candidate.rho = float(np.sqrt(fall))
         flares, better = (with_it, best) if improves else (block, alone)
-        for each, theta in zip(flares, better.theta, strict=True):
-            each.theta = theta
+        for flare, theta in zip(flares, better.theta, strict=True):
+            flare.theta = theta
         return improves
 
     @staticmethod
@@ -248,23 +248,26 @@ class _StareSearch:
         return tuple(np.round(_thetas(block), 2).ravel().tolist())
 
     def _was_refused(self, peak: float, width: float) -> bool:
-        return any(abs(peak - other) <= max(width, wide) and 1 / 3 < width / wide < 3 for other, wide in self.refused)
+        return any(
+            abs(peak - refused_peak) <= max(width, refused_width) and 1 / 3 < width / refused_width < 3
+            for refused_peak, refused_width in self.refused
+        )
 
-    def _evened(self, left: Float, light: Float) -> Float:
+    def _evened(self, residuals: Float, light: Float) -> Float:
         """Scale residuals under flares down to the noise of frames without a flare."""
         if not self.found:
-            return left
+            return residuals
         noise = self.sums.noise(_thetas(self.found), light)
         base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
-        loud, evened = excess > 1.01, left.copy()
+        loud, evened = excess > 1.01, residuals.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
         for first, end in true_runs(loud):
             rows, middle = slice(first, end), times[(first + end) // 2]
             near = ~loud & (np.abs(times - middle) < self.sums.survey.bank.baseline.window_s / 2 + 1)
-            level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
-            evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
+            level = np.median(residuals[near], axis=0) if near.any() else np.zeros(residuals.shape[1])
+            evened[rows] = level + (residuals[rows] - level) / np.sqrt(excess[rows])[:, None]
         return evened
 
     def fitted(self, changed: set[Candidate]) -> set[Candidate]:
@@ -272,8 +275,8 @@ class _StareSearch:
         moved: set[Candidate] = set()
         spans = [self.sums.window(candidate.theta) for candidate in changed]
         for block in self.blocks():
-            mine = [self.sums.window(candidate.theta) for candidate in block]
-            if any(a < d and c < b for a, b in mine for c, d in spans):
+            windows = [self.sums.window(candidate.theta) for candidate in block]
+            if any(a < d and c < b for a, b in windows for c, d in spans):
                 moved |= self._fit(block, changed)
         return moved
 
@@ -282,17 +285,17 @@ class _StareSearch:
         best = self._best(self.sums.block(_thetas(block), others), block, new)
         # The noise depends on the fitted flares.
         rows = self.sums.block(best.theta, others)
-        best, left = rows.fit(best.theta), list(block)
-        while len(left) > 1:
-            falls = [rows.without(best, j) for j in range(len(left))]
-            j = int(np.argmin([fit.chi2 for fit in falls]))
-            if falls[j].chi2 - best.chi2 >= self.threshold**2:
+        best, flares = rows.fit(best.theta), list(block)
+        while len(flares) > 1:
+            reduced = [rows.without(best, j) for j in range(len(flares))]
+            j = int(np.argmin([fit.chi2 for fit in reduced]))
+            if reduced[j].chi2 - best.chi2 >= self.threshold**2:
                 break
-            self.refused.append(left[j].template)
-            self.found.remove(left.pop(j))
-            best = falls[j]
+            self.refused.append(flares[j].template)
+            self.found.remove(flares.pop(j))
+            best = reduced[j]
         moved = set()
-        for candidate, theta in zip(left, best.theta, strict=True):
+        for candidate, theta in zip(flares, best.theta, strict=True):
             if np.abs(theta - candidate.theta).max() > 1e-4:
                 moved.add(candidate)
             candidate.theta = theta
@@ -305,9 +308,9 @@ class _StareSearch:
         for k in (k for k, candidate in enumerate(block) if candidate in new):
             # A flare that was fitted alone may be too wide because it includes another.
             for j in np.flatnonzero(start[:, WIDTH] > start[k, WIDTH]):
-                other = start.copy()
-                other[j, WIDTH] = start[k, WIDTH]
-                fits.append(rows.fit(other))
+                narrower = start.copy()
+                narrower[j, WIDTH] = start[k, WIDTH]
+                fits.append(rows.fit(narrower))
         return min(fits, key=lambda fit: fit.chi2)
 
 

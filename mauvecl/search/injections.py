@@ -63,15 +63,15 @@ def fit_accuracy(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, Float
     Values of each cell, by the names of `ACCURACY_COLUMNS`, have the shape (n_half_width, n_size); NaN without
     detections.
     """
-    each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
+    ratios = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
     # NumPy warns of cells without detections.
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         low, middle, high = (
-            {name: np.nanquantile(values, q, axis=2) for name, values in each.items()} for q in (0.16, 0.5, 0.84)
+            {name: np.nanquantile(values, q, axis=2) for name, values in ratios.items()} for q in (0.16, 0.5, 0.84)
         )
-        covered = np.nanmean(each["covered"], axis=2)
+        covered = np.nanmean(ratios["covered"], axis=2)
     return {
-        "fitted": np.isfinite(each["energy"]).sum(axis=2).astype(np.float64),
+        "fitted": np.isfinite(ratios["energy"]).sum(axis=2).astype(np.float64),
         "energy_ratio_low": low["energy"],
         "energy_ratio_high": high["energy"],
         **{f"{name}_ratio": middle[name] for name in ("energy", "amplitude", "half_width", "temperature")},
@@ -134,20 +134,20 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
     near = _near_templates(search, reaches, means, bank.directions @ survey.response)
     # Flares of several half-widths share templates.
-    places, index = np.unique(np.concatenate([own for own, _, _ in near]), return_inverse=True)
+    places, index = np.unique(np.concatenate([numbers for numbers, _, _ in near]), return_inverse=True)
     numbers, onsets = np.divmod(places, search.n_grid)
     filters = np.empty((places.size, stare.n_frames), np.float32)
     for number in np.unique(numbers):
-        mine = numbers == number
-        filters[mine] = np.rint(search.in_time(search.grid[number], onsets[mine]) / STEP) * STEP
+        in_row = numbers == number
+        filters[in_row] = np.rint(search.in_time(search.grid[number], onsets[in_row]) / STEP) * STEP
     filter_widths_s = np.array([row.template.half_width_s for row in search.grid])[numbers]
     sites = []
-    for width, mean, (own_places, peaks_s, counts) in zip(widths_s, means, near, strict=True):
-        mine, index = np.split(index, [own_places.size])
-        own = filters[mine]
-        used = np.flatnonzero(own.any(axis=0))
+    for width, mean, (site_places, peaks_s, counts) in zip(widths_s, means, near, strict=True):
+        rows, index = np.split(index, [site_places.size])
+        site_filters = filters[rows]
+        used = np.flatnonzero(site_filters.any(axis=0))
         ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
-        arrays = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32), filter_widths_s[mine]
+        arrays = np.ascontiguousarray(site_filters[:, ends]), mean[ends].astype(np.float32), filter_widths_s[rows]
         sites.append(InjectionSite(width, peak_s, first + ends.start, *arrays, peaks_s, counts))
     return tuple(sites)
 
@@ -168,23 +168,23 @@ def _near_templates(
     whether they count as a detection, (n_temperature, n_template). `reaches` and
     `means` are those of the flares, and `along` is their light along the bank's directions.
     """
-    seen: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
+    responding: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         peaks = search.peaks_s(row)
-        for templates, (near, earliest, latest), value in zip(seen, reaches, correlated[:, 0], strict=True):
+        for templates, (near, earliest, latest), value in zip(responding, reaches, correlated[:, 0], strict=True):
             if row.template.half_width_s in near:
                 values = along[:, None] * value
                 inside = (peaks >= earliest) & (peaks <= latest) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside & (values.max(axis=0) > 0))
                 templates.append((number * search.n_grid + onsets, peaks[onsets], values[:, onsets]))
-    found = []
-    for templates in seen:
+    detecting = []
+    for templates in responding:
         places, times, values = (np.concatenate(part, axis=-1) for part in zip(*templates, strict=True))
         counts = values >= OVERLAP * values.max(initial=0)
         used = counts.any(axis=0)
-        found.append((places[used], times[used], counts[:, used]))
-    return found
+        detecting.append((places[used], times[used], counts[:, used]))
+    return detecting
 
 
 #: Number of stares per batch.
@@ -237,8 +237,8 @@ class Injections:
     @cached_property
     def quiescent(self) -> tuple[Components, Method]:
         """Components of the frames without flares, and the method of drawing them."""
-        every = self.survey.components
-        quiescent = replace(every, flare_electrons=every.flare_electrons[:0])
+        components = self.survey.components
+        quiescent = replace(components, flare_electrons=components.flare_electrons[:0])
         return quiescent, method_for(quiescent, self.survey.stare, self.processes)
 
     def request(self, position: int) -> StaresRequest:
@@ -253,7 +253,7 @@ class Injections:
         injecting = CriticalAmplitudes(
             survey=replace(survey, stare=frames.stare),
             sites=tuple(replace(site, first=site.first - first) for site in sites), threshold=self.threshold,
-            frames=replace(frames, known=frames.known.astype(np.float32)), amplitudes=self.amplitudes,
+            frames=replace(frames, mean=frames.mean.astype(np.float32)), amplitudes=self.amplitudes,
             temperature_k=self.temperature_k, fits_before=start + self.fitted,
         )  # fmt: skip
         return StaresRequest(
@@ -318,37 +318,35 @@ class CriticalAmplitudes:
         """Prepare the random part of some stares."""
         n_sum = values.shape[2]
         noise = np.moveaxis(self.frames.net(values), 2, 0)
-        own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
-        return _multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else light[:1]
+        normals, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
+        return _multiple(noise, NOISE_STEP).astype(np.float64), normals, light if light.any() else light[:1]
 
     def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
         """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
-        (noise, normals, light), filters, here = drawn, site.weights, site.frames
-        mean, stare, width = site.mean * (1 + light[:, here]), self.frames.stare, site.half_width_s
-        since = stare.start_s[here] - site.peak_s
+        (noise, normals, light), filters, frames = drawn, site.weights, site.frames
+        mean, stare, width = site.mean * (1 + light[:, frames]), self.frames.stare, site.half_width_s
+        since = stare.start_s[frames] - site.peak_s
         lit = slice(np.searchsorted(since, -width - stare.frame_s, "right"), np.searchsorted(since, GLOW * width))
-        own, directions = (
-            normals[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0)),
-            self.survey.bank.directions,
-        )
+        photons = normals[:, :, frames][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
+        directions = self.survey.bank.directions
         return (
-            _combined(directions, noise[:, :, here] @ filters),
+            _combined(directions, noise[:, :, frames] @ filters),
             _combined((directions @ self.survey.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
-            _combined(directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
+            _combined(directions @ self.photons, _multiple(photons, NOISE_STEP) @ filters[lit]),
         )
 
     def _critical(self, site: InjectionSite, values: tuple[Single, Single, Single]) -> Single:
         a, b, c = values
-        left = np.float32(self.threshold) - a
-        # Root of b x^2 + c x = left in its numerically stable form; zero if there is an alarm without the flare.
-        root = np.multiply(left, 4 * b)
+        missing = np.float32(self.threshold) - a
+        # Root of b x^2 + c x = missing in its numerically stable form; zero if there is an alarm without the flare.
+        root = np.multiply(missing, 4 * b)
         root += c * c
         np.sqrt(np.maximum(root, 0, out=root), out=root)
         root += c
         with np.errstate(divide="ignore", invalid="ignore"):
-            np.divide(2 * left, root, out=root)
+            np.divide(2 * missing, root, out=root)
         root[~((b > 0) & site.counts[:, None]).repeat(root.shape[1] // b.shape[1], axis=1)] = np.inf
-        np.copyto(root, 0, where=(left <= 0) & site.counts[:, None])
+        np.copyto(root, 0, where=(missing <= 0) & site.counts[:, None])
         return np.asarray(root.min(axis=(0, 2)) ** 2)
 
     def _fit(self, drawn: FrameNoise, estimates: Mapping[str, Single]) -> None:
