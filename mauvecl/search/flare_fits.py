@@ -13,14 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.fits.time_course import interval_end
+from mauvecl.fits.least_squares import interval_end, least_squares
 from mauvecl.flares.shapes import between, sides
 from mauvecl.host.arrays import Float
 from mauvecl.search.templates import REACH
@@ -37,10 +37,8 @@ BEYOND_BANK = 1.25
 OVERLAP_BEFORE, OVERLAP_AFTER = 2.0, 10.0
 #: Bounds of log amplitude.
 LOG_AMPLITUDES = (-27.0, 14.0)
-#: Relative change of chi-squared at which a fit has converged, and its largest number of evaluations.
-CONVERGED, MAX_EVALUATIONS = 1e-6, 100
-#: Largest distance of starting parameters from the middle of their bounds, over that of the bounds.
-LARGEST_SINE = 1.0 - 1e-9
+#: Relative change of chi-squared at which a fit has converged.
+CONVERGED = 1e-6
 #: No flares.
 NO_FLARES = np.zeros((0, 4))
 
@@ -238,28 +236,15 @@ class Block:
 
     def fit(self, theta: Float) -> BlendFit:
         """Fit all flares from a starting point, shape (n_flare, 4)."""
-        low, high = (np.tile(end, len(theta)) for end in self.sums.bounds)
-        middle, half = (low + high) / 2, (high - low) / 2
-
-        @lru_cache(maxsize=2)
-        def triangle(content: bytes) -> Float:
-            """Return the triangular factor of derivatives and residuals as columns.
-
-            Its columns have the same scalar products, on which alone the fit depends. It has few rows.
-            """
-            angles = np.frombuffer(content)
-            residuals, jacobian = self.residuals(middle + half * np.sin(angles))
-            return np.asarray(np.linalg.qr(np.column_stack([jacobian * half * np.cos(angles), residuals]), mode="r"))
-
-        # Parameters are sines within their bounds.
-        start = np.arcsin(np.clip((theta.ravel() - middle) / half, -LARGEST_SINE, LARGEST_SINE))
-        angles, _, report, _, status = scipy.optimize.leastsq(
-            lambda x: triangle(x.tobytes())[:, -1], start, Dfun=lambda x: triangle(x.tobytes())[:, :-1],
-            full_output=True, ftol=CONVERGED, xtol=1e-9, maxfev=MAX_EVALUATIONS,
-        )  # fmt: skip
-        best, chi2 = (middle + half * np.sin(angles)).reshape(-1, 4), float(report["fvec"] @ report["fvec"])
+        limits = self._limits(len(theta))
+        best, chi2, converged = least_squares(self.residuals, theta.ravel(), limits, CONVERGED)
         dof = self.data.size - self.basis.shape[1] - theta.size
-        return BlendFit(best, chi2, dof, status in (1, 2, 3, 4))
+        return BlendFit(best.reshape(-1, 4), chi2, dof, converged)
+
+    def _limits(self, n_flare: int) -> tuple[Float, Float]:
+        """Return the smallest and largest parameters of flares, (4 n_flare,) each."""
+        low, high = self.sums.bounds
+        return np.tile(low, n_flare), np.tile(high, n_flare)
 
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
@@ -273,13 +258,13 @@ class Block:
 
         Chi-squared rises by `rise` at its ends.
         """
-        limits = tuple(np.tile(end, len(best.theta)) for end in self.sums.bounds)
 
         def value_and_slope(x: Float) -> tuple[float, Float]:
             gradient = np.zeros(best.theta.shape)
             value, gradient[j] = quantity.of(x.reshape(-1, 4)[j])
             return value, gradient.ravel()
 
+        limits = self._limits(len(best.theta))
         (low, low_closed), (high, high_closed) = (
             interval_end(self.residuals, value_and_slope, best.theta.ravel(), limits, best.chi2, sign * rise)
             for sign in (-1.0, 1.0)
