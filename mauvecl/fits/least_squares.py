@@ -47,7 +47,7 @@ def least_squares(
         return np.asarray(np.linalg.qr(np.column_stack([jacobian * half * np.cos(angles), residuals]), mode="r"))
 
     angles = np.arcsin(np.clip((start - middle) / half, -LARGEST_SINE, LARGEST_SINE))
-    angles, _, report, _, status = scipy.optimize.leastsq(
+    angles, _, report, _, status = scipy.optimize.leastsq(  # type: ignore[call-overload]
         lambda x: triangle(x.tobytes())[:, -1], angles, Dfun=lambda x: triangle(x.tobytes())[:, :-1],
         full_output=True, ftol=tolerance, xtol=1e-9, maxfev=MAX_EVALUATIONS,
     )  # fmt: skip
