@@ -632,10 +632,10 @@ def fit_two_temperatures(
 
 def _without_absent_blackbody(measured: Measurement, single: Measurement) -> Measurement:
     """Return a measurement of two blackbodies with the estimates of one where the light of the other is zero."""
-    absent = (measured.amplitudes[:, :2] <= 0.0).any(axis=1)
-    n = len(absent)
+    n = len(single.estimates)
     of_one = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
-    return replace(measured, estimates=np.where(absent[:, None], of_one, measured.estimates))
+    absent = (measured.amplitudes[:, :2] <= 0.0).any(axis=1, keepdims=True)
+    return replace(measured, estimates=np.where(absent, of_one, measured.estimates))
 
 
 class _SecondTemperatures:

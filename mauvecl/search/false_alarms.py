@@ -124,8 +124,8 @@ class TemplateGrid:
                 for neighbours in _next_to(rows, k):
                     # The filter, of the neighbours at any shift, that has the largest correlation with this one.
                     products = np.array([scipy.signal.correlate(this, row, method="fft") for row in neighbours])
-                    phase, shift = np.unravel_index(int(np.argmax(products)), products.shape)
-                    aligned.append(np.roll(neighbours[phase], int(shift) - this.size + 1))
+                    best_row, shift = np.unravel_index(int(np.argmax(products)), products.shape)
+                    aligned.append(np.roll(neighbours[best_row], int(shift) - this.size + 1))
                 width.append(_neighbour_correlations(this, aligned))
         directions = list(bank.directions)
         temperature = [_neighbour_correlations(this, _next_to(directions, k)) for k, this in enumerate(directions)]

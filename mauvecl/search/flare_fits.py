@@ -153,8 +153,8 @@ class SummedStare:
         """
         windows, survey = [self.window(flare) for flare in flares], self.survey
         used = np.zeros(len(self.net), np.bool_)
-        for first, last in windows:
-            used[slice(*self.overlapping(first, last))] = True
+        for window in windows:
+            used[slice(*self.overlapping(*window))] = True
         rows = np.flatnonzero(used)
         _, first, count = np.unique(survey.stare.numbers[rows] // per_group, return_index=True, return_counts=True)
         groups = rows[first[count == per_group][:, None] + np.arange(per_group)]
@@ -165,7 +165,7 @@ class SummedStare:
         net = (self.net[span] - other_light)[groups - span.start].mean(axis=1)
         data = np.einsum("tij,tj->ti", whiten, net)
         edges = np.column_stack([self.edges[groups[:, 0], 0], self.edges[groups[:, -1], 1]])
-        longest = max(last - first for first, last in windows)
+        longest = max(end - begin for begin, end in windows)
         terms = [*self._baseline(edges.mean(axis=1), longest), *survey.curves[:, groups].mean(axis=2)]
         design = np.reshape(terms, (len(terms), len(groups))).T
         columns = np.einsum("tij,tp->tijp", whiten, design).reshape(data.size, -1)

@@ -373,7 +373,7 @@ class CriticalAmplitudes:
                 for name, values in comparison.items():
                     estimates[name][d, s] = values[0]
 
-    def _comparison(self, site: InjectionSite, amplitude: float, fit: FittedFlares) -> dict[str, Float]:
+    def _comparison(self, site: InjectionSite, amplitude: float, fit: FittedFlares) -> dict[str, NDArray[Any]]:
         """Compare a fit with the injected flare; the keys are `FIT_QUANTITIES`."""
         duration = amplitude * site.half_width_s * self.survey.bank.shape.equivalent_duration
         return {
