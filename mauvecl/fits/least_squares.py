@@ -21,8 +21,10 @@ LARGEST_SINE = 1.0 - 1e-9
 #: Number of steps to the end of an interval; largest length of a step and of the last, relative to the root of the rise
 #: of chi-squared; relative regularisation of degenerate parameters.
 NEWTON_STEPS, LONGEST, CONVERGED, RIDGE = 40, 1.5, 1e-3, 1e-10
-#: Factors on the lengths of steps after one that turns back, and after another one.
-SHORTER, LONGER = 0.5, 1.5
+#: Factor on the lengths of all steps after one that turns back.
+SHORTER = 0.5
+#: Share of the rise of chi-squared that the end of a closed interval reaches.
+NEARLY = 0.9
 
 
 def least_squares(
@@ -95,7 +97,7 @@ def interval_end(
         step = back + np.sign(rise) * np.sqrt(max(room, 0.0) / (slope @ along)) * along
         change = jacobian @ step
         # Steps across a kink, where the peak changes frames, would not become shorter.
-        damping = min(1.0, damping * (SHORTER if np.sum(change * last_change) < 0.0 else LONGER))
+        damping *= SHORTER if np.sum(change * last_change) < 0.0 else 1.0
         length, last_change = float(np.linalg.norm(change)) / unit, change
         share = min(1.0, LONGEST / length) * damping
         there[free] += share * step
@@ -104,4 +106,4 @@ def interval_end(
             there, free = np.clip(there, low, high), free[~outside[free]]
         elif share * length < CONVERGED:
             return quantity(there)[0], True
-    return quantity(there)[0], False
+    return quantity(there)[0], float(residuals @ residuals) >= chi2 + NEARLY * abs(rise)
