@@ -4,7 +4,7 @@ __kernel ${attributes}
 void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, const uint start_row, const uint stop_row,
                   const uint first_frame, __global const Mixture *restrict mixtures, __global const float *restrict spectra,
                   __global const float *restrict weights, __global const float *restrict constants,
-                  const uint stride, __global float *restrict values)
+                  const uint first_pixel, const uint stop_pixel, const uint stride, __global float *restrict values)
 {
     /* values[frame][scenario][statistic][stare] */
     const uint item = get_global_id(0), frame = first_frame + get_global_id(1), padded = job->padded_count;
@@ -50,7 +50,8 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
         for (uint s = 0; s < ${sums}u; s++)
             for (uint j = 0; j < ${parts}u; j++) sum[k][s][j] = (floatv)0.0f;
 
-    for (uint start = 0; start < padded; start += CHUNK) {
+    /* Pixels outside of this range have no weight. */
+    for (uint start = first_pixel; start < stop_pixel; start += CHUNK) {
         Draws drawn;
         draw(SCENE_PASSED, &at, 0u, start, &drawn);
         for (uint k = 0; k < scenario_count; k++) {

@@ -296,7 +296,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "errors of fluxes at a known temperature": (
         "test_correct_model_covers_and_simple_model_is_rejected",
-        ('gradient[:, which, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)', "gradient[:, which, m] = 0.0"),
+        ('gradient[:, is_sum, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)', "gradient[:, is_sum, m] = 0.0"),
     ),
     "errors of jumps at a known temperature": (
         "test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies[jump-2.5]",
@@ -304,7 +304,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "intervals clipped at a standard deviation": (
         "test_intervals_agree_with_minos_and_emcee",
-        ("left = np.maximum(left, 0.0)", "left = np.clip(left, 0.0, 1.0)"),
+        ("rise = np.maximum(rise, 0.0)", "rise = np.clip(rise, 0.0, 1.0)"),
     ),
     "intervals beyond their bounds": (
         "test_bounded_intervals_agree_with_brute_force",
@@ -313,8 +313,8 @@ MUTATIONS: dict[str, Mutation] = {
     "the noise of a star for that of its flare": (
         "test_forecasts_of_blackbodies[M3V-0.5-50s-30000K]",
         (
-            "constant + quiet.gain_dn_per_electron * each for each in (light, most)",
-            "constant + quiet.gain_dn_per_electron * each for each in (quiet.light_dn, most)",
+            "constant + quiet.gain_dn_per_electron * photons_dn for photons_dn in (light, most)",
+            "constant + quiet.gain_dn_per_electron * photons_dn for photons_dn in (quiet.light_dn, most)",
         ),
     ),
     "saturated pixels in use": (
@@ -326,11 +326,14 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "flare and factor on light correlated with the wrong sign": (
         "test_intervals_agree_with_brute_force[0.5-prior]",
-        ("dims + factor_at.variance, -covariance", "dims + factor_at.variance, covariance"),
+        ("variance_of_factor + factor_at.variance, -covariance", "variance_of_factor + factor_at.variance, covariance"),
     ),
     "a factor on light without its own error": (
         "test_intervals_agree_with_brute_force[0.5-free]",
-        ("Ratio(value, bottom, variance, dims + factor_at.variance", "Ratio(value, bottom, variance, dims"),
+        (
+            "Ratio(value, bottom, variance, variance_of_factor + factor_at.variance",
+            "Ratio(value, bottom, variance, variance_of_factor",
+        ),
     ),
     # Fits of events.
     "a prior of the number of flares that depends on the time since the start": (

@@ -24,8 +24,7 @@ from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
 from mauvecl.search.false_alarms import consecutive_alarm_rate, counted_threshold, sampled_rate
-from mauvecl.search.flare_fits import SingleFlareFit
-from mauvecl.search.injections import ACCURACY_COLUMNS, Injections, Refit, fit_accuracy
+from mauvecl.search.injections import ACCURACY_COLUMNS, Injections, fit_accuracy
 from mauvecl.search.search import Survey
 from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
 from mauvecl.study.cases import Case, cases, collect_messages
@@ -335,17 +334,16 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
 
     values = injected_sizes(case, size_of_unit, survey.unit_snr, threshold)
     positions = min(question.positions, question.count)
+    per_amplitude = size_of_unit(np.array(question.half_widths_s))[:, None]
+    amplitudes = values / per_amplitude
     injections = Injections(
         survey, question.half_widths_s, threshold, case.study.run.seed, positions, -(-question.count // positions),
-        case.study.processes.additive_only,
+        case.study.processes.additive_only, amplitudes, -(-question.fitted // positions),
+        case.study.flare.temperature_k,
     )  # fmt: skip
-    per_amplitude = size_of_unit(np.array(injections.half_widths_s))[:, None]
-    amplitudes = values / per_amplitude
-    fit, fitted = SingleFlareFit(survey.bank, survey.templates), -(-question.fitted // positions)
-    refit = Refit(fit, amplitudes, case.study.flare.temperature_k, fitted)
 
     def at_one_peak(position: int) -> Arrays:
-        return reduced(injections.request(position, refit))
+        return reduced(injections.request(position))
 
     peaks = map_in_order(engine, at_one_peak, range(positions))
     arrays = list(reported(peaks, positions, lambda done, total: report(done / total)))
@@ -358,7 +356,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
         case.label, case.at, survey, size, **false_alarms, saturates=injections.saturates,
         in_a_row=consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
         injected=InjectedCompleteness(injections.half_widths_s, values, amplitudes, critical),
-        fitted=fit_accuracy(arrays) if refit.count else None,
+        fitted=fit_accuracy(arrays) if question.fitted else None,
         ideal_share=survey.unit_snr / known_snr if known_snr > 0 else float("nan"),
     )  # fmt: skip
 

@@ -200,7 +200,10 @@ class StareLaunches(Launches):
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
             more = (padded(stare.mixtures), stare.spectra, stare.weights, stare.constants)
-            self._own = [*map(self.upload, more)]
+            # Only the range of pixels that a sum weights is drawn.
+            chunks = np.flatnonzero(stare.weights.reshape(len(stare.weights), -1, variant.chunk).any(axis=(0, 2)))
+            first, last = (chunks[0], chunks[-1] + 1) if chunks.size else (0, 0)
+            self._own = [*map(self.upload, more), np.uint32(first * variant.chunk), np.uint32(last * variant.chunk)]
         else:
             self._own = [self.upload(table.packed)]
 

@@ -171,9 +171,9 @@ class FlareModel:
         # Flux of each component in each range, and over all wavelengths, for an amplitude of one.
         light = [(f"{low:g}-{high:g} nm", _light_between(grid, fluxes, low, high)) for low, high in bands_nm]
         edge = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
-        whole = [(edge.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(edge.edge_flux)] if jump else []
+        continuum = [(edge.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(edge.edge_flux)] if jump else []
         bodies_flux = scale * STEFAN_BOLTZMANN * kelvin**4
-        light.append(("bolometric", np.concatenate([bodies_flux, whole, np.ones(len(chosen))])))
+        light.append(("bolometric", np.concatenate([bodies_flux, continuum, np.ones(len(chosen))])))
         derived = _derived(kelvin, scale, names, light, quiet.exposure_s, distance_pc, radius_rsun)
         log_k = np.log(kelvin)
         # The exponential of the last one must be a temperature that is accepted.
@@ -184,8 +184,10 @@ class FlareModel:
     def stacked(self, n: int, light: float = 1.0) -> Self:
         """Return the model of exposures that are n times as long, of which a share `light` of all light arrives."""
         derived = tuple(
-            replace(each, factors=n * each.factors) if each.unit == "erg" and each.factors is not None else each
-            for each in self.derived
+            replace(quantity, factors=n * quantity.factors)
+            if quantity.unit == "erg" and quantity.factors is not None
+            else quantity
+            for quantity in self.derived
         )
         return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=derived)
 
@@ -219,9 +221,9 @@ class FlareModel:
     def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
         """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
         factors = [derived.factors for derived in self.derived]
-        which = np.array([factor is not None for factor in factors])
+        is_sum = np.array([factor is not None for factor in factors])
         stacked = np.stack([factor for factor in factors if factor is not None], axis=1)
-        return which, scipy.interpolate.CubicSpline(self.log_k, stacked)
+        return is_sum, scipy.interpolate.CubicSpline(self.log_k, stacked)
 
     def counts(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> Float:
         """Return the mean DN that a flare adds to each pixel of the exposure, shape (n_pixel,)."""
@@ -242,8 +244,8 @@ class FlareModel:
         ratios = [spline for spline, derived in pairs if spline is not None and derived.ratio is not None]
         if not ratios and jump != 1.0:
             raise InputError.of("jump", jump, "1 for a model without a Balmer continuum")
-        own = [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k))) for ratio in ratios]
-        return self._checked(temperature_k, [amplitude, *own, *lines])
+        balmer = [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k))) for ratio in ratios]
+        return self._checked(temperature_k, [amplitude, *balmer, *lines])
 
     def _checked(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
         low, high = np.exp(self.log_k[[0, -1]])
@@ -262,9 +264,9 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
     dimmed (n,).
     """
     values = np.empty((log_k.size, len(model.derived)))
-    which, spline = model.sums
-    values[:, which] = undimmed(np.einsum("nql,nl->nq", spline(log_k), linear), factor)
-    for q in np.flatnonzero(~which):
+    is_sum, spline = model.sums
+    values[:, is_sum] = undimmed(np.einsum("nql,nl->nq", spline(log_k), linear), factor)
+    for q in np.flatnonzero(~is_sum):
         derived, ratio = model.derived[q], model.splines[q]
         values[:, q] = np.exp(log_k) if derived.held is None else derived.held
         if ratio is not None:
@@ -308,8 +310,8 @@ def _derived(
         yield Derived("jump", "", "flux just below the Balmer edge over that just above", ratio=1.0 / (scale * edge))
     for column, name in enumerate(names):
         if name.startswith("line "):
-            what = f"flux of the line {name[5:]} at the telescope"
-            yield Derived(name, "erg / (cm2 s)", what, of_one(column, 1.0))
+            text = f"flux of the line {name[5:]} at the telescope"
+            yield Derived(name, "erg / (cm2 s)", text, of_one(column, 1.0))
     fluxes = [(where, np.column_stack([f[:NODES], np.tile(f[NODES:], (NODES, 1))])) for where, f in light]
     for where, flux in fluxes:
         yield Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", flux)
@@ -381,29 +383,29 @@ class Ratio:
         """Return the variance of top - ratio x bottom."""
         return self.top_variance - 2.0 * ratio * self.covariance + ratio**2 * self.bottom_variance
 
-    def root(self, left: Float, sign: float) -> Float:
-        """Return one of the two ratios at which chi-squared has risen by `left`: the end if the bottom is not zero."""
-        a = self.bottom**2 - left * self.bottom_variance
-        b = self.top * self.bottom - left * self.covariance
+    def root(self, rise: Float, sign: float) -> Float:
+        """Return one of the two ratios at which chi-squared has risen by `rise`: the end if the bottom is not zero."""
+        a = self.bottom**2 - rise * self.bottom_variance
+        b = self.top * self.bottom - rise * self.covariance
         # The root of b^2 - a c, without its cancellation.
         spread = self.bottom**2 * self.top_variance - 2.0 * self.top * self.bottom * self.covariance
         spread = spread + self.top**2 * self.bottom_variance
-        rest = self.top_variance * self.bottom_variance - self.covariance**2
-        root = np.sqrt(np.maximum(left * (spread - left * rest), 0.0))
+        determinant = self.top_variance * self.bottom_variance - self.covariance**2
+        root = np.sqrt(np.maximum(rise * (spread - rise * determinant), 0.0))
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray((b + sign * root) / a)
 
-    def end(self, left: Float, sign: float) -> Float:
-        """Return the end of the set of ratios that raise chi-squared by at most `left`, with a positive bottom.
+    def end(self, rise: Float, sign: float) -> Float:
+        """Return the end of the set of ratios that raise chi-squared by at most `rise`, with a positive bottom.
 
         The end is infinite if the bottom may be zero, and of the other sign, no end, if it cannot be positive.
         """
-        left = np.maximum(left, 0.0)
+        rise = np.maximum(rise, 0.0)
         if self.bottom.all() and not self.bottom_variance.any():
-            return np.asarray((self.top + sign * np.sqrt(left * self.top_variance)) / self.bottom)
-        end, may_be_zero = self.root(left, sign), self.bottom**2 <= left * self.bottom_variance
+            return np.asarray((self.top + sign * np.sqrt(rise * self.top_variance)) / self.bottom)
+        end, may_be_zero = self.root(rise, sign), self.bottom**2 <= rise * self.bottom_variance
         # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.
-        closed = ~may_be_zero | ((self.top**2 > left * self.top_variance) & (sign * self.top < 0.0))
+        closed = ~may_be_zero | ((self.top**2 > rise * self.top_variance) & (sign * self.top < 0.0))
         return np.where(may_be_zero | (self.bottom > 0.0), np.where(closed, end, sign * np.inf), -sign * np.inf)
 
 
@@ -536,8 +538,8 @@ class ReducedSums(MeanSums):
         if unknown is not None and unknown.has_factor:
             # The last row of the Cholesky factor's inverse depends on the factor alone, given the other unknowns.
             row, precision = rows[-1], float(unknown.sd[-1]) ** -2.0
-            own = float(row @ unknown.spectra[-1])
-            scale = (own + np.sqrt(own**2 + 4.0 * precision)) / 2.0
+            change = float(row @ unknown.spectra[-1])
+            scale = (change + np.sqrt(change**2 + 4.0 * precision)) / 2.0
             means = (model.hot @ row)[:, None], (model.fixed @ row)[:, None], model.log_k
             expected, share = 1.0 + float(unknown.mean[-1]), precision / scale**2
             light = LightFactor(*means, row, scale, expected, share, unknown.factor_prior)
@@ -561,17 +563,17 @@ def spanning_weights(
     """
     optimal = plain if rows is None else plain - (spectra @ rows.T) @ rows
     gram = optimal @ spectra.T
-    kept, whole = np.diag(gram), np.einsum("tp,tp->t", plain, spectra)
-    if not (whole > 0.0).all():
+    power, power_if_known = np.diag(gram), np.einsum("tp,tp->t", plain, spectra)
+    if not (power_if_known > 0.0).all():
         raise InputError(
             "each component of a flare must have light in pixels that neither saturate nor are left out", key="model"
         )
-    if not (kept > LEAST_KEPT * whole).all():
+    if not (power > LEAST_KEPT * power_if_known).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
         raise InputError(
             f"the light of a flare cannot be distinguished from {unknown}; give fewer unknowns", key="nuisances"
         )
-    length = np.sqrt(kept)
+    length = np.sqrt(power)
     values, vectors = np.linalg.eigh(gram / np.outer(length, length))
     large = values > least * values[-1]
     return (vectors[:, large] / length[:, None] / np.sqrt(values[large])).T @ optimal, length
@@ -586,9 +588,9 @@ def variance_of(
     """
     added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
     highest = added if highest_dn is None else highest_dn
-    light, most = (np.maximum(quiet.light_dn + each, 0.0) for each in (added, highest))
+    light, most = (np.maximum(quiet.light_dn + flare, 0.0) for flare in (added, highest))
     constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
-    variance, scatter = (constant + quiet.gain_dn_per_electron * each for each in (light, most))
+    variance, scatter = (constant + quiet.gain_dn_per_electron * photons_dn for photons_dn in (light, most))
     # Frames of a pixel near saturation are occasionally clipped, so that the pixel is not reliable.
     raw = most / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
     used = raw + NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < quiet.ceiling_dn

@@ -34,6 +34,15 @@ if TYPE_CHECKING:
     from mauvecl.fits.flare_model import FlareModel, MeanSums, ReducedSums
 
 
+#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
+REFINEMENTS, NARROWER = 3, 8.0
+#: The search for the best temperature starts from every `COARSE`-th node of the model.
+COARSE = 4
+#: Share of a refinement's step above which a best temperature still moves; distance in nodes at which the gain beside
+#: it is then tried, its least rise that counts, and the number of narrowing grids that follow it.
+SETTLED, BESIDE, LEAST_RISE, CLIMBS = 0.5, 0.05, 1e-3, 4
+#: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
+ROUNDING = 1e-9
 #: Steps of the search for the end of an interval.
 STEPS = 12
 #: Temperatures within an interval at which derived quantities are computed.
@@ -52,6 +61,86 @@ TRIED, REACH = 25, 6.0
 NEWTON = 3
 
 
+def _inverse(matrix: Float) -> Float:
+    """Return the inverse of a matrix; most have one element or none, for which the general way takes far longer."""
+    return 1.0 / matrix if len(matrix) <= 1 else np.asarray(np.linalg.inv(matrix))
+
+
+def _product(matrix: Float, values: Float) -> Float:
+    """Return the product of a matrix (k, k) with values (k, ...)."""
+    return matrix[0] * values if len(matrix) == 1 else np.tensordot(matrix, values, 1) if len(matrix) else values
+
+
+class FactorAt(NamedTuple):
+    """Best factor on all light at temperatures, as a linear function of the amplitudes."""
+
+    without: Float  # for amplitudes of zero, shape (n, ...)
+    falls: Float  # its decrease per unit of each amplitude, shape (n_linear, n, ...)
+    variance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """Unbounded fit of a subset of the components."""
+
+    components: list[int]  # numbers of the fixed components that are fitted
+    bounded: bool  # whether amplitudes of fixed components are at least zero
+    covariance: Float  # of their amplitudes at a known blackbody, shape (n_component, n_component)
+    precision: Float  # inverse of the variance of the blackbody's amplitude, shape (n or 1, ...)
+    trade: Float  # decrease of their amplitudes per unit of the blackbody's, shape (n_component, n or 1, ...)
+    has_blackbody: bool  # whether the blackbody is fitted as well
+    fixed: Float  # amplitudes of the fixed components, shape (n_component, n, ...)
+    gain: Float  # decrease of chi-squared by the components, shape (n, ...)
+    amplitude: Float  # of the blackbody, shape (n, ...)
+
+    @cached_property
+    def rounding(self) -> Float:
+        """Smallest amplitudes of the fixed components that count as zero despite rounding."""
+        variance = np.diag(self.covariance).reshape(-1, *(1,) * (self.fixed.ndim - 1)) + self.trade**2 / self.precision
+        return -ROUNDING * np.sqrt(variance)
+
+    def positive(self, amplitude: Float, fixed: Float) -> NDArray[np.bool_]:
+        """Return whether no amplitude is below its bound, shape (n, ...)."""
+        positive = np.asarray(amplitude >= -ROUNDING / np.sqrt(self.precision))
+        return positive & (fixed >= self.rounding).all(axis=0) if self.bounded else positive
+
+    def value(self, factors: Float) -> Float:
+        """Return a sum of the best amplitudes, with factors (n_linear, n, ...)."""
+        return np.asarray(np.sum(factors[1:][self.components] * self.fixed, axis=0) + factors[0] * self.amplitude)
+
+    def change(self, factors: Float) -> tuple[Float, Float, Float]:
+        """Return the changes of amplitudes per change of a linear quantity, and the quantity's variance.
+
+        The factors of the quantity have the shape (n_linear, n, ...).
+        """
+        of_fixed = factors[1:][self.components]
+        fixed = _product(self.covariance, of_fixed)
+        variance = np.sum(of_fixed * fixed, axis=0)
+        if not self.has_blackbody:
+            return np.zeros_like(variance), fixed, variance
+        slope = factors[0] - np.sum(of_fixed * self.trade, axis=0)
+        step = slope / self.precision
+        return step, fixed - step * self.trade, variance + slope * step
+
+    def ratio(self, factors: Float, factor_at: FactorAt | None) -> Ratio:
+        """Return a sum of the amplitudes, with factors (n_linear, n, ...), over the factor on all light."""
+        value, variance = self.value(factors), self.change(factors)[2]
+        if factor_at is None:
+            return Ratio(value, np.ones_like(value), variance, np.zeros_like(value), np.zeros_like(value))
+        step, fixed, variance_of_factor = self.change(factor_at.falls)
+        covariance = np.sum(factors[1:][self.components] * fixed, axis=0) + factors[0] * step
+        bottom = factor_at.without - self.value(factor_at.falls)
+        return Ratio(value, bottom, variance, variance_of_factor + factor_at.variance, -covariance)
+
+    def reached(self, ratio: Ratio, end: Float, factors: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:
+        """Return the amplitudes at an end of a ratio; an open end is reached with any amplitudes of the face."""
+        finite = np.isfinite(end)
+        at = np.where(finite, end, 0.0)
+        step, fixed, _ = self.change(factors if factor_at is None else factors + at * factor_at.falls)
+        reach = np.where(finite, at * ratio.bottom - ratio.top, 0.0) / np.maximum(ratio.variance_at(at), 1e-300)
+        return self.amplitude + reach * step, self.fixed + reach * fixed
+
+
 @dataclass(frozen=True, eq=False)
 class BestFit:
     """Best fits of n frames."""
@@ -60,12 +149,12 @@ class BestFit:
     linear: Float  # shape (n, n_linear); amplitudes
     gain: Float  # shape (n,); chi-squared of the sums without a flare less that of the fit
 
-    def replaced(self, rows: NDArray[np.intp], others: BestFit) -> BestFit:
+    def replaced(self, rows: NDArray[np.intp], fits: BestFit) -> BestFit:
         """Return the fits with those of some frames replaced."""
-        every = {field.name: getattr(self, field.name).copy() for field in fields(self)}
-        for name, values in every.items():
-            values[rows] = getattr(others, name)
-        return BestFit(**every)
+        arrays = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, values in arrays.items():
+            values[rows] = getattr(fits, name)
+        return BestFit(**arrays)
 
 
 class Profile:
@@ -80,7 +169,7 @@ class Profile:
         """Take the sums of frames, (n, n_sum), and those of the factor on light, (n,), if it is unknown."""
         self.reduction, self.sums, self.light, self.bounded = reduction, sums, light, bounded
         self.nodes = reduction.log_k
-        self.rest = reduction.free(sums)
+        self.free_sums = reduction.free(sums)
 
     def bounded_rows(self, rows: NDArray[np.intp], reduction: MeanSums | None = None) -> Profile:
         """Return the bounded profile of some of the frames, optionally for another reduction to the same sums."""
@@ -94,43 +183,45 @@ class Profile:
         """
         hot, fixed = self.reduction.spline(log_k), self.reduction.fixed
         if log_k.shape[0] == 1:
-            along = np.tensordot(self.sums, hot[0], (1, -1))
+            projection = np.tensordot(self.sums, hot[0], (1, -1))
         else:
-            along = np.einsum("n...k,nk->n...", hot, self.sums)
-        whole, cross = np.einsum("...k,...k->...", hot, hot), np.moveaxis(hot @ fixed.T, -1, 0)
+            projection = np.einsum("n...k,nk->n...", hot, self.sums)
+        power, cross = np.einsum("...k,...k->...", hot, hot), np.moveaxis(hot @ fixed.T, -1, 0)
         of_fixed = (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *(1,) * (log_k.ndim - 1))
-        gram, every = fixed @ fixed.T, range(len(fixed))
+        gram, numbers = fixed @ fixed.T, range(len(fixed))
         for size in range(0 if self.bounded else len(fixed), len(fixed) + 1):
-            for some in map(list, combinations(every, size)):
-                inverse = _inverse(gram[some][:, some])
-                alone, share = (_product(inverse, each[some]) for each in (of_fixed, cross))
-                gain = np.sum(of_fixed[some] * alone, axis=0)
-                power = whole - np.sum(cross[some] * share, axis=0)
-                cold = Face(some, self.bounded, inverse, power, share, hot=False, others=alone, gain=gain,
-                            amplitude=np.zeros_like(power))  # fmt: skip
+            for components in map(list, combinations(numbers, size)):
+                covariance = _inverse(gram[components][:, components])
+                without_blackbody, trade = (_product(covariance, values[components]) for values in (of_fixed, cross))
+                gain = np.sum(of_fixed[components] * without_blackbody, axis=0)
+                precision = power - np.sum(cross[components] * trade, axis=0)
+                cold = Face(
+                    components, self.bounded, covariance, precision, trade, has_blackbody=False,
+                    fixed=without_blackbody, gain=gain, amplitude=np.zeros_like(precision),
+                )  # fmt: skip
                 yield cold
-                amplitude = (along - np.sum(cross[some] * alone, axis=0)) / power
-                others, gain = alone - amplitude * share, gain + amplitude**2 * power
-                yield replace(cold, hot=True, others=others, gain=gain, amplitude=amplitude)
+                amplitude = (projection - np.sum(cross[components] * without_blackbody, axis=0)) / precision
+                with_blackbody, gain = without_blackbody - amplitude * trade, gain + amplitude**2 * precision
+                yield replace(cold, has_blackbody=True, fixed=with_blackbody, gain=gain, amplitude=amplitude)
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
         gain = np.zeros((len(self.sums), *log_k.shape[1:]))
         for face in self.faces(log_k):
-            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
+            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.fixed))
         return gain
 
-    def gain_at_nodes(self, every: int = 1) -> Float:
-        """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
-        return self.gain(self.nodes[None, ::every])
+    def gain_at_nodes(self, stride: int = 1) -> Float:
+        """Return `gain` at each `stride`-th temperature of the model, shape (n, n_node)."""
+        return self.gain(self.nodes[None, ::stride])
 
     def factor_at(self, log_k: Float) -> FactorAt | None:
         """Return the best factor on all light at temperatures (n, ...) as a function of the amplitudes, if unknown."""
         light = self.reduction.light
         if light is None or self.light is None:
             return None
-        own = self.light.reshape(-1, *(1,) * (log_k.ndim - 1)) / light.scale
-        return FactorAt(light.expected + own, np.moveaxis(light.weights_of(log_k), -1, 0), light.scale**-2.0)
+        estimate = self.light.reshape(-1, *(1,) * (log_k.ndim - 1)) / light.scale
+        return FactorAt(light.expected + estimate, np.moveaxis(light.weights_of(log_k), -1, 0), light.scale**-2.0)
 
     def factor(self, best: BestFit) -> Float:
         """Return the factor on all light of best fits, shape (n,); 1 if it is known."""
@@ -145,13 +236,13 @@ class Profile:
         gain = np.zeros(len(self.sums))
         amplitudes = np.zeros((1 + len(self.reduction.fixed), gain.size))
         for face in self.faces(log_k):
-            better = (face.gain > gain) & face.positive(face.amplitude, face.others)
+            better = (face.gain > gain) & face.positive(face.amplitude, face.fixed)
             np.copyto(gain, face.gain, where=better)
             amplitudes[:, better] = 0.0
-            for k, values in zip((0, *(1 + k for k in face.some)), (face.amplitude, *face.others), strict=True):
+            for k, values in zip((0, *(1 + k for k in face.components)), (face.amplitude, *face.fixed), strict=True):
                 # Rounding may leave an amplitude below its bound.
-                own = np.maximum(values, 0.0) if self.bounded or k == 0 else values
-                np.copyto(amplitudes[k], own, where=better)
+                positive = np.maximum(values, 0.0) if self.bounded or k == 0 else values
+                np.copyto(amplitudes[k], positive, where=better)
         return BestFit(log_k, np.ascontiguousarray(amplitudes.T), gain)
 
     def _stationary(self, at_nodes: Float | None) -> Float:
@@ -161,40 +252,40 @@ class Profile:
         between two nodes, so that its maximum has a closed form.
         """
         units, cubics = self.reduction.directions
-        node = np.argmax(np.maximum(self.rest @ units.T, 0.0) if at_nodes is None else at_nodes, axis=1)
+        node = np.argmax(np.maximum(self.free_sums @ units.T, 0.0) if at_nodes is None else at_nodes, axis=1)
         interval = np.minimum(node, self.nodes.size - 2)
-        falling = np.vecdot(self.rest, cubics[interval, 2]) < 0.0
+        falling = np.vecdot(self.free_sums, cubics[interval, 2]) < 0.0
         interval = np.where(falling, np.maximum(node - 1, 0), interval)
-        c = np.einsum("npk,nk->pn", cubics[interval], self.rest)
+        c = np.einsum("npk,nk->pn", cubics[interval], self.free_sums)
         span = self.nodes[interval + 1] - self.nodes[interval]
         with np.errstate(divide="ignore", invalid="ignore"):
             top = c[2] / (np.sqrt(c[1] ** 2 - 3 * c[0] * c[2]) - c[1])
-        # Otherwise the best node is an end of the model's temperatures, or no light is found.
+        # Otherwise the best node is an end of the model's temperatures, or there is no light.
         best = np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node])
         return np.asarray(best)
 
     def _refined(self, at_nodes: Float | None) -> Float:
         """Return the best temperatures with bounds on all components, shape (n,)."""
-        every = COARSE if at_nodes is None else 1
-        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
+        stride = COARSE if at_nodes is None else 1
+        at_nodes = self.gain_at_nodes(stride) if at_nodes is None else at_nodes
         low, high = self.nodes[0], self.nodes[-1]
-        step = every * float(self.nodes[1] - self.nodes[0])
-        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
+        step = stride * float(self.nodes[1] - self.nodes[0])
+        x = self.nodes[::stride][np.argmax(at_nodes, axis=1)]
         for _ in range(REFINEMENTS):
-            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
-            g = self.gain(there)
+            tried = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
+            g = self.gain(tried)
             # The vertex of the parabola through three points, or the best point if there is no maximum.
-            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
-            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
-            under = right * a - left * b
-            over = right * a**2 - left * b**2
+            a, b = tried[:, 0] - tried[:, 1], tried[:, 2] - tried[:, 1]
+            rise_left, rise_right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
+            under = rise_right * a - rise_left * b
+            over = rise_right * a**2 - rise_left * b**2
             inside = np.abs(under) > 1e-300
-            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
-            three = there[np.arange(x.size), np.argmax(g, axis=1)]
-            vertex = np.where(inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2]), vertex, three)
-            x = np.where(self.gain(vertex) >= g.max(axis=1), vertex, three)
+            vertex = tried[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
+            best = tried[np.arange(x.size), np.argmax(g, axis=1)]
+            vertex = np.where(inside & (vertex >= tried[:, 0]) & (vertex <= tried[:, 2]), vertex, best)
+            x = np.where(self.gain(vertex) >= g.max(axis=1), vertex, best)
             # A smooth maximum moves less and less; bounds may bend the gain sharply.
-            moving = np.abs(x - there[:, 1]) > SETTLED * step
+            moving = np.abs(x - tried[:, 1]) > SETTLED * step
             step /= NARROWER
         self._climb(x, np.flatnonzero(moving))
         return np.asarray(x)
@@ -210,10 +301,10 @@ class Profile:
         rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
         if not rising.size:
             return
-        own = self.bounded_rows(rising)
+        profile = self.bounded_rows(rising)
         for _ in range(CLIMBS):
-            there = np.clip(x[rising, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
-            x[rising] = there[np.arange(rising.size), np.argmax(own.gain(there), axis=1)]
+            tried = np.clip(x[rising, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
+            x[rising] = tried[np.arange(rising.size), np.argmax(profile.gain(tried), axis=1)]
             step /= 4.0
 
     def ends(self, best: BestFit, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
@@ -246,6 +337,12 @@ class Profile:
         return low, high
 
 
+def with_bounds(reduction: ReducedSums, sums: Float, best: BestFit) -> BestFit:
+    """Return fits with amplitudes of at least zero, from fits without this bound."""
+    negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
+    return best.replaced(negative, Profile(reduction, sums[negative], bounded=True).best()) if negative.size else best
+
+
 def intervals(
     model: FlareModel, profile: Profile, best: BestFit, at_nodes: Float, allowed: float
 ) -> tuple[Float, Float]:
@@ -263,37 +360,38 @@ def intervals(
     least, factor = best.gain[:, None] - allowed, profile.factor(best)
 
     def ends_of_sum(spline: CubicSpline) -> tuple[Float, Float]:
-        factors, own_least = np.moveaxis(spline(x), -1, 0), least
-        own = faces if profile.bounded else faces[-1:]
-        ends = _linear_ends(own, factors, own_least, factor_at)
+        """Return the ends of a sum of amplitudes over the factor on all light."""
+        factors, least_gain = np.moveaxis(spline(x), -1, 0), least
+        tried = faces if profile.bounded else faces[-1:]
+        ends = _linear_ends(tried, factors, least_gain, factor_at)
         if light is not None and light.prior.size:
             value = np.vecdot(spline(best.log_k), best.linear) / factor
-            own_least = least - light.change(value, factor, ends[1] - ends[0], allowed)[:, None]
-            ends = _linear_ends(own, factors, own_least, factor_at)
+            least_gain = least - light.change(value, factor, ends[1] - ends[0], allowed)[:, None]
+            ends = _linear_ends(tried, factors, least_gain, factor_at)
         if not profile.bounded:
             ratio, closed = faces[-1].ratio(factors, factor_at), np.isfinite(high - low)
-            _bend(ends, profile, spline, x, ratio, faces[-1].gain - own_least, allowed, closed)
+            _correct_curved_ends(ends, profile, spline, x, ratio, faces[-1].gain - least_gain, allowed, closed)
         return ends
 
     kelvin = np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
     columns: list[tuple[Float, Float]] = []
-    known: dict[bytes, list[Float]] = {}
+    ends_per_unit: dict[bytes, list[Float]] = {}
     for derived, spline in zip(model.derived, model.splines, strict=True):
         if spline is None:
             ends = kelvin if derived.held is None else (np.full(low.size, derived.held),) * 2
         elif derived.factors is not None:
             # A luminosity is a multiple of a flux, so that their intervals are computed once.
             size = float(derived.factors.max())
-            alike = (derived.factors / size).astype(np.float32).tobytes()
-            if alike not in known:
-                known[alike] = [end / size for end in ends_of_sum(spline)]
-            ends = size * known[alike][0], size * known[alike][1]
+            key = (derived.factors / size).astype(np.float32).tobytes()
+            if key not in ends_per_unit:
+                ends_per_unit[key] = [end / size for end in ends_of_sum(spline)]
+            ends = size * ends_per_unit[key][0], size * ends_per_unit[key][1]
         else:
             lowest, highest = _ratio_ends(faces, spline(x), len(model.linear), least)
             ends = derived.offset + lowest, derived.offset + highest
         # Light that contradicts every factor above zero limits nothing.
-        none = ends[0] > ends[1]
-        columns.append((np.where(none, -np.inf, ends[0]), np.where(none, np.inf, ends[1])))
+        empty = ends[0] > ends[1]
+        columns.append((np.where(empty, -np.inf, ends[0]), np.where(empty, np.inf, ends[1])))
     lows, highs = (np.column_stack(side) for side in zip(*columns, strict=True))
     # A parabola through the outermost samples may exceed a bound.
     return np.maximum(lows, model.bounds) if profile.bounded else lows, highs
@@ -313,19 +411,19 @@ def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: Fac
     """
     lows, highs = np.full(factors.shape[1:], np.inf), np.full(factors.shape[1:], -np.inf)
     for face in faces:
-        left = face.gain - least
-        inside = left >= -1e-9 * (1.0 + np.abs(least))
+        room = face.gain - least
+        inside = room >= -1e-9 * (1.0 + np.abs(least))
         if not inside.any():
             continue
         ratio = face.ratio(factors, factor_at)
-        for sign, bounds, which in ((-1.0, lows, np.fmin), (1.0, highs, np.fmax)):
-            end = ratio.end(left, sign)
-            there = inside & face.positive(*face.reached(ratio, end, factors, factor_at)) if face.bounded else inside
-            which(bounds, end, out=bounds, where=there)
-    return extreme(lows, -1.0), extreme(highs, 1.0)
+        for sign, bounds, outermost in ((-1.0, lows, np.fmin), (1.0, highs, np.fmax)):
+            end = ratio.end(room, sign)
+            is_end = inside & face.positive(*face.reached(ratio, end, factors, factor_at)) if face.bounded else inside
+            outermost(bounds, end, out=bounds, where=is_end)
+    return _extreme(lows, -1.0), _extreme(highs, 1.0)
 
 
-def extreme(values: Float, sign: float) -> Float:
+def _extreme(values: Float, sign: float) -> Float:
     """Return the largest of samples (n, n_sample), or for a negative sign the smallest, by a parabola through three."""
     signed = sign * values
     k = np.argmax(signed, axis=1)
@@ -340,8 +438,8 @@ def extreme(values: Float, sign: float) -> Float:
     return np.asarray(sign * (middle + rise))
 
 
-def _bend(
-    ends: tuple[Float, Float], profile: Profile, spline: CubicSpline, x: Float, ratio: Ratio, left: Float,
+def _correct_curved_ends(
+    ends: tuple[Float, Float], profile: Profile, spline: CubicSpline, x: Float, ratio: Ratio, room: Float,
     allowed: float, closed: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Move the ends of a quantity that bends within the error of the temperature to those of simulated thresholds."""
@@ -355,22 +453,22 @@ def _bend(
     if not rows.size:
         return
     # Rounding does not exclude the ends of the temperature's interval.
-    x, left, ratio = x[rows], np.where(left > -1e-6, np.maximum(left, 0.0), left)[rows], ratio.rows(rows)
+    x, room, ratio = x[rows], np.where(room > -1e-6, np.maximum(room, 0.0), room)[rows], ratio.rows(rows)
     middle, share, error = ratio.value[:, half], np.ones(rows.size), (x[:, -1] - x[:, 0]) / np.sqrt(4 * allowed)
     if light is not None:
         factors = spline(profile.nodes) + float(np.median(middle)) * light.weights_of(profile.nodes)
         spline = scipy.interpolate.CubicSpline(profile.nodes, factors)
     for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-        reached = np.where(left < 0.0, -np.inf, sign * ratio.end(left, sign))
+        reached = np.where(room < 0.0, -np.inf, sign * ratio.end(room, sign))
         place = np.arange(rows.size), reached.argmax(axis=1)
         if light is not None:
             # Share of the variance that is not the factor's; the factor is straight.
             total = ratio.variance_at(middle[:, None])[place]
             share = np.clip(1.0 - light.scale**-2.0 * middle**2 / total, 0.0, 1.0)
-        moved = sign * np.sqrt(np.maximum(left[place], 0.0) * share)
+        moved = sign * np.sqrt(np.maximum(room[place], 0.0) * share)
         simulated = _simulated_thresholds(profile, spline, rows, x[place], moved, error, allowed)
-        more = left + (share * (simulated - allowed))[:, None]
-        end[rows] = extreme(np.where(more < 0.0, sign * -np.inf, ratio.end(more, sign)), sign)
+        corrected = room + (share * (simulated - allowed))[:, None]
+        end[rows] = _extreme(np.where(corrected < 0.0, sign * -np.inf, ratio.end(corrected, sign)), sign)
 
 
 def _simulated_thresholds(
@@ -385,31 +483,31 @@ def _simulated_thresholds(
     best value there in standard errors, and `error` the standard error of the log temperature.
     """
     units, nodes = profile.reduction.directions[0], profile.nodes
-    held = _held_direction(profile.reduction, spline, nodes)
-    length = np.linalg.norm(held, axis=1)[:, None]
+    directions = _quantity_direction(profile.reduction, spline, nodes)
+    length = np.linalg.norm(directions, axis=1)[:, None]
     sums, value = _sums_at_end(profile, spline, rows, x, moved)
     # A cubature of normal noise, exact for polynomials of third degree.
     n, z = sums.shape[1] - 2, np.sqrt(allowed)
     noise = np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)])
     distances = ALONG * np.arange(0.5, (z + BEYOND) / ALONG)
     distances = np.concatenate([-distances, distances])
-    out = np.repeat(distances, len(noise))
-    draws = np.column_stack([np.ones(out.size), out, np.tile(noise, (distances.size, 1))])
+    along = np.repeat(distances, len(noise))
+    draws = np.column_stack([np.ones(along.size), along, np.tile(noise, (distances.size, 1))])
     # Evenly spaced nodes around the temperatures, (n, TRIED).
     last = nodes.size - 1
     step = (nodes[-1] - nodes[0]) / last
     stride = np.clip(2 * REACH * error / step / (TRIED - 1), 1, last // (TRIED - 1)).astype(np.intp)
     first = np.rint((x - nodes[0]) / step).astype(np.intp) - stride * (TRIED // 2)
     tried = np.clip(first, 0, last - stride * (TRIED - 1))[:, None] + stride[:, None] * np.arange(TRIED)
-    root = np.empty((rows.size, out.size))
+    root = np.empty((rows.size, along.size))
     for start in range(0, rows.size, ENDS_AT_ONCE):
-        some = slice(start, start + ENDS_AT_ONCE)
-        own, node = sums[some], tried[some]
-        light = np.maximum(draws @ (own @ units[node].transpose(0, 2, 1)), 0.0)
-        away = own @ (held / length)[node].transpose(0, 2, 1)
-        away[:, 0] -= value[some, None] / length[node, 0]
-        root[some] = np.sqrt(_likelihood_ratio(light, draws @ away))
-    return _as_probable(root, out, z) ** 2
+        chunk = slice(start, start + ENDS_AT_ONCE)
+        chunk_sums, node = sums[chunk], tried[chunk]
+        light = np.maximum(draws @ (chunk_sums @ units[node].transpose(0, 2, 1)), 0.0)
+        away = chunk_sums @ (directions / length)[node].transpose(0, 2, 1)
+        away[:, 0] -= value[chunk, None] / length[node, 0]
+        root[chunk] = np.sqrt(_likelihood_ratio(light, draws @ away))
+    return _equally_probable(root, along, z) ** 2
 
 
 def _sums_at_end(
@@ -421,39 +519,39 @@ def _sums_at_end(
     otherwise.
     """
     reduction = profile.reduction
-    there, (basis, inverse) = _held_direction(reduction, spline, x), reduction.basis
+    direction, (basis, inverse) = _quantity_direction(reduction, spline, x), reduction.basis
     # The fitted sums at the end, with the quantity moved there.
     hot = reduction.spline(x)
     body = reduction.free(hot)
     body /= np.linalg.norm(body, axis=1)[:, None]
-    mean = profile.sums[rows] - profile.rest[rows] + np.vecdot(profile.rest[rows], body)[:, None] * body
-    mean += (moved / np.linalg.norm(there, axis=1))[:, None] * there
+    mean = profile.sums[rows] - profile.free_sums[rows] + np.vecdot(profile.free_sums[rows], body)[:, None] * body
+    mean += (moved / np.linalg.norm(direction, axis=1))[:, None] * direction
     amplitude = np.vecdot(mean, body) / np.vecdot(hot, body)
-    others = (mean @ basis.T - amplitude[:, None] * (hot @ basis.T)) @ inverse.T
+    fixed_amplitudes = (mean @ basis.T - amplitude[:, None] * (hot @ basis.T)) @ inverse.T
     # The gradient of the quantity: that at this temperature, and along the change of the mean with temperature.
     slope = reduction.spline(x, 1)
     change = reduction.free(slope)
     change -= np.vecdot(change, body)[:, None] * body
-    steeper = np.vecdot(spline(x, 1), np.column_stack([amplitude, others]))
-    steeper -= amplitude * np.vecdot(there, slope)
+    steeper = np.vecdot(spline(x, 1), np.column_stack([amplitude, fixed_amplitudes]))
+    steeper -= amplitude * np.vecdot(direction, slope)
     power = amplitude * np.vecdot(change, change)
-    normal = there + np.divide(steeper, power, out=np.zeros_like(power), where=power > 0.0)[:, None] * change
+    normal = direction + np.divide(steeper, power, out=np.zeros_like(power), where=power > 0.0)[:, None] * change
     normal /= np.linalg.norm(normal, axis=1)[:, None]
-    fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
+    fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *direction.shape))
     changes = np.linalg.qr(np.dstack([slope, hot, *fixed]))[0].transpose(0, 2, 1)
     across = changes - (changes @ normal[:, :, None]) * normal[:, None]
-    return np.concatenate([mean[:, None], normal[:, None], across], axis=1), np.vecdot(mean, there)
+    return np.concatenate([mean[:, None], normal[:, None], across], axis=1), np.vecdot(mean, direction)
 
 
-def _as_probable(root: Float, out: Float, z: float) -> Float:
+def _equally_probable(root: Float, along: Float, z: float) -> Float:
     """Return the values, (n,), below which roots of ratios are as probable as |distance| is below `z`.
 
     Shares of fits with a smaller ratio are smoothed alike for the simulated fits and where the quantity is straight.
-    `root`, (n, n_fit), holds the roots of the likelihood ratios of simulated fits, and `out`, (n_fit,), their distances
-    along the gradient of the quantity in standard errors.
+    `root`, (n, n_fit), holds the roots of the likelihood ratios of simulated fits, and `along`, (n_fit,), their
+    distances along the gradient of the quantity in standard errors.
     """
-    weights = np.exp(-(out**2) / 2)
-    level = weights @ scipy.special.ndtr((z - np.abs(out)) / SMOOTH)
+    weights = np.exp(-(along**2) / 2)
+    level = weights @ scipy.special.ndtr((z - np.abs(along)) / SMOOTH)
     end = np.full(len(root), z)
     for _ in range(NEWTON):
         below = (end[:, None] - root) / SMOOTH
@@ -467,34 +565,34 @@ def _as_probable(root: Float, out: Float, z: float) -> Float:
 
 def _parabola(samples: Float, middle: NDArray[np.intp]) -> tuple[Float, Float, Float]:
     """Return value, slope and second derivative of a parabola through three samples, per step, at the middle one."""
-    before, here, after = (samples.ravel().take(middle + side) for side in (-1, 0, 1))
-    return here, (after - before) / 2, before + after - 2 * here
+    before, middle_value, after = (samples.ravel().take(middle + side) for side in (-1, 0, 1))
+    return middle_value, (after - before) / 2, before + after - 2 * middle_value
 
 
 def _likelihood_ratio(light: Float, away: Float) -> Float:
     """Return the maximum of light^2 less that of light^2 - away^2 over samples (..., n_sample)."""
     n = light.shape[-1]
     first = np.arange(0, light.size, n).reshape(light.shape[:-1])
-    at_best, held = (np.clip(peak.argmax(axis=-1), 1, n - 2) + first for peak in (light, light**2 - away**2))
+    at_best, at_best_held = (np.clip(peak.argmax(axis=-1), 1, n - 2) + first for peak in (light, light**2 - away**2))
     value, slope, bend = _parabola(light, at_best)
     t = np.clip(np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0), -1.0, 1.0)
     free = value + t * (slope + t * bend / 2)
     # One step of Newton's method from the best sample.
-    (p0, p1, p2), (h0, h1, h2) = _parabola(light, held), _parabola(away, held)
+    (p0, p1, p2), (h0, h1, h2) = _parabola(light, at_best_held), _parabola(away, at_best_held)
     bend = h1**2 + h0 * h2 - p1**2 - p0 * p2
     t = np.clip(np.divide(p0 * p1 - h0 * h1, bend, out=np.zeros_like(bend), where=bend > 0.0), -1.0, 1.0)
     p0, h0 = p0 + t * (p1 + t * p2 / 2), h0 + t * (h1 + t * h2 / 2)
     return np.asarray(np.maximum(free**2 - p0**2 + h0**2, 0.0))
 
 
-def _held_direction(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> Float:
+def _quantity_direction(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> Float:
     """Return directions at temperatures (n,) whose product with the sums is a quantity's best value, (n, n_sum)."""
     (basis, inverse), hot, factors = reduction.basis, reduction.spline(log_k), spline(log_k)
-    along = hot @ basis.T
-    body = hot - along @ basis
-    others = factors[:, 1:] @ inverse
-    slope = factors[:, 0] - np.vecdot(others, along)
-    return np.asarray((slope / np.vecdot(body, body))[:, None] * body + others @ basis)
+    projection = hot @ basis.T
+    body = hot - projection @ basis
+    fixed_weights = factors[:, 1:] @ inverse
+    slope = factors[:, 0] - np.vecdot(fixed_weights, projection)
+    return np.asarray((slope / np.vecdot(body, body))[:, None] * body + fixed_weights @ basis)
 
 
 #: Derivatives of n fits with respect to a parameter: of the sums, (n, n_sum), of the quantities as they are recorded,
@@ -503,20 +601,21 @@ Slopes = tuple[Float, Float, Float]
 
 
 def covariance(
-    model: FlareModel, reduction: MeanSums, best: BestFit, factor: Float, other: Slopes | None = None
+    model: FlareModel, reduction: MeanSums, best: BestFit, factor: Float, second: Slopes | None = None
 ) -> Float:
     """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived).
 
-    The parameters are the amplitudes as they are recorded, the log temperature, an `other` one, and the factor on all
-    light if it is unknown. The result is NaN if a flare adds no light, or if its parameters are degenerate.
+    The parameters are the amplitudes as they are recorded, the log temperature, that of a `second` blackbody if there
+    is one, and the factor on all light if it is unknown. The result is NaN if a flare adds no light, or if its
+    parameters are degenerate.
     """
     log_k, linear, light = best.log_k, best.linear, reduction.light
     fixed = np.broadcast_to(reduction.fixed, (log_k.size, *reduction.fixed.shape))
     columns = [reduction.spline(log_k)[:, None], fixed, (linear[:, :1] * reduction.spline(log_k, 1))[:, None]]
     gradients = [_gradient(model, log_k, linear)]
-    if other is not None:
-        columns.append(other[0][:, None])
-        gradients.append(other[1][:, :, None])
+    if second is not None:
+        columns.append(second[0][:, None])
+        gradients.append(second[1][:, :, None])
     jacobian, gradient = np.concatenate(columns, axis=1), np.concatenate(gradients, axis=2)
     information = jacobian @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.einsum("nii->ni", information))
@@ -530,25 +629,25 @@ def covariance(
     if light is None:
         return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
     over = np.where(factor > 0.0, factor, np.nan)
-    which, _ = model.sums
-    gradient[:, which] /= over[:, None, None]
+    is_sum, _ = model.sums
+    gradient[:, is_sum] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
-    by_factor = np.where(which, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
-    slopes = [linear[:, 0] * light.spline(log_k, 1)[:, 0]] + ([] if other is None else [other[2]])
+    by_factor = np.where(is_sum, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
+    slopes = [linear[:, 0] * light.spline(log_k, 1)[:, 0]] + ([] if second is None else [second[2]])
     follows = -np.column_stack([light.weights_of(log_k), *(slope / light.scale for slope in slopes)])
     gradient += by_factor[:, :, None] * follows[:, None, :]
-    own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
-    return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1) + own)
+    from_factor = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
+    return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1) + from_factor)
 
 
 def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
     """Return derivatives with respect to amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
     n, m = linear.shape
     gradient = np.zeros((n, len(model.derived), m + 1))
-    which, spline = model.sums
-    gradient[:, which, :m] = spline(log_k)
-    gradient[:, which, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)
-    for q in np.flatnonzero(~which):
+    is_sum, spline = model.sums
+    gradient[:, is_sum, :m] = spline(log_k)
+    gradient[:, is_sum, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)
+    for q in np.flatnonzero(~is_sum):
         ratio = model.splines[q]
         if ratio is None:
             gradient[:, q, m] = np.exp(log_k) if model.derived[q].held is None else 0.0
@@ -558,100 +657,3 @@ def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
         gradient[:, q, 1] = ratio(log_k) / amplitude
         gradient[:, q, m] = ratio(log_k, 1) * linear[:, 1] / amplitude
     return gradient
-
-
-#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
-REFINEMENTS, NARROWER = 3, 8.0
-#: The search for the best temperature starts from every `COARSE`-th node of the model.
-COARSE = 4
-#: Share of a refinement's step above which a best temperature still moves; distance in nodes at which the gain beside
-#: it is then tried, its least rise that counts, and the number of narrowing grids that follow it.
-SETTLED, BESIDE, LEAST_RISE, CLIMBS = 0.5, 0.05, 1e-3, 4
-#: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
-ROUNDING = 1e-9
-
-
-def _inverse(matrix: Float) -> Float:
-    """Return the inverse of a matrix; most have one element or none, for which the general way takes far longer."""
-    return 1.0 / matrix if len(matrix) <= 1 else np.asarray(np.linalg.inv(matrix))
-
-
-def _product(matrix: Float, values: Float) -> Float:
-    """Return the product of a matrix (k, k) with values (k, ...)."""
-    return matrix[0] * values if len(matrix) == 1 else np.tensordot(matrix, values, 1) if len(matrix) else values
-
-
-class FactorAt(NamedTuple):
-    """Best factor on all light at temperatures, as a linear function of the amplitudes."""
-
-    without: Float  # for amplitudes of zero, shape (n, ...)
-    falls: Float  # its decrease per unit of each amplitude, shape (n_linear, n, ...)
-    variance: float
-
-
-@dataclass(frozen=True, eq=False)
-class Face:
-    """Unbounded fit of a subset of the components."""
-
-    some: list[int]  # fixed components
-    bounded: bool  # whether amplitudes of fixed components are at least zero
-    inverse: Float  # of their information, shape (n_some, n_some)
-    power: Float  # inverse of the variance of the blackbody's amplitude, shape (n or 1, ...)
-    share: Float  # decrease of the others per unit of the blackbody's, shape (n_some, n or 1, ...)
-    hot: bool  # whether the blackbody is fitted as well
-    others: Float  # amplitudes of the fixed components, shape (n_some, n, ...)
-    gain: Float  # decrease of chi-squared by the components, shape (n, ...)
-    amplitude: Float  # of the blackbody, shape (n, ...)
-
-    @cached_property
-    def rounding(self) -> Float:
-        """Smallest amplitudes of the fixed components that count as zero despite rounding."""
-        variance = np.diag(self.inverse).reshape(-1, *(1,) * (self.others.ndim - 1)) + self.share**2 / self.power
-        return -ROUNDING * np.sqrt(variance)
-
-    def positive(self, amplitude: Float, others: Float) -> NDArray[np.bool_]:
-        """Return whether no amplitude is below its bound, shape (n, ...)."""
-        positive = np.asarray(amplitude >= -ROUNDING / np.sqrt(self.power))
-        return positive & (others >= self.rounding).all(axis=0) if self.bounded else positive
-
-    def value(self, factors: Float) -> Float:
-        """Return a sum of the best amplitudes, with factors (n_linear, n, ...)."""
-        return np.asarray(np.sum(factors[1:][self.some] * self.others, axis=0) + factors[0] * self.amplitude)
-
-    def change(self, factors: Float) -> tuple[Float, Float, Float]:
-        """Return the changes of amplitudes per change of a linear quantity, and the quantity's variance.
-
-        The factors of the quantity have the shape (n_linear, n, ...).
-        """
-        own = factors[1:][self.some]
-        others = _product(self.inverse, own)
-        variance = np.sum(own * others, axis=0)
-        if not self.hot:
-            return np.zeros_like(variance), others, variance
-        slope = factors[0] - np.sum(own * self.share, axis=0)
-        step = slope / self.power
-        return step, others - step * self.share, variance + slope * step
-
-    def ratio(self, factors: Float, factor_at: FactorAt | None) -> Ratio:
-        """Return a sum of the amplitudes, with factors (n_linear, n, ...), over the factor on all light."""
-        value, variance = self.value(factors), self.change(factors)[2]
-        if factor_at is None:
-            return Ratio(value, np.ones_like(value), variance, np.zeros_like(value), np.zeros_like(value))
-        step, others, dims = self.change(factor_at.falls)
-        covariance = np.sum(factors[1:][self.some] * others, axis=0) + factors[0] * step
-        bottom = factor_at.without - self.value(factor_at.falls)
-        return Ratio(value, bottom, variance, dims + factor_at.variance, -covariance)
-
-    def reached(self, ratio: Ratio, end: Float, factors: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:
-        """Return the amplitudes at an end of a ratio; an open end is reached with any amplitudes of the face."""
-        finite = np.isfinite(end)
-        at = np.where(finite, end, 0.0)
-        step, others, _ = self.change(factors if factor_at is None else factors + at * factor_at.falls)
-        reach = np.where(finite, at * ratio.bottom - ratio.top, 0.0) / np.maximum(ratio.variance_at(at), 1e-300)
-        return self.amplitude + reach * step, self.others + reach * others
-
-
-def with_bounds(reduction: ReducedSums, sums: Float, best: BestFit) -> BestFit:
-    """Return fits with amplitudes of at least zero, from fits without this bound."""
-    negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
-    return best.replaced(negative, Profile(reduction, sums[negative], bounded=True).best()) if negative.size else best

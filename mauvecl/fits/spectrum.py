@@ -68,10 +68,9 @@ NEAR_GROUP = 1.1
 
 def _values(measured: Measurement | Forecast, values: Float, errors: Float) -> str:
     """Return quantities with errors and units as text."""
-    each = zip(measured.names, values, errors, measured.units, strict=True)
     return ", ".join(
         f"{name} = {formatted(value, '.4g')} +- {formatted(error, '.2g')} {unit}".rstrip()
-        for name, value, error, unit in each
+        for name, value, error, unit in zip(measured.names, values, errors, measured.units, strict=True)
     )
 
 
@@ -111,8 +110,8 @@ class Measurement:
     def __repr__(self) -> str:
         if not len(self.estimates):
             return "<Measurement of no frames>"
-        others = f"; the first of {len(self.estimates)} frames" if len(self.estimates) > 1 else ""
-        return f"<Measurement: {_values(self, self.estimates[0], self.errors[0])}{others}>"
+        count = f"; the first of {len(self.estimates)} frames" if len(self.estimates) > 1 else ""
+        return f"<Measurement: {_values(self, self.estimates[0], self.errors[0])}{count}>"
 
     @property
     def errors(self) -> Float:
@@ -132,22 +131,22 @@ class Measurement:
             if isinstance(value, np.ndarray):
                 axis = 1 if name in ("low", "high") else 0
                 values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
-        every = cls(**values | {"dof": min(part.dof for part in parts)})
-        return every if numbers is None else every.rows(np.argsort(np.concatenate(numbers)))
+        joined = cls(**values | {"dof": min(part.dof for part in parts)})
+        return joined if numbers is None else joined.rows(np.argsort(np.concatenate(numbers)))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all arrays that depend on the frames, for files."""
         values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
         return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
 
-    def rows(self, which: NDArray[Any]) -> Self:
+    def rows(self, index: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
-        rows: dict[str, Any] = {}
+        arrays: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
-                rows[field.name] = value[:, which] if field.name in ("low", "high") else value[which]
-        return replace(self, **rows)
+                arrays[field.name] = value[:, index] if field.name in ("low", "high") else value[index]
+        return replace(self, **arrays)
 
     def column(self, name: str) -> int:
         """Return the index of a quantity; raises InputError for an unknown name."""
@@ -226,20 +225,20 @@ def fit(
     [9000.0, 0.5]
     """
     problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
-    log_k, linear, cut = problem.pilot()
-    near, every = bool(cut.any()), np.arange(len(cut))
+    log_k, linear, saturates = problem.pilot()
+    any_saturates, all_rows = bool(saturates.any()), np.arange(len(saturates))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
-    saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if near else 0)
-    for rows in [*saturated, *[every] * (REFITS - 1)]:
-        for batch, reduction in problem.groups(log_k, linear, rows, near):
+    saturated = [np.flatnonzero(saturates)] * (SATURATED_REFITS if any_saturates else 0)
+    for rows in [*saturated, *[all_rows] * (REFITS - 1)]:
+        for batch, reduction in problem.groups(log_k, linear, rows, any_saturates):
             profile = problem.profile(reduction, batch)
             best = with_bounds(reduction, profile.sums, profile.best())
             log_k[batch], linear[batch] = best.log_k, best.linear
-    parts, order = [], []
-    for batch, reduction in problem.groups(log_k, linear, every, near):
-        parts.append(problem.measured(batch, reduction))
-        order.append(batch)
-    return Measurement.joined(parts, order)
+    measurements, batches = [], []
+    for batch, reduction in problem.groups(log_k, linear, all_rows, any_saturates):
+        measurements.append(problem.measured(batch, reduction))
+        batches.append(batch)
+    return Measurement.joined(measurements, batches)
 
 
 def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
@@ -300,38 +299,38 @@ class _Problem:
         used = usual.variance > 0.0
         counts = np.count_nonzero(raw > np.where(used, _highest_usable(quiet), np.inf), axis=1)
 
-        def best(rows: NDArray[np.intp], reduction: ReducedSums) -> None:
-            for some in _batches(rows):
-                fit_of_some = self.profile(reduction, some).best()
-                log_k[some], linear[some] = fit_of_some.log_k, fit_of_some.linear
+        def fit_rows(rows: NDArray[np.intp], reduction: ReducedSums) -> None:
+            for batch in _batches(rows):
+                best = self.profile(reduction, batch).best()
+                log_k[batch], linear[batch] = best.log_k, best.linear
 
-        best(np.flatnonzero(counts == 0), usual)
+        fit_rows(np.flatnonzero(counts == 0), usual)
         # Frames with about as many saturated pixels share the pixels that none of them saturates.
-        alike = np.rint(np.log(np.maximum(counts, 1)) / SATURATED_STEP).astype(np.intp)
-        for key in np.unique(alike[counts > 0]):
-            for some in _batches(np.flatnonzero((alike == key) & (counts > 0))):
-                shared = clipped_pixels(raw[some], quiet)
-                if (~shared & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
-                    best(some, self.reduction(None, clipped=shared))
+        step = np.rint(np.log(np.maximum(counts, 1)) / SATURATED_STEP).astype(np.intp)
+        for key in np.unique(step[counts > 0]):
+            for batch in _batches(np.flatnonzero((step == key) & (counts > 0))):
+                clipped = clipped_pixels(raw[batch], quiet)
+                if (~clipped & used).sum() >= LEAST_SHARED * (used.sum() - counts[batch].max()):
+                    fit_rows(batch, self.reduction(None, clipped=clipped))
                     continue
-                for row in some[:, None]:
-                    best(row, self.reduction(None, clipped=clipped_pixels(raw[row], quiet)))
+                for row in batch[:, None]:
+                    fit_rows(row, self.reduction(None, clipped=clipped_pixels(raw[row], quiet)))
         return log_k, linear, counts > 0
 
     def groups(
-        self, log_k: Float, linear: Float, rows: NDArray[np.intp], near: bool
+        self, log_k: Float, linear: Float, rows: NDArray[np.intp], any_saturates: bool
     ) -> Iterator[tuple[NDArray[np.intp], ReducedSums]]:
         """Yield batches of frames whose fitted flares have nearly the same variance, with their reduction.
 
-        The frames are some `rows` of all, and `near` says whether pixels are near saturation in any of these.
+        The frames are some `rows` of all; if `any_saturates`, pixels are near saturation in some of these.
         """
         quiet, model, raw, nuisances = self.quiet, self.model, self.raw, self.nuisances
         log_k, linear, n_pixel = log_k[rows], linear[rows], quiet.wavelength_nm.size
         edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
         ceiling = _highest_usable(quiet)
         # Pixels that saturate in every frame have no say.
-        seen = raw[rows].min(axis=0) <= ceiling if near else True
-        relative = seen * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
+        usable = raw[rows].min(axis=0) <= ceiling if any_saturates else True
+        relative = usable * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
         averaged = np.diff(np.append(edges, n_pixel))
         hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
         fixed = np.add.reduceat(model.fixed * relative, edges, axis=1) / averaged
@@ -342,17 +341,17 @@ class _Problem:
         order = np.argsort(number, kind="stable")
         # Single frames may have all the light that an exposure loses on average.
         undimmed = 1.0 / min(1.0, nuisances.mean_factor) if nuisances else 1.0
-        for some in np.split(order, np.cumsum(counts)[:-1]):
-            middle = np.mean(log_k[some])
-            mean = linear[some, 0].mean() * model.hot_spline(middle) + linear[some, 1:].mean(axis=0) @ model.fixed
+        for group in np.split(order, np.cumsum(counts)[:-1]):
+            middle = np.mean(log_k[group])
+            mean = linear[group, 0].mean() * model.hot_spline(middle) + linear[group, 1:].mean(axis=0) @ model.fixed
             highest = undimmed * mean
             if (quiet.n_frames * quiet.mean_raw_dn + NEAR_GROUP * highest > ceiling).any():
-                each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in some)
-                highest = undimmed * np.max(list(each), axis=0) if some.size <= BATCH else NEAR_GROUP * highest
-            own = rows[some]
-            clipped = clipped_pixels(raw[own], quiet) if near else None
+                flares = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in group)
+                highest = undimmed * np.max(list(flares), axis=0) if group.size <= BATCH else NEAR_GROUP * highest
+            numbers = rows[group]
+            clipped = clipped_pixels(raw[numbers], quiet) if any_saturates else None
             reduction = self.reduction(mean, highest_dn=highest, clipped=clipped)
-            yield from ((batch, reduction) for batch in _batches(own))
+            yield from ((batch, reduction) for batch in _batches(numbers))
 
     def measured(self, rows: NDArray[np.intp], reduction: ReducedSums) -> Measurement:
         """Measure the flares of some frames of one variance."""
@@ -364,14 +363,15 @@ class _Problem:
         low, high = (np.stack([interval[side] for interval in ends]) for side in (0, 1))
         # Intervals differ from unbounded ones only if they reach a bound.
         reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
-        near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
-        if near.size:
-            bounded = profile.bounded_rows(near)
-            nodes = bounded.gain_at_nodes()
-            there = bounded.best(nodes)
+        near_bound = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
+        if near_bound.size:
+            bounded = profile.bounded_rows(near_bound)
+            bounded_at_nodes = bounded.gain_at_nodes()
+            bounded_best = bounded.best(bounded_at_nodes)
             for k, rise in enumerate(self.rises):
-                low[k, near], high[k, near] = intervals(model, bounded, there, nodes, rise)
-            best = best.replaced(near, there)
+                ends_at_bound = intervals(model, bounded, bounded_best, bounded_at_nodes, rise)
+                low[k, near_bound], high[k, near_bound] = ends_at_bound
+            best = best.replaced(near_bound, bounded_best)
         return self.measurement(model, reduction, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
 
     def measurement(
@@ -485,18 +485,20 @@ def forecast_model(
     factor = nuisances.mean_factor if nuisances else 1.0
     # The flare as it is recorded.
     linear = factor * np.asarray(amplitudes, np.float64)[None]
-    log_k, single = np.log(np.atleast_1d(temperature_k)), model.single if isinstance(model, TwoTemperatures) else model
+    log_k = np.log(np.atleast_1d(temperature_k))
+    single = model.single if isinstance(model, TwoTemperatures) else model
     counts = factor * model.counts(temperature_k, amplitudes)
     reduction = ReducedSums.of(single, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
-    one, own, slopes = single, reduction, None
+    # The model with a second temperature held, and the response of the sums to it.
+    flare, response, slopes = single, reduction, None
     if isinstance(model, TwoTemperatures):
         second, log_k = float(log_k[1]), log_k[:1]
-        one, own = model.at(second), reduction.with_second(second, model.end(second))
+        flare, response = model.at(second), reduction.with_second(second, model.end(second))
         slopes = model.slopes(second, reduction, log_k, linear)
-    sums = linear[0] @ np.vstack([own.spline(log_k), own.fixed])
-    spread = covariance(one, own, BestFit(log_k, linear, np.array([sums @ sums])), np.array([factor]), slopes)[0]
-    values = derived_values(one, log_k, linear, np.array([factor]))[0]
-    return Forecast(one.names, one.units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(sums)))
+    sums, factors = linear[0] @ np.vstack([response.spline(log_k), response.fixed]), np.array([factor])
+    spread = covariance(flare, response, BestFit(log_k, linear, np.array([sums @ sums])), factors, slopes)[0]
+    values = derived_values(flare, log_k, linear, factors)[0]
+    return Forecast(flare.names, flare.units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(sums)))
 
 
 #: Number of second temperatures per node of the model, in steps of 0.6 %.
@@ -543,7 +545,7 @@ class TwoTemperatures:
             # The ratio of the flux at the telescope to that at the surface is proportional to the area.
             return np.asarray(self._bolometric(x)[..., 0] / np.exp(4 * x))
 
-        def both(derived: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
+        def with_second(derived: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
             if derived.factors is None or spline is None:
                 return derived
             return replace(derived, factors=np.insert(derived.factors[:end], 1, spline(log_k)[0], axis=1))
@@ -554,7 +556,7 @@ class TwoTemperatures:
         return FlareModel(
             single.log_k[:end], single.hot[:end], np.vstack([single.hot_spline(log_k), single.fixed]),
             (single.linear[0], "second", *single.linear[1:]),
-            (*map(both, single.derived, single.splines), kelvin, share),
+            (*map(with_second, single.derived, single.splines), kelvin, share),
         )  # fmt: skip
 
     def slopes(self, log_k: float, reduction: ReducedSums, lower: Float, linear: Float) -> Slopes:
@@ -595,8 +597,9 @@ def fit_two_temperatures(
     -------
     Measurement
         As for `fit`, with the lower temperature, and with amplitude, fluxes and areas of both blackbodies. The second
-        temperature and the ratio of its area to that of the first follow. Errors from the curvature are undefined if
-        a single blackbody fits best.
+        temperature and the ratio of its area to that of the first follow. If a single blackbody fits best, estimates
+        are those of `fit` with an undefined (NaN) second temperature of area 0, and errors from the curvature are
+        undefined.
 
     Raises
     ------
@@ -607,79 +610,89 @@ def fit_two_temperatures(
         raise InputError("the model must have blackbodies, with or without lines, and no Balmer jump", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
     problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
-    parts, order, two = [], [], TwoTemperatures(model)
+    measurements, order, two = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
     for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
-        whole, quiescent = problem.profile(reduction, rows), problem.quiescent_chi2(reduction, rows)
-        search = _Search(two, whole, reduction, problem.rises)
+        quiescent = problem.quiescent_chi2(reduction, rows)
+        search = _SecondTemperatures(two, problem.profile(reduction, rows), reduction, problem.rises)
         low, high = search.intervals()
         best_node = search.gain.argmax(axis=1)
         # Exposures with the same best second temperature are measured together.
         for node in np.unique(best_node):
-            here, log_k = np.flatnonzero(best_node == node), float(search.grid[node])
-            profile, ends = search.profile(int(node), here), (low[:, here], high[:, here])
-            best = replace(profile.best(profile.gain_at_nodes()), gain=search.gain[here, node])
+            alike, log_k = np.flatnonzero(best_node == node), float(search.grid[node])
+            profile, ends = search.profile(int(node), alike), (low[:, alike], high[:, alike])
+            best = replace(profile.best(profile.gain_at_nodes()), gain=search.gain[alike, node])
             second = log_k, two.slopes(log_k, reduction, best.log_k, best.linear)
-            parts.append(problem.measurement(two.at(log_k), reduction, profile, best, quiescent[here], ends, second))
-            order.append(rows[here])
-    return Measurement.joined(parts, order)
+            flare = two.at(log_k)
+            measurements.append(problem.measurement(flare, reduction, profile, best, quiescent[alike], ends, second))
+            order.append(rows[alike])
+    return _without_absent_blackbody(Measurement.joined(measurements, order), single)
 
 
-class _Search:
+def _without_absent_blackbody(measured: Measurement, single: Measurement) -> Measurement:
+    """Return a measurement of two blackbodies with the estimates of one where the light of the other is zero."""
+    n = len(single.estimates)
+    of_one = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
+    absent = (measured.amplitudes[:, :2] <= 0.0).any(axis=1, keepdims=True)
+    return replace(measured, estimates=np.where(absent, of_one, measured.estimates))
+
+
+class _SecondTemperatures:
     """Largest gains of exposures with a common variance at second temperatures in and next to their intervals."""
 
-    def __init__(self, model: TwoTemperatures, whole: Profile, reduction: ReducedSums, allowed: list[float]) -> None:
-        self._model, self._whole, self._reduction, self._allowed = model, whole, reduction, allowed
+    def __init__(self, model: TwoTemperatures, profile: Profile, reduction: ReducedSums, rises: list[float]) -> None:
+        self._model, self._sums, self._reduction, self._rises = model, profile, reduction, rises
         log_k = reduction.log_k
         #: Second log temperatures that may be tried, and the largest gain at each, minus infinity if not tried.
         self.grid = np.linspace(log_k[2 * APART], log_k[-1], PER_NODE * (log_k.size - 1 - 2 * APART) + 1)
-        self.gain = np.full((len(whole.sums), self.grid.size), -np.inf)
+        self.gain = np.full((len(profile.sums), self.grid.size), -np.inf)
         n, nodes = self.gain.shape
-        wanted = np.zeros((n, nodes), np.bool_)
-        wanted[:, ::COARSE] = True
+        selected = np.zeros((n, nodes), np.bool_)
+        selected[:, ::COARSE] = True
         # Twice around the intervals, since the first one may be a single temperature.
         for margin in (COARSE, COARSE // 4, None):
-            for node in np.flatnonzero(wanted.any(axis=0)):
-                rows = np.flatnonzero(wanted[:, node] & np.isinf(self.gain[:, node]))
+            for node in np.flatnonzero(selected.any(axis=0)):
+                rows = np.flatnonzero(selected[:, node] & np.isinf(self.gain[:, node]))
                 if rows.size:
                     self.gain[rows, node] = self.profile(int(node), rows).best().gain
             if margin is not None:
-                inside = self.gain >= self.gain.max(axis=1)[:, None] - max(allowed)
+                inside = self.gain >= self.gain.max(axis=1)[:, None] - max(rises)
                 low = np.maximum(inside.argmax(axis=1) - margin, 0)
                 high = np.minimum(nodes - 1 - inside[:, ::-1].argmax(axis=1) + margin, nodes - 1)
-                wanted[:] = False
+                selected[:] = False
                 for share in np.linspace(0.0, 1.0, TRIES + 1):
-                    wanted[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
+                    selected[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
 
     def profile(self, node: int, rows: NDArray[np.intp]) -> Profile:
         """Return the profile of some exposures at a second temperature."""
         log_k = float(self.grid[node])
-        return self._whole.bounded_rows(rows, self._reduction.with_second(log_k, self._model.end(log_k)))
+        return self._sums.bounded_rows(rows, self._reduction.with_second(log_k, self._model.end(log_k)))
 
     def intervals(self) -> tuple[Float, Float]:
         """Return the ends of intervals, (n_level, n, n_derived): the outermost ones at all second temperatures."""
         gain = self.gain.max(axis=1)
-        shape = len(self._allowed), gain.size, len(self._model.names)
+        shape = len(self._rises), gain.size, len(self._model.names)
         lows, highs = np.full(shape, np.inf), np.full(shape, -np.inf)
-        for node in np.flatnonzero((self.gain >= gain[:, None] - max(self._allowed)).any(axis=0)):
-            rows = np.flatnonzero(self.gain[:, node] >= gain - max(self._allowed))
+        for node in np.flatnonzero((self.gain >= gain[:, None] - max(self._rises)).any(axis=0)):
+            rows = np.flatnonzero(self.gain[:, node] >= gain - max(self._rises))
             profile, model = self.profile(int(node), rows), self._model.at(float(self.grid[node]))
             at_nodes = profile.gain_at_nodes()
-            own = profile.best(at_nodes)
-            for k, rise in enumerate(self._allowed):
-                there = np.flatnonzero(own.gain >= gain[rows] - rise)
-                if not there.size:
+            best = profile.best(at_nodes)
+            for k, rise in enumerate(self._rises):
+                inside = np.flatnonzero(best.gain >= gain[rows] - rise)
+                if not inside.size:
                     continue
-                limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
-                some = profile.bounded_rows(there)
-                low, high = intervals(model, some, limit, at_nodes[there], rise)
-                lows[k, rows[there]] = np.minimum(lows[k, rows[there]], low)
-                highs[k, rows[there]] = np.maximum(highs[k, rows[there]], high)
+                numbers = rows[inside]
+                # The rise is that above the best fit at all second temperatures.
+                fits = BestFit(best.log_k[inside], best.linear[inside], gain[numbers])
+                low, high = intervals(model, profile.bounded_rows(inside), fits, at_nodes[inside], rise)
+                lows[k, numbers] = np.minimum(lows[k, numbers], low)
+                highs[k, numbers] = np.maximum(highs[k, numbers], high)
         for k, n in np.ndindex(shape[:2]):
             # Ends of the second temperature, interpolated between the tried nodes.
             tried = np.isfinite(self.gain[n])
-            x, over = self.grid[tried], np.sqrt(gain[n] - self.gain[n, tried]) - np.sqrt(self._allowed[k])
+            x, over = self.grid[tried], np.sqrt(gain[n] - self.gain[n, tried]) - np.sqrt(self._rises[k])
             a, b = np.flatnonzero(over <= 0)[[0, -1]]
             lows[k, n, -2] = np.exp(np.interp(0.0, over[[a, a - 1]], x[[a, a - 1]])) if a > 0 else -np.inf
             highs[k, n, -2] = np.exp(np.interp(0.0, over[[b, b + 1]], x[[b, b + 1]])) if b < x.size - 1 else np.inf

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Ranges, ReducedSums
+from mauvecl.fits.least_squares import interval_end, least_squares
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
@@ -187,8 +188,8 @@ def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -
     if raw.ndim != 2:
         raise InputError(f"frames must have two dimensions, frames and pixels, not the shape {raw.shape}", key="frames")
     if stare is None:
-        here = quiet.conditions["temperature_c"]
-        stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=here)
+        celsius = quiet.conditions["temperature_c"]
+        stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=celsius)
     n_pixel = quiet.wavelength_nm.size
     if raw.shape != (stare.n_frames, n_pixel):
         raise InputError(f"frames must have the shape {(stare.n_frames, n_pixel)}, not {raw.shape}", key="frames")
@@ -209,13 +210,13 @@ def fit_bins(
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
         # Variances of the unknown changes, averaged over the bin.
         variances = {of: sd**2 / (b - a) for of, sd in stare.jitters.items()} | {"star": 0.0}
-        for each in stare.unknowns:
-            variances[each.of] += (each.sd * float(each.curve[a:b].mean())) ** 2
+        for unknown in stare.unknowns:
+            variances[unknown.of] += (unknown.sd * float(unknown.curve[a:b].mean())) ** 2
         if stare.pointing is not None:
             variances["light"] += stare.pointing.depth**2
         mean = [*strengths[a:b].mean(axis=0), *(float(np.sqrt(variances[of])) for of in CHANGING)]
         alike.setdefault((float(b - a), *np.round(mean, DIGITS).tolist()), []).append(k)
-    parts = []
+    measurements = []
     for (length, star, sky, dark, light, *spreads), rows in alike.items():
         n = int(length)
         stacked = replace(
@@ -223,19 +224,22 @@ def fit_bins(
             sky_electrons=sky * quiet.sky_electrons, dark_dn=dark * quiet.dark_dn,
             neighbour_electrons=light * quiet.neighbour_electrons,
         )  # fmt: skip
-        unknown = Nuisances.of(stacked, {}) if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
+        unknowns = Nuisances.of(stacked, {})
+        if nuisances is not None:
+            unknowns = replace(nuisances, spectra=n * nuisances.spectra)
         for of, sd in zip(CHANGING, spreads, strict=True):
             name = CHANGED_PART[of]
-            if not sd > 0.0 or name in unknown.names:
+            if not sd > 0.0 or name in unknowns.names:
                 continue
             if name == "star":
-                unknown = unknown.with_spectrum(name, stacked.net_source_dn, sd)
+                unknowns = unknowns.with_spectrum(name, stacked.net_source_dn, sd)
             elif spectrum_of(name, stacked).any():
-                unknown = unknown.joined(Nuisances.of(stacked, {name: sd}))
+                unknowns = unknowns.joined(Nuisances.of(stacked, {name: sd}))
         added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
-        own = unknown if unknown.names else None
-        parts.append(fit(added, stacked, model.stacked(n, light), own, levels=levels, skipped_nm=skipped_nm))
-    measurement = Measurement.joined(parts, list(alike.values()))
+        nuisances_of_bins = unknowns if unknowns.names else None
+        stacked_model = model.stacked(n, light)
+        measurements.append(fit(added, stacked, stacked_model, nuisances_of_bins, levels=levels, skipped_nm=skipped_nm))
+    measurement = Measurement.joined(measurements, list(alike.values()))
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, measurement)
 
 
@@ -253,9 +257,8 @@ Whiten = Callable[[Float], Float]
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
 #: Number of fits after the first, each with the covariances of the previous fit.
 REFITS = 3
-#: Number of steps to the end of an interval, and of those without damping; largest length of a step and of the last,
-#: relative to the root of the rise of chi-squared; relative regularisation of degenerate parameters.
-NEWTON_STEPS, UNDAMPED, LONGEST, CONVERGED, RIDGE = 30, 8, 1.5, 1e-3, 1e-10
+#: Relative change of chi-squared at which a fit has converged.
+TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,16 +353,16 @@ class _Data:
 
         return marginalised
 
-    def residuals(self, theta: Float, whiten: Whiten) -> Float:
-        """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
-        rise, log_k, *_ = self.flare(theta)
-        return np.asarray(whiten((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0])
+    def linearised(self, theta: Float, whiten: Whiten) -> tuple[Float, Float]:
+        """Return residuals, (n,), and their derivatives with respect to the parameters, (n, 6).
 
-    def jacobian(self, theta: Float, whiten: Whiten) -> Float:
-        """Return the derivatives of `residuals` with respect to the parameters, shape (n, 6)."""
+        The squares of the residuals add up to chi-squared with the unknown levels marginalised over.
+        """
         rise, log_k, of_rise, of_log_k = self.flare(theta)
         hot, slope = self.reduction.spline(log_k), self.reduction.spline(log_k, 1)
-        return np.asarray(-whiten(of_rise[..., None] * hot + (rise * of_log_k)[..., None] * slope).T)
+        changes = of_rise[..., None] * hot + (rise * of_log_k)[..., None] * slope
+        residuals, *jacobian = whiten(np.concatenate([(self.sums - rise[:, None] * hot)[None], -changes]))
+        return residuals, np.transpose(jacobian)
 
 
 @dataclass(frozen=True)
@@ -454,16 +457,16 @@ def fit_cooling(
     data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
     fit = _BestFit.of(data, stare.frame_s, peak_s, half_width_s, cooling=cooling)
     theta, free, best = fit.theta, fit.free, fit.chi2
-    jacobian = data.jacobian(theta, fit.whiten)[:, free]
+    jacobian = data.linearised(theta, fit.whiten)[1][:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
-    estimates, slopes = (np.array(each) for each in zip(*(q.at(theta, data) for q in quantities), strict=True))
+    estimates, slopes = (np.array(values) for values in zip(*(q.at(theta, data) for q in quantities), strict=True))
     scale = np.where([quantity.place == 0 for quantity in quantities], 1.0, estimates)
     slopes = scale[:, None] * slopes[:, free]
     spread = slopes @ covariance @ slopes.T
     rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
-    each = [fit.end(sign, rise, quantity) for sign, rise, quantity in product((-1.0, 1.0), rises, quantities)]
-    low, high = np.reshape(each, (2, len(rises), 1, len(quantities)))
+    ends = [fit.end(sign * rise, quantity) for sign, rise, quantity in product((-1.0, 1.0), rises, quantities)]
+    low, high = np.reshape(ends, (2, len(rises), 1, len(quantities)))
     dof = data.sums.size - free.size - sum(np.isinf(unknown.sd) for unknown in data.unknown)
     none = float(np.sum(data.whitening(theta, none=True)(data.sums[None]) ** 2))
     return Measurement(
@@ -497,8 +500,8 @@ def cooling_course(
         # What the unknown changes add to the sum over pixels follows from its residuals.
         components = Components(quiet, np.zeros((0, used.size)), used[None])
         changes, variance = components.directions(strengths), components.covariance(strengths)[:, 0, 0]
-        own = {of: change[:, 0] + (mean_dn if of == "light" else 0.0) for of, change in changes.items()}
-        levels = np.array([unknown.sd * unknown.curve * own[unknown.of] for unknown in stare.unknowns])
+        slopes = {of: change[:, 0] + (mean_dn if of == "light" else 0.0) for of, change in changes.items()}
+        levels = np.array([unknown.sd * unknown.curve * slopes[unknown.of] for unknown in stare.unknowns])
         drawn_dn = drawn_dn - fitted_amplitudes(levels, np.ones(len(levels)), drawn_dn - mean_dn, variance) @ levels
     return CoolingCourse(np.array([values[name] for name in measurement.names]), drawn_dn, mean_dn, np.exp(log_k))
 
@@ -532,7 +535,7 @@ def _data(
 
     if stare.pointing is not None:
         jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
-    unknown = [level(each.of, each.sd, each.curve) for each in stare.unknowns]
+    unknown = [level(change.of, change.sd, change.curve) for change in stare.unknowns]
     if nuisances is not None:
         sums, light = sums - weights @ nuisances.mean_dn, nuisances.mean_factor * light
         for sd, spectrum, of_flare in zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True):
@@ -558,7 +561,7 @@ def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cool
     power, along = np.sum(templates**2, axis=1), templates @ whiten(data.sums[None])[0]
     best = int(np.argmax(np.maximum(along, 0.0) ** 2 / power))
     amplitude, log_k = max(float(along[best] / power[best]), 1e-6), data.reduction.log_k[nodes][best]
-    # Somewhat hotter at the peak than on average, if it cools.
+    # A flare that cools is somewhat hotter at the peak than on average.
     first, last = (0.1, -0.3) if cooling else (0.0, 0.0)
     return np.array([peak_s, np.log(half_width_s), np.log(amplitude), log_k + first, last, np.log(2.0 * half_width_s)])
 
@@ -596,59 +599,29 @@ class _BestFit:
         """Fit a flare from a starting point, with the covariance of the frames at the fit before."""
         free = np.arange(len(PARAMETERS) if cooling else 4)
         first, last = data.edges[0, 0], data.edges[-1, 0]
-        whole, coolest, hottest = last - first + frame_s, data.model.log_k[0], data.model.log_k[-1]
+        duration_s, coolest, hottest = last - first + frame_s, data.model.log_k[0], data.model.log_k[-1]
         limits = (
-            np.array([first - whole, *np.log([0.1 * frame_s, 1e-9]), coolest + 1e-9, coolest - hottest,
+            np.array([first - duration_s, *np.log([0.1 * frame_s, 1e-9]), coolest + 1e-9, coolest - hottest,
                       np.log(frame_s)]),
-            np.array([first + 2 * whole, *np.log([whole, 1e9]), hottest - 1e-9, 0.0, np.log(100 * whole)]),
+            np.array([first + 2 * duration_s, *np.log([duration_s, 1e9]), hottest - 1e-9, 0.0,
+                      np.log(100 * duration_s)]),
         )  # fmt: skip
         whiten = data.whitening(None)
         theta = np.clip(_start(data, whiten, peak_s, half_width_s, cooling), *limits)
 
-        def with_free(values: Float) -> Float:
-            return np.concatenate([values, theta[free.size :]])
-
-        def residuals(values: Float) -> Float:
-            return data.residuals(with_free(values), whiten)
-
-        def jacobian(values: Float) -> Float:
-            return data.jacobian(with_free(values), whiten)[:, free]
+        def linearised(values: Float) -> tuple[Float, Float]:
+            residuals, jacobian = data.linearised(np.concatenate([values, theta[free.size :]]), whiten)
+            return residuals, jacobian[:, free]
 
         low, high = (end[free] for end in limits)
         for refits in range(REFITS + 1):
             whiten = data.whitening(theta) if refits else whiten
-            start, scale = np.clip(theta[free], low + 1e-9, high - 1e-9), np.where(free == 0, np.exp(theta[1]), 1.0)
-            solution = scipy.optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=scale)
-            theta = with_free(solution.x)
-        return cls(data, whiten, theta, free, limits, 2 * float(solution.cost))
+            best, chi2, _ = least_squares(linearised, theta[free], (low, high), TOLERANCE)
+            theta = np.concatenate([best, theta[free.size :]])
+        return cls(data, whiten, theta, free, limits, chi2)
 
-    def end(self, sign: float, rise: float, quantity: _Quantity) -> float:
-        """Return the end of an interval on one side; infinite if chi-squared does not rise that far within the limits.
-
-        Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals. A
-        parameter that reaches a limit stays there.
-        """
-        data, free, (low, high), there = self.data, self.free, self.limits, self.theta.copy()
-        allowed = self.chi2 + rise
-        for number in range(NEWTON_STEPS):
-            residuals, every = data.residuals(there, self.whiten), data.jacobian(there, self.whiten)
-            # A flare that does not cool leaves the cooling time without any effect.
-            power = np.sum(every**2, axis=0)
-            free = free[power[free] > 0.0]
-            jacobian, slope = every[:, free], quantity.at(there, data)[1][free]
-            information = jacobian.T @ jacobian + np.diag(RIDGE * power[free])
-            back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
-            if not slope @ along > 0.0:
-                break
-            room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
-            step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
-            length = float(np.linalg.norm(jacobian @ step)) / np.sqrt(rise)
-            # Steps across a kink, where the peak changes frames, would not become shorter.
-            share = min(1.0, LONGEST / length) * 0.5 ** max(0, number - UNDAMPED)
-            there[free] += share * step
-            outside = (there < low) | (there > high)
-            if outside[free].any():
-                there, free = np.clip(there, low, high), free[~outside[free]]
-            elif share * length < CONVERGED:
-                return quantity.at(there, data)[0]
-        return sign * np.inf
+    def end(self, rise: float, quantity: _Quantity) -> float:
+        """Return the end of an interval at a rise of chi-squared, as `interval_end` does; infinite if it is open."""
+        linearised, value = partial(self.data.linearised, whiten=self.whiten), partial(quantity.at, data=self.data)
+        end, closed = interval_end(linearised, value, self.theta, self.limits, self.chi2, rise, self.free)
+        return end if closed else float(np.copysign(np.inf, rise))

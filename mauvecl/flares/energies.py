@@ -385,10 +385,10 @@ class RateTable(Rates):
         rows = Rows(read_table(path, "table of rates"), f"table of rates {shortened(path.name)}")
         columns = []
         for name, unit in (("energy", "erg"), ("rate", "1 / d")):
-            held = rows.first((name,))
-            if held is None:
+            column = rows.first((name,))
+            if column is None:
                 raise InputError(f"{rows.named} has no column {name!r}, but needs energy and rate", key="columns")
-            values = [rows.number(held, row, unit) for row in range(rows.n)]
+            values = [rows.number(column, row, unit) for row in range(rows.n)]
             columns.append(np.array([np.nan if value is None else value for value in values]))
         energy, rate = columns
         largest = np.nanmax(energy, initial=0.0)

@@ -53,10 +53,10 @@ class Components:
         n_pixel = self.quiet.wavelength_nm.size
         if self.quiet.n_frames != 1:
             raise InputError.of("n_frames", self.quiet.n_frames, "one frame of the stare")
-        for name, what, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
+        for name, text, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
             spectra = np.asarray(getattr(self, name), np.float64)
             if spectra.ndim != 2 or spectra.shape[1] != n_pixel or len(spectra) < least:
-                raise InputError(f"{what} must have the shape (n, {n_pixel}), not {spectra.shape}", key=name)
+                raise InputError(f"{text} must have the shape (n, {n_pixel}), not {spectra.shape}", key=name)
             set_read_only(self, **{name: spectra})
         if len(self.flare_electrons) > MOST_FLARES:
             raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
@@ -250,13 +250,13 @@ class StareExpectation:
         frame_s, coefficients = self.stare.frame_s, self.coefficients
         net, sd, mean = (np.empty((self.stare.n_frames, len(weights)), kind) for _ in range(3))
         for begin in range(0, len(weights), MOST_STATISTICS):
-            there = slice(begin, begin + MOST_STATISTICS)
-            rows = weights[there]
+            part = slice(begin, begin + MOST_STATISTICS)
+            rows = weights[part]
             first = self._bare.mean_dn @ rows.T
             drawn = np.asarray(draw(self.components(rows)), np.float64)
             # The sums are relative to the quiescent light at the temperature of its expectation.
-            net[:, there] = (drawn + first[0] + first[1] + first[3] + (1.0 - coefficients[:, 2:3]) * first[2]) / frame_s
-            sd[:, there], mean[:, there] = self.expected(rows)
+            net[:, part] = (drawn + first[0] + first[1] + first[3] + (1.0 - coefficients[:, 2:3]) * first[2]) / frame_s
+            sd[:, part], mean[:, part] = self.expected(rows)
         return net, sd, mean
 
     def raw(self, draw: Draw) -> Float:
@@ -264,8 +264,8 @@ class StareExpectation:
         frames = np.tile(self.quiet.recorded_dn, (self.stare.n_frames, 1))
         pixels = np.flatnonzero(self.used)
         for begin in range(0, pixels.size, MOST_STATISTICS):
-            some = pixels[begin : begin + MOST_STATISTICS]
-            frames[:, some] += draw(self.components(np.eye(self.used.size)[some]))
+            part = pixels[begin : begin + MOST_STATISTICS]
+            frames[:, part] += draw(self.components(np.eye(self.used.size)[part]))
         return frames
 
     @property
@@ -317,9 +317,9 @@ def draw_light_curves(
     filled = np.flatnonzero(elements.any(axis=1))
     spectrum, spectrum_sd, spectrum_mean = expectation.net(elements[filled], draw, np.float32)
     # Each pixel belongs to one element, so their sum is the whole range.
-    whole = spectrum.sum(axis=1, dtype=np.float64), *expectation.expected(used[None])
-    parts = expectation.net(np.array(rows).reshape(len(rows), used.size), draw)
-    flux, sd, mean = (np.column_stack(both) for both in zip(whole, parts, strict=True))
+    total = spectrum.sum(axis=1, dtype=np.float64), *expectation.expected(used[None])
+    bands = expectation.net(np.array(rows).reshape(len(rows), used.size), draw)
+    flux, sd, mean = (np.column_stack(columns) for columns in zip(total, bands, strict=True))
     low, high = quiet.wavelength_nm[[0, -1]]
     names = (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm))
     element_nm = quiet.element_wavelength_nm[filled]

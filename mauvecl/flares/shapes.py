@@ -117,8 +117,8 @@ def between(first: Float, last: Float) -> Float:
 
 def consecutive_integrals(shape: Integrable, tau: ArrayLike) -> Float:
     """Return the integrals between consecutive values of tau along the last axis, in half-widths."""
-    both = sides(shape, tau)
-    return between(both[..., :-1], both[..., 1:])
+    integrals = sides(shape, tau)
+    return between(integrals[..., :-1], integrals[..., 1:])
 
 
 class Davenport2014(Shape):

@@ -195,11 +195,10 @@ def temperatures_of(events: Sequence[Event]) -> Float:
         law = _cooling_of(event)
         if law is not None:
             cooling.append(law)
-        elif all(abs(event.hottest_k - other) >= SAME_K for other in constant):
+        elif all(abs(event.hottest_k - kelvin) >= SAME_K for kelvin in constant):
             constant.append(event.hottest_k)
-    left = MOST_TEMPERATURES - len(constant)
-    if left < (LEAST_STEPS if cooling else 0):
-        most = MOST_TEMPERATURES - (LEAST_STEPS if cooling else 0)
+    most = MOST_TEMPERATURES - (LEAST_STEPS if cooling else 0)
+    if len(constant) > most:
         raise InputError(
             f"flares of a stare must have at most {most} constant "
             f"temperatures{' besides those that cool' if cooling else ''}, not {len(constant)}",
@@ -207,8 +206,8 @@ def temperatures_of(events: Sequence[Event]) -> Float:
         )
     if cooling:
         low, high = min(c.end_k for c in cooling), max(c.peak_k for c in cooling)
-        nodes = 1.0 / np.linspace(1.0 / low, 1.0 / high, left)
-        constant += [float(k) for k in nodes if all(abs(k - other) >= SAME_K for other in constant)]
+        nodes = 1.0 / np.linspace(1.0 / low, 1.0 / high, MOST_TEMPERATURES - len(constant))
+        constant += [float(k) for k in nodes if all(abs(k - kelvin) >= SAME_K for kelvin in constant)]
     return np.sort(np.array(constant))
 
 
@@ -259,6 +258,8 @@ def _node_weights(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
 
 #: Largest number of frames of a stare, twenty years of 5 s.
 MOST_FRAMES = 2**27
+#: Arrays of a stare with a value per frame.
+PER_FRAME = ("start_s", "star", "light", "sky", "temperature_c")
 #: Largest relative standard deviation; with larger ones, levels could be negative.
 LARGEST_SPREAD = 0.2
 HOUR_S = 3600.0
@@ -331,13 +332,13 @@ class Stare:
     pointing: PointingDrifts | None = None
 
     def __post_init__(self) -> None:
-        own = {name: getattr(self, name) for name in ("start_s", "star", "light", "sky", "temperature_c")}
-        set_read_only(self, **own)
+        arrays = {name: getattr(self, name) for name in PER_FRAME}
+        set_read_only(self, **arrays)
         n = self.start_s.size
         if not 1 <= n <= MOST_FRAMES:
             raise InputError.of("n_frames", n, f"between 1 and {MOST_FRAMES}")
         curves = [(unknown.name, unknown.curve) for unknown in self.unknowns]
-        for name, values in [*((name, getattr(self, name)) for name in own), *curves]:
+        for name, values in [*((name, getattr(self, name)) for name in PER_FRAME), *curves]:
             if values.shape != (n,):
                 raise InputError(f"{name} of the stare must have the shape ({n},), not {values.shape}", key=name)
             if not np.isfinite(values).all():
@@ -491,9 +492,8 @@ class Stare:
 
 def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
     """Return a stare with some of its frames."""
-    names = ("start_s", "star", "light", "sky", "temperature_c")
     unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
-    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})
+    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in PER_FRAME})
 
 
 def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float]]) -> Float:
@@ -589,21 +589,21 @@ def stare_along(
     times = TimeGrid(start, duration_s / DAY_S, frame_s)
     track = orbit.track(times)
     visible = Visibility.of(track, place.direction[None], limits)
-    seen = visible.seen[:, 0]
-    if not seen.any():
+    is_visible = visible.seen[:, 0]
+    if not is_visible.any():
         raise InputError(
             f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}; try another time "
             "or other limits",
             key="target",
         )
     # All but the temperature follow from a stare without gaps.
-    whole = Stare.of(times.n * frame_s, frame_s=frame_s, **unknowns)
+    continuous = Stare.of(times.n * frame_s, frame_s=frame_s, **unknowns)
     # The temperature is computed from several time constants before the first frame on, in the same kind of orbit.
     settling_s = SETTLING * thermal.time_constant_s
     past = TimeGrid(times.iso(-settling_s, 3), settling_s / DAY_S, PAST_STEP_S)
     before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
     first = float(thermal.temperature_c(before.sunlight, PAST_STEP_S)[-1])
     temperature = thermal.temperature_c(track.sunlight, times.step_s, first)
-    stare = select_frames(replace(whole, temperature_c=temperature), seen)
-    hits = particles.rate_per_cm2_s(track)[seen]
-    return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))
+    stare = select_frames(replace(continuous, temperature_c=temperature), is_visible)
+    hits = particles.rate_per_cm2_s(track)[is_visible]
+    return OrbitStare(stare, hits, visible.shadow[is_visible], times.iso(0.0), tuple(orbit.messages(times)))

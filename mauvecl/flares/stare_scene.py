@@ -49,20 +49,20 @@ class Flares:
     """Flares that are added to stares."""
 
     # Amplitude of each flare spectrum in each frame, shape (n_row, n_frame, n_flare), with one row or one per stare.
-    given: NDArray[Any]
-    amplitudes: Floats  # factors on `given`, shape (n_scenario, n_amplitude_row)
+    coefficients: NDArray[Any]
+    amplitudes: Floats  # factors on `coefficients`, shape (n_scenario, n_amplitude_row)
 
     @classmethod
     def of(cls, components: Components, stare: Stare, flare: Any, amplitudes: Any, count: int) -> Self:
         """Validate the arguments of `Stares.frames`; raises InputError for wrong shapes and negative values."""
         n_frames, n_flares = stare.n_frames, components.n_flares
-        given = np.zeros((1, n_frames, n_flares), np.float32) if flare is None else np.asarray(flare)
-        if given.ndim == 2:
-            given = given[None]
-        if given.shape[1:] != (n_frames, n_flares) or given.shape[0] not in (1, count):
+        coefficients = np.zeros((1, n_frames, n_flares), np.float32) if flare is None else np.asarray(flare)
+        if coefficients.ndim == 2:
+            coefficients = coefficients[None]
+        if coefficients.shape[1:] != (n_frames, n_flares) or coefficients.shape[0] not in (1, count):
             raise InputError(
                 f"flare coefficients must have the shape ({count}, {n_frames}, {n_flares}), or one row for all stares, "
-                f"not {given.shape}",
+                f"not {coefficients.shape}",
                 key="flare",
             )
         factors = np.ones((1, 1)) if amplitudes is None else np.asarray(amplitudes)
@@ -72,31 +72,32 @@ class Flares:
                 f"not {factors.shape}",
                 key="amplitudes",
             )
-        for what, values in (("flare coefficients", given), ("amplitudes", factors)):
+        for name, values in (("flare coefficients", coefficients), ("amplitudes", factors)):
             # The ends of values that include NaN are NaN.
             for end in (values.min(initial=0.0), values.max(initial=0.0)):
                 if not 0 <= end <= LARGEST:
-                    raise InputError.of(what, end, f"between 0 and {LARGEST:g}")
-        return cls(given, factors.astype(np.float32))
+                    raise InputError.of(name, end, f"between 0 and {LARGEST:g}")
+        return cls(coefficients, factors.astype(np.float32))
 
     @cached_property
     def rows(self) -> Floats:
         """Amplitudes for the kernels, shape (n_row, n_flare, n_padded_frame)."""
-        n_row, n_frames, n_flares = self.given.shape
+        n_row, n_frames, n_flares = self.coefficients.shape
         rows = np.zeros((n_row, n_flares, padded_frames(n_frames)), np.float32)
-        rows[:, :, :n_frames] = np.moveaxis(self.given, 2, 1)
+        rows[:, :, :n_frames] = np.moveaxis(self.coefficients, 2, 1)
         return rows
 
     def part(self, first: int, count: int) -> Flares:
         """Return the flares of some stares."""
-        there = slice(first, first + count)
-        amplitudes = self.amplitudes if self.amplitudes.shape[1] == 1 else self.amplitudes[:, there]
-        return Flares(self.given if len(self.given) == 1 else self.given[there], np.ascontiguousarray(amplitudes))
+        part = slice(first, first + count)
+        amplitudes = self.amplitudes if self.amplitudes.shape[1] == 1 else self.amplitudes[:, part]
+        coefficients = self.coefficients if len(self.coefficients) == 1 else self.coefficients[part]
+        return Flares(coefficients, np.ascontiguousarray(amplitudes))
 
     @cached_property
     def most(self) -> Float:
         """Largest coefficient of each spectrum, shape (n_flare,)."""
-        return np.asarray(self.given.max(axis=(0, 1)) * np.float64(self.amplitudes.max()))
+        return np.asarray(self.coefficients.max(axis=(0, 1)) * np.float64(self.amplitudes.max()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +165,7 @@ class StareScene:
         job["temperature_jitter"] = stare.temperature_jitter_c
         job["dark_slope"] = self.components.quiet.conditions["dark_slope_per_c"]
         job["scenario_count"], job["amplitude_rows"] = flares.amplitudes.shape
-        job["flare_rows"] = len(flares.given)
+        job["flare_rows"] = len(flares.coefficients)
         return job
 
     def losses(self, numbers: NDArray[np.uint64], seed: int) -> Floats:
@@ -250,7 +251,7 @@ def unique(n: int, order: int) -> list[tuple[int, ...]]:
 
 
 def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
-    """Pad with zeros to whole blocks of frames."""
+    """Pad with zeros to full blocks of frames."""
     more = padded_frames(values.shape[-1]) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)]).astype(kind)
 
@@ -331,7 +332,7 @@ class StaresRequest(Countable):
     least: ClassVar[int] = 64
 
     def __post_init__(self) -> None:
-        if len(self.flares.given) > 1 or self.flares.amplitudes.shape[1] > 1:
+        if len(self.flares.coefficients) > 1 or self.flares.amplitudes.shape[1] > 1:
             object.__setattr__(self, "rows_from", self.start)
 
     @cached_property
@@ -361,8 +362,8 @@ class KeepStatistics:
 
     def __call__(self, values: Floats, first: int, glow: Floats | None = None) -> Arrays:
         """Return one row per stare, with scenarios on the second axis."""
-        kept = {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
-        return kept if glow is None else kept | {"glow": glow.copy()}
+        arrays = {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
+        return arrays if glow is None else arrays | {"glow": glow.copy()}
 
 
 def joined(request: StaresRequest, parts: Sequence[Arrays]) -> Arrays:
@@ -392,7 +393,7 @@ class SumTable:
     rows: Floats
     #: Shape (n_statistic * (n_statistic + 1) / 2,); lower triangular matrix that converts whitened sums to the
     #: statistics.
-    whole: Floats
+    lower: Floats
     fourths: bool  # whether fourth cumulants are needed
 
     @classmethod
@@ -424,7 +425,7 @@ class SumTable:
     @property
     def packed(self) -> Floats:
         """Array for the kernel."""
-        return np.concatenate([self.rows.ravel(), self.whole])
+        return np.concatenate([self.rows.ravel(), self.lower])
 
 
 def check_sums(scene: StareScene, flares: Flares) -> None:

@@ -22,7 +22,6 @@ from mauvecl.search.flare_fits import (
     KELVIN,
     PEAK,
     WIDTH,
-    BetterFitError,
     BlendFit,
     Block,
     Factor,
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 
 
 #: Values of a fit without a measurement.
-UNMEASURED = FittedFlares(**{each.name: np.full(1, np.nan) for each in fields(FittedFlares)})
+UNMEASURED = FittedFlares(**{field.name: np.full(1, np.nan) for field in fields(FittedFlares)})
 #: Share of a flare's S/N that may remain in nearby residuals without an alarm, because its shape or temperature differs
 #: from that of the fit.
 LEFT_BEHIND = 0.05
@@ -114,17 +113,13 @@ def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor 
         changed = set(new)
         for _ in range(TURNS):
             changed = search.fitted(changed)
-    for number, block in enumerate(search.blocks(), 1):
-        theta, measured = _thetas(block), list[Measured]()
-        rows = search.sums.block(theta, _thetas(search.found))
-        best = rows.fit(theta)
-        while not measured:
-            try:
-                measured = [_measured(rows, best, j, energy) for j in range(len(block))]
-            except BetterFitError as better:
-                best = rows.fit(better.theta)
-        for candidate, values in zip(block, measured, strict=True):
-            found.append(Alarm(candidate.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
+    for number, group in enumerate(search.blocks(), 1):
+        theta = _thetas(group)
+        block = search.sums.block(theta, search.others(group))
+        best = block.fit(theta)
+        for j, candidate in enumerate(group):
+            measured = _measured(block, best, j, energy)
+            found.append(Alarm(candidate.rho, *measured, number, len(group), best.chi2, best.dof, best.p_value))
     return sorted(found, key=lambda alarm: -alarm.rho)
 
 
@@ -151,6 +146,10 @@ class _StareSearch:
         n = MAX_FLARES_PER_FIT
         return [block[k : k + n] for block in blocks for k in range(0, len(block), n)]
 
+    def others(self, group: Collection[Candidate]) -> Float:
+        """Return the parameters of the found flares outside of a group."""
+        return _thetas(candidate for candidate in self.found if candidate not in group)
+
     def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Callable[[int], Candidate]]]:
         """Yield per row the largest excess over fit residuals and the peak time of each onset, and its candidate."""
         theta, (low, high) = _thetas(self.found), self.sums.bounds
@@ -158,9 +157,9 @@ class _StareSearch:
         # Flares at the bounds of the fit may remain in the residuals entirely.
         at_end = np.minimum(theta - low, high - theta) <= AT_BOUND * (high - low)
         wrong = self.sums.light(theta[at_end[:, [PEAK, WIDTH]].any(axis=1)])
-        both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
+        residuals = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
         search = self.sums.survey.search
-        for row, rho in search.values(both.astype(np.float32)):
+        for row, rho in search.values(residuals.astype(np.float32)):
             peaks = search.peaks_s(row)
             rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
             # Statistics of flares within reach of the templates.
@@ -208,7 +207,7 @@ class _StareSearch:
         if not blocks:
             return []
         overlaps = [[self.sums.overlap(candidate.theta) for candidate in block] for block in blocks]
-        spans = [(min(a for a, _ in each), max(b for _, b in each)) for each in overlaps]
+        spans = [(min(a for a, _ in ends), max(b for _, b in ends)) for ends in overlaps]
         best: list[list[tuple[float, Candidate]]] = [[] for _ in blocks]
         for excess, peaks, candidate_at in self._values():
             for several, (first, last) in zip(best, spans, strict=True):
@@ -227,21 +226,21 @@ class _StareSearch:
     def _improves(self, block: list[Candidate], candidate: Candidate) -> bool:
         """Return whether a further flare improves a block significantly, and update the flares to the better fit."""
         before, with_it = _thetas(block), [*block, candidate]
-        rows = self.sums.block(_thetas(with_it), _thetas([*self.found, candidate]))
+        rows = self.sums.block(_thetas(with_it), self.others(block))
         best = self._best(rows, with_it, [candidate])
         # The other flares alone may fit better from their new parameters.
         alone = min((rows.fit(before), rows.without(best, len(block))), key=lambda fit: fit.chi2)
         fall = alone.chi2 - best.chi2
         # The other flares may have another shape, which changes their overlap with this one.
-        mine, others = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
-        seen = abs(float(mine @ others)) / max(float(np.linalg.norm(mine)), 1e-300)
-        rests = max(LEFT_UNSEEN * seen, LEFT_BEHIND * max(each.rho for each in block))
-        improves = bool(fall >= (self.threshold + rests) ** 2)
+        light, other_light = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
+        response = abs(float(light @ other_light)) / max(float(np.linalg.norm(light)), 1e-300)
+        allowed = max(LEFT_UNSEEN * response, LEFT_BEHIND * max(flare.rho for flare in block))
+        improves = bool(fall >= (self.threshold + allowed) ** 2)
         if improves:
             candidate.rho = float(np.sqrt(fall))
         flares, better = (with_it, best) if improves else (block, alone)
-        for each, theta in zip(flares, better.theta, strict=True):
-            each.theta = theta
+        for flare, theta in zip(flares, better.theta, strict=True):
+            flare.theta = theta
         return improves
 
     @staticmethod
@@ -249,23 +248,26 @@ class _StareSearch:
         return tuple(np.round(_thetas(block), 2).ravel().tolist())
 
     def _was_refused(self, peak: float, width: float) -> bool:
-        return any(abs(peak - other) <= max(width, wide) and 1 / 3 < width / wide < 3 for other, wide in self.refused)
+        return any(
+            abs(peak - refused_peak) <= max(width, refused_width) and 1 / 3 < width / refused_width < 3
+            for refused_peak, refused_width in self.refused
+        )
 
-    def _evened(self, left: Float, light: Float) -> Float:
+    def _evened(self, residuals: Float, light: Float) -> Float:
         """Scale residuals under flares down to the noise of frames without a flare."""
         if not self.found:
-            return left
+            return residuals
         noise = self.sums.noise(_thetas(self.found), light)
         base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
-        loud, evened = excess > 1.01, left.copy()
+        loud, evened = excess > 1.01, residuals.copy()
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
         for first, end in true_runs(loud):
             rows, middle = slice(first, end), times[(first + end) // 2]
             near = ~loud & (np.abs(times - middle) < self.sums.survey.bank.baseline.window_s / 2 + 1)
-            level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
-            evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
+            level = np.median(residuals[near], axis=0) if near.any() else np.zeros(residuals.shape[1])
+            evened[rows] = level + (residuals[rows] - level) / np.sqrt(excess[rows])[:, None]
         return evened
 
     def fitted(self, changed: set[Candidate]) -> set[Candidate]:
@@ -273,27 +275,27 @@ class _StareSearch:
         moved: set[Candidate] = set()
         spans = [self.sums.window(candidate.theta) for candidate in changed]
         for block in self.blocks():
-            mine = [self.sums.window(candidate.theta) for candidate in block]
-            if any(a < d and c < b for a, b in mine for c, d in spans):
+            windows = [self.sums.window(candidate.theta) for candidate in block]
+            if any(a < d and c < b for a, b in windows for c, d in spans):
                 moved |= self._fit(block, changed)
         return moved
 
     def _fit(self, block: list[Candidate], new: Collection[Candidate]) -> set[Candidate]:
-        best = self._best(self.sums.block(_thetas(block), _thetas(self.found)), block, new)
+        others = self.others(block)
+        best = self._best(self.sums.block(_thetas(block), others), block, new)
         # The noise depends on the fitted flares.
-        others = _thetas(candidate for candidate in self.found if candidate not in block)
-        rows = self.sums.block(best.theta, np.vstack([others, best.theta]))
-        best, left = rows.fit(best.theta), list(block)
-        while len(left) > 1:
-            falls = [rows.without(best, j) for j in range(len(left))]
-            j = int(np.argmin([fit.chi2 for fit in falls]))
-            if falls[j].chi2 - best.chi2 >= self.threshold**2:
+        rows = self.sums.block(best.theta, others)
+        best, flares = rows.fit(best.theta), list(block)
+        while len(flares) > 1:
+            reduced = [rows.without(best, j) for j in range(len(flares))]
+            j = int(np.argmin([fit.chi2 for fit in reduced]))
+            if reduced[j].chi2 - best.chi2 >= self.threshold**2:
                 break
-            self.refused.append(left[j].template)
-            self.found.remove(left.pop(j))
-            best = falls[j]
+            self.refused.append(flares[j].template)
+            self.found.remove(flares.pop(j))
+            best = reduced[j]
         moved = set()
-        for candidate, theta in zip(left, best.theta, strict=True):
+        for candidate, theta in zip(flares, best.theta, strict=True):
             if np.abs(theta - candidate.theta).max() > 1e-4:
                 moved.add(candidate)
             candidate.theta = theta
@@ -306,9 +308,9 @@ class _StareSearch:
         for k in (k for k, candidate in enumerate(block) if candidate in new):
             # A flare that was fitted alone may be too wide because it includes another.
             for j in np.flatnonzero(start[:, WIDTH] > start[k, WIDTH]):
-                other = start.copy()
-                other[j, WIDTH] = start[k, WIDTH]
-                fits.append(rows.fit(other))
+                narrower = start.copy()
+                narrower[j, WIDTH] = start[k, WIDTH]
+                fits.append(rows.fit(narrower))
         return min(fits, key=lambda fit: fit.chi2)
 
 
@@ -317,7 +319,7 @@ Measured = tuple[FittedFlares, dict[str, tuple[float, float]], str]
 
 
 def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Measured:
-    """Measure a flare; raises BetterFitError if profiling finds a better fit of its block."""
+    """Measure a flare of a block."""
     sums, theta, (low, high) = rows.sums, best.theta[j], rows.sums.bounds
     snr = float(np.sqrt(max(rows.without(best, j).chi2 - best.chi2, 0.0)))
     at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))

@@ -145,15 +145,15 @@ class Completeness:
         return cls(10**log_energy, np.clip(probability, 0, 1), "bolometric", how)
 
 
-def size_at(sizes: Float, shares: Float, wanted: float) -> float:
+def size_at(sizes: Float, shares: Float, share: float) -> float:
     """Return the size above which a share of flares is found, between ascending sizes; infinite if it never is."""
-    missed = np.flatnonzero(shares < wanted)
+    missed = np.flatnonzero(shares < share)
     if not missed.size:
         return float(sizes[0])
     if missed[-1] == sizes.size - 1:
         return float("inf")
     around = slice(missed[-1], missed[-1] + 2)
-    return float(np.exp(np.interp(wanted, shares[around], np.log(sizes[around]))))
+    return float(np.exp(np.interp(share, shares[around], np.log(sizes[around]))))
 
 
 # A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.
@@ -236,9 +236,9 @@ class InjectedCompleteness:
     def __post_init__(self) -> None:
         cells = np.empty((3, len(self.half_widths_s), self.sizes.size))
         for d, s in np.ndindex(cells.shape[1:]):
-            each = np.mean(self.critical[d] <= self.sizes[s], axis=1)
+            by_position = np.mean(self.critical[d] <= self.sizes[s], axis=1)
             # Intervals are those for the effective number of independent draws.
-            fraction, trials = float(each.mean()), self._independent(each, self.count)
+            fraction, trials = float(by_position.mean()), self._independent(by_position, self.count)
             around = clopper_pearson(round(fraction * trials), trials)
             cells[:, d, s] = fraction, min(around.low, fraction), max(around.high, fraction)
         set_read_only(self, completeness=cells[0], completeness_low=cells[1], completeness_high=cells[2])
@@ -249,13 +249,13 @@ class InjectedCompleteness:
         return int(self.critical[0].size)
 
     @staticmethod
-    def _independent(each: Float, count: int) -> int:
+    def _independent(fractions: Float, count: int) -> int:
         """Return the effective number of independent draws, reduced if positions differ (Kish's design effect)."""
-        fraction = float(each.mean())
+        fraction = float(fractions.mean())
         binomial = fraction * (1 - fraction) / count
-        if not binomial > 0 or each.size < 2:
+        if not binomial > 0 or fractions.size < 2:
             return count
-        return max(1, int(count * min(1.0, binomial / max(float(each.var(ddof=1)) / each.size, 1e-300))))
+        return max(1, int(count * min(1.0, binomial / max(float(fractions.var(ddof=1)) / fractions.size, 1e-300))))
 
     def limit(self, power: float, half_width: int | None) -> Interval:
         """Return the size at which the fraction `power` is detected, with a 95 % interval; infinite if never reached.
@@ -395,17 +395,17 @@ def fit_power_law(
     x, chance = x[used], chance[used]
     blur = stats.norm.pdf(recovered[:, None], x, error_dex) * step if error_dex > 0 else None
 
-    def seen(alpha: float) -> Float:
+    def density(alpha: float) -> Float:
         """Return recovered flares per day and dex of true energy, for a rate of 1 above the pivot."""
         return np.asarray((alpha - 1) * np.log(10) * 10 ** ((1 - alpha) * (x - pivot)) * chance)
 
     def best_rate(alpha: float) -> float:
         """Return the logarithm of the most likely rate for an exponent."""
-        return float(np.log10(logs.size / (days * step * seen(alpha).sum())))
+        return float(np.log10(logs.size / (days * step * density(alpha).sum())))
 
     def cost(alpha: float) -> float:
         """Return the negative log likelihood at the best rate for an exponent, less a constant."""
-        flares = seen(alpha)
+        flares = density(alpha)
         at = np.interp(recovered, x, flares) if blur is None else blur @ flares
         return float(-np.sum(np.log(np.maximum(at, 1e-300))) - logs.size * np.log(10) * best_rate(alpha))
 

@@ -110,25 +110,25 @@ class TemplateGrid:
         rows = [np.zeros((len(template.phases), size + room)) for template in bank.templates]
         for template, filters in zip(bank.templates, rows, strict=True):
             begin = 2 * room + template.first
-            for phase, own in enumerate(filters):
+            for phase, row in enumerate(filters):
                 shape = template.detrended(phase, bank.baseline.powers)
-                own[begin : begin + shape.size] = shape / np.linalg.norm(shape)
+                row[begin : begin + shape.size] = shape / np.linalg.norm(shape)
         per_frame, onset, width = [], [], []
         for k, (template, filters) in enumerate(zip(bank.templates, rows, strict=True)):
             # The phases within a frame are followed by those of the next onset.
             onsets = np.concatenate([np.roll(filters, n * template.stride, axis=1) for n in (-1, 0, 1)])
-            for p, own in enumerate(filters, len(filters)):
+            for p, this in enumerate(filters, len(filters)):
                 per_frame.append(1 / template.stride)
-                onset.append(_neighbour_correlations(own, [onsets[p - 1], onsets[p + 1]]))
+                onset.append(_neighbour_correlations(this, [onsets[p - 1], onsets[p + 1]]))
                 aligned = []
-                for others in _next_to(rows, k):
-                    # The filter, of the others at any shift, that has the largest correlation with this one.
-                    along = np.array([scipy.signal.correlate(own, other, method="fft") for other in others])
-                    which, shift = np.unravel_index(int(np.argmax(along)), along.shape)
-                    aligned.append(np.roll(others[which], int(shift) - own.size + 1))
-                width.append(_neighbour_correlations(own, aligned))
+                for neighbours in _next_to(rows, k):
+                    # The filter, of the neighbours at any shift, that has the largest correlation with this one.
+                    products = np.array([scipy.signal.correlate(this, row, method="fft") for row in neighbours])
+                    best_row, shift = np.unravel_index(int(np.argmax(products)), products.shape)
+                    aligned.append(np.roll(neighbours[best_row], int(shift) - this.size + 1))
+                width.append(_neighbour_correlations(this, aligned))
         directions = list(bank.directions)
-        temperature = [_neighbour_correlations(own, _next_to(directions, k)) for k, own in enumerate(directions)]
+        temperature = [_neighbour_correlations(this, _next_to(directions, k)) for k, this in enumerate(directions)]
         return cls(bank.frame_s, *map(np.array, (per_frame, onset, width, temperature)))
 
     def false_alarms_per_second(self, threshold: float) -> float:
@@ -140,7 +140,7 @@ class TemplateGrid:
         x, weights = np.polynomial.laguerre.laggauss(N_NODES)
         z = np.sqrt(threshold**2 + 2 * x)
         density = weights / z * np.exp(-(threshold**2) / 2) / np.sqrt(2 * np.pi)
-        onset, width, temperature = (_below(z, each) for each in (self.onset, self.width, self.temperature))
+        onset, width, temperature = (_below(z, rows) for rows in (self.onset, self.width, self.temperature))
         return np.asarray(np.einsum("z,rz,tz->rt", density, onset * width, temperature))
 
 
@@ -149,10 +149,10 @@ def _next_to(values: list[Float], k: int) -> list[Float]:
     return values[max(k - 1, 0) : k] + values[k + 1 : k + 2]
 
 
-def _neighbour_correlations(own: Float, neighbours: list[Float]) -> tuple[float, float, float]:
-    """Return the correlations with two neighbours and between them; without one, those with the opposite of `own`."""
-    before, after = [*neighbours, -own, -own][:2]
-    return float(own @ before), float(own @ after), float(before @ after)
+def _neighbour_correlations(this: Float, neighbours: list[Float]) -> tuple[float, float, float]:
+    """Return the correlations with two neighbours and between them; without one, those with the opposite of `this`."""
+    before, after = [*neighbours, -this, -this][:2]
+    return float(this @ before), float(this @ after), float(before @ after)
 
 
 def _below(z: Float, correlations: Float) -> Float:
@@ -238,12 +238,12 @@ class SampledRate:
             per_day = np.zeros(weights.size)
             for shift, share in zip(shifts, shares.T, strict=True):
                 per_day += share * np.interp((threshold - shift) / scales, fine, rates).mean(axis=1)
-            each = -np.expm1(-self.days * per_day)
+            alarm = -np.expm1(-self.days * per_day)
             if shifted:
                 # A few templates with a large mean suffice for an alarm.
-                each = 1 - np.exp(-self.days * per_day) * scipy.special.ndtr(threshold - largest)
-            probability[k] = weights @ each
-            spread = np.sqrt(np.sum((weights * (each - probability[k])) ** 2))
+                alarm = 1 - np.exp(-self.days * per_day) * scipy.special.ndtr(threshold - largest)
+            probability[k] = weights @ alarm
+            spread = np.sqrt(np.sum((weights * (alarm - probability[k])) ** 2))
             error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
         return SampledRate(self.thresholds, probability, error, self.days, shifted)
 
@@ -306,19 +306,20 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     estimates = np.empty((draws, len(LADDER)))
     directions, noise_sd = search.bank.directions, np.sqrt(search.variance)
     for n in range(draws):
-        which, direction = divmod(int(np.searchsorted(shares, rng.random() * shares[-1], "right")), len(directions))
-        template = search.in_time(rows[which], np.array([int(rng.choice(tried[which]))]))[0]
+        chosen = int(np.searchsorted(shares, rng.random() * shares[-1], "right"))
+        number, direction = divmod(chosen, len(directions))
+        template = search.in_time(rows[number], np.array([int(rng.choice(tried[number]))]))[0]
         noise = noise_sd[:, None] * rng.standard_normal((search.stare.n_frames, n_sum))
-        own, along = template @ noise @ directions[direction], directions @ directions[direction]
+        value, along = template @ noise @ directions[direction], directions @ directions[direction]
         # One more sum holds the response that changes the chosen template's value by one, since it is proportional to
         # the template in time.
-        held, values = np.column_stack([noise, template * search.variance]), list[Float]()
-        for (row, (correlated,)), weight in zip(search.correlations(held[None]), weights, strict=True):
+        sums, values = np.column_stack([noise, template * search.variance]), list[Float]()
+        for (row, (correlated,)), weight in zip(search.correlations(sums[None]), weights, strict=True):
             at = row.per_amplitude > 0
             c = along[:, None] * correlated[n_sum, at]
-            r = directions @ correlated[:n_sum, at] - own * c
-            near = np.flatnonzero(_is_near(r, c, LADDER[0]))
-            values.append(np.array([each.ravel()[near] for each in (r, c, np.broadcast_to(weight[:, None], r.shape))]))
+            r = directions @ correlated[:n_sum, at] - value * c
+            near, w = np.flatnonzero(_is_near(r, c, LADDER[0])), np.broadcast_to(weight[:, None], r.shape)
+            values.append(np.array([terms.ravel()[near] for terms in (r, c, w)]))
         estimates[n] = _estimates(np.concatenate(values, axis=1))
     estimates *= shares[-1]
     error = estimates.std(axis=0, ddof=1) / np.sqrt(draws)
@@ -387,25 +388,25 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, 
     """
     rows, at = survey.bank.directions, np.zeros(survey.stare.n_frames, np.bool_)
     at[np.linspace(0, at.size - 1, POINTS).astype(int)] = True
-    here = replace(survey, stare=select_frames(survey.stare, at))
+    sample = replace(survey, stare=select_frames(survey.stare, at))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
     n = len(survey.stare.unknowns)
     z = rng.standard_normal((RATE_DRAWS, n))
     z[RATE_DRAWS // 2 :] *= WIDENING
     log = -np.sum(z**2, axis=1) / 2
     weights = np.exp(log - np.logaddexp(log, log / WIDENING**2 - n * np.log(WIDENING)))
-    coefficients = np.tile(here.coefficients, (RATE_DRAWS, 1, 1))
-    coefficients[..., : len(STEADY)] *= np.moveaxis(here.unknowns.factors(z), 0, 2)
-    covariance = here.components.jittered_covariance(coefficients, here.stare)
-    variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / here.variance[:, None]
+    coefficients = np.tile(sample.coefficients, (RATE_DRAWS, 1, 1))
+    coefficients[..., : len(STEADY)] *= np.moveaxis(sample.unknowns.factors(z), 0, 2)
+    covariance = sample.components.jittered_covariance(coefficients, sample.stare)
+    variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / sample.variance[:, None]
     scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
     # Unknowns of several standard deviations may shift a template's value.
     if part.search.largest(part.unsubtracted(part.unknowns.extremes)).max() <= MIN_SHIFT:
         return scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1))
     # The same share of draws from both halves.
-    some = slice(None, None, ONE_IN)
-    weights = weights[some]
-    return scales[some], weights / weights.sum(), *_shifts(part, z[some])
+    draws = slice(None, None, ONE_IN)
+    weights = weights[draws]
+    return scales[draws], weights / weights.sum(), *_shifts(part, z[draws])
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
@@ -417,8 +418,8 @@ def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
         for (row, rho), weight in zip(survey.search.values(survey.unsubtracted(amplitude[None])), weights, strict=True):
             means = rho[0][:, row.per_amplitude > 0]
             place = np.clip(np.rint((means + MAX_SHIFT) / SHIFT_STEP), 0, bins.size - 1).astype(np.int64)
-            each = np.broadcast_to(weight[:, None], means.shape)
-            shares[draw] += np.bincount(place.ravel(), each.ravel(), bins.size)
+            weight_of_each = np.broadcast_to(weight[:, None], means.shape)
+            shares[draw] += np.bincount(place.ravel(), weight_of_each.ravel(), bins.size)
     shares /= shares.sum(axis=1, keepdims=True)
     used = shares.any(axis=0)
     return bins[used], shares[:, used]

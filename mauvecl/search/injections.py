@@ -1,8 +1,8 @@
 """Injection of flares into simulated frames, their sites, and the accuracy of fits to them.
 
-Each injected flare is fitted alone, with standard errors from the curvature. Flares that `stare` detects
-are fitted together and have intervals from the profile likelihood (`alarms`), which have better coverage near the
-threshold.
+Each injected flare is fitted alone, from the template that detected it, with standard errors from the curvature.
+Flares that `stare` detects are fitted together and have intervals from the profile likelihood (`alarms`), which have
+better coverage near the threshold.
 
 The statistic of a template is a + A b + sqrt(A) c for a flare of amplitude A: a follows from simulated frames without
 the flare, b from its mean, and c from its photon noise. The flare is detected for all A above the root, so that one
@@ -24,30 +24,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.stare import select_frames
 from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
+from mauvecl.search.flare_fits import WIDTH, FittedFlares, SummedStare
+from mauvecl.search.search import Survey
 
 if TYPE_CHECKING:
-    from mauvecl.search.flare_fits import SingleFlareFit
-    from mauvecl.search.search import Search, SearchedFrames, Survey
+    from mauvecl.search.search import Search, SearchedFrames
     from mauvecl.search.templates import Bank
 
 
 #: Quantities of each fit: ratios of fitted to injected values, the peak offset in half-widths, and whether the
 #: equivalent duration is within its standard error.
 FIT_QUANTITIES = ("energy", "amplitude", "half_width", "temperature", "peak", "covered")
-
-
-@dataclass(frozen=True, eq=False)
-class Refit:
-    """Injected flares to fit if they are detected."""
-
-    fit: SingleFlareFit
-    amplitudes: Float  # injected amplitudes, shape (n_half_width, n_amplitude)
-    temperature_k: float  # temperature of the injected flares
-    count: int  # number of stares per peak time with fits, the first ones
 
 
 #: Columns of the accuracy of fits, for values by name.
@@ -71,15 +63,15 @@ def fit_accuracy(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, Float
     Values of each cell, by the names of `ACCURACY_COLUMNS`, have the shape (n_half_width, n_size); NaN without
     detections.
     """
-    each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
+    ratios = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
     # NumPy warns of cells without detections.
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         low, middle, high = (
-            {name: np.nanquantile(values, q, axis=2) for name, values in each.items()} for q in (0.16, 0.5, 0.84)
+            {name: np.nanquantile(values, q, axis=2) for name, values in ratios.items()} for q in (0.16, 0.5, 0.84)
         )
-        covered = np.nanmean(each["covered"], axis=2)
+        covered = np.nanmean(ratios["covered"], axis=2)
     return {
-        "fitted": np.isfinite(each["energy"]).sum(axis=2).astype(np.float64),
+        "fitted": np.isfinite(ratios["energy"]).sum(axis=2).astype(np.float64),
         "energy_ratio_low": low["energy"],
         "energy_ratio_high": high["energy"],
         **{f"{name}_ratio": middle[name] for name in ("energy", "amplitude", "half_width", "temperature")},
@@ -142,20 +134,20 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
     near = _near_templates(search, reaches, means, bank.directions @ survey.response)
     # Flares of several half-widths share templates.
-    places, index = np.unique(np.concatenate([own for own, _, _ in near]), return_inverse=True)
+    places, index = np.unique(np.concatenate([numbers for numbers, _, _ in near]), return_inverse=True)
     numbers, onsets = np.divmod(places, search.n_grid)
     filters = np.empty((places.size, stare.n_frames), np.float32)
     for number in np.unique(numbers):
-        mine = numbers == number
-        filters[mine] = np.rint(search.in_time(search.grid[number], onsets[mine]) / STEP) * STEP
+        in_row = numbers == number
+        filters[in_row] = np.rint(search.in_time(search.grid[number], onsets[in_row]) / STEP) * STEP
     filter_widths_s = np.array([row.template.half_width_s for row in search.grid])[numbers]
     sites = []
-    for width, mean, (own_places, peaks_s, counts) in zip(widths_s, means, near, strict=True):
-        mine, index = np.split(index, [own_places.size])
-        own = filters[mine]
-        used = np.flatnonzero(own.any(axis=0))
+    for width, mean, (site_places, peaks_s, counts) in zip(widths_s, means, near, strict=True):
+        rows, index = np.split(index, [site_places.size])
+        site_filters = filters[rows]
+        used = np.flatnonzero(site_filters.any(axis=0))
         ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
-        arrays = np.ascontiguousarray(own[:, ends]), mean[ends].astype(np.float32), filter_widths_s[mine]
+        arrays = np.ascontiguousarray(site_filters[:, ends]), mean[ends].astype(np.float32), filter_widths_s[rows]
         sites.append(InjectionSite(width, peak_s, first + ends.start, *arrays, peaks_s, counts))
     return tuple(sites)
 
@@ -176,23 +168,23 @@ def _near_templates(
     whether they count as a detection, (n_temperature, n_template). `reaches` and
     `means` are those of the flares, and `along` is their light along the bank's directions.
     """
-    seen: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
+    responding: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         peaks = search.peaks_s(row)
-        for templates, (near, earliest, latest), value in zip(seen, reaches, correlated[:, 0], strict=True):
+        for templates, (near, earliest, latest), value in zip(responding, reaches, correlated[:, 0], strict=True):
             if row.template.half_width_s in near:
                 values = along[:, None] * value
                 inside = (peaks >= earliest) & (peaks <= latest) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside & (values.max(axis=0) > 0))
                 templates.append((number * search.n_grid + onsets, peaks[onsets], values[:, onsets]))
-    found = []
-    for templates in seen:
+    detecting = []
+    for templates in responding:
         places, times, values = (np.concatenate(part, axis=-1) for part in zip(*templates, strict=True))
         counts = values >= OVERLAP * values.max(initial=0)
         used = counts.any(axis=0)
-        found.append((places[used], times[used], counts[:, used]))
-    return found
+        detecting.append((places[used], times[used], counts[:, used]))
+    return detecting
 
 
 #: Number of stares per batch.
@@ -206,6 +198,8 @@ INJECT_KEY = 0x696E6A65
 NUMBERS = 2**32
 #: Half-widths after the peak beyond which the photon noise of a flare is neglected.
 GLOW = 15.0
+#: Frames of a fit are averaged if at least this many averages remain per half-width.
+FINE = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,6 +213,9 @@ class Injections:
     positions: int  # number of peak times, stratified over the recorded frames
     draws: int  # realisations per position
     processes: Processes  # additive ones require frames that are drawn by pixel
+    amplitudes: Float  # amplitudes of the flares that are fitted if they are detected, (n_half_width, n_amplitude)
+    fitted: int  # number of realisations per position with fits, the first ones
+    temperature_k: float  # temperature of the flares
 
     @cached_property
     def peaks_s(self) -> Float:
@@ -238,19 +235,13 @@ class Injections:
         return float(np.min(room[flare > 0] / flare[flare > 0], initial=np.inf))
 
     @cached_property
-    def photons(self) -> Float:
-        """Root of the covariance that a flare of unit amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
-        values, vectors = np.linalg.eigh(self.survey.components.sum_cumulants(2)[1][len(STEADY)])
-        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-    @cached_property
     def quiescent(self) -> tuple[Components, Method]:
         """Components of the frames without flares, and the method of drawing them."""
-        every = self.survey.components
-        quiescent = replace(every, flare_electrons=every.flare_electrons[:0])
+        components = self.survey.components
+        quiescent = replace(components, flare_electrons=components.flare_electrons[:0])
         return quiescent, method_for(quiescent, self.survey.stare, self.processes)
 
-    def request(self, position: int, refit: Refit) -> StaresRequest:
+    def request(self, position: int) -> StaresRequest:
         """Return the request for the critical amplitudes at a peak time and fits of detected flares."""
         survey = self.survey
         sites = sites_of(survey, self.half_widths_s, float(self.peaks_s[position]))
@@ -259,11 +250,11 @@ class Injections:
         first = min(part.start for part in reached)
         frames = survey.frames.part(slice(first, max(part.stop for part in reached)))
         start, (quiescent, method) = (1 + position) * NUMBERS, self.quiescent
-        single = replace(frames, known=frames.known.astype(np.float32))
         injecting = CriticalAmplitudes(
+            survey=replace(survey, stare=frames.stare),
             sites=tuple(replace(site, first=site.first - first) for site in sites), threshold=self.threshold,
-            directions=survey.bank.directions, response=survey.response, photons=self.photons, frames=single,
-            start=start, refit=refit,
+            frames=replace(frames, mean=frames.mean.astype(np.float32)), amplitudes=self.amplitudes,
+            temperature_k=self.temperature_k, fits_before=start + self.fitted,
         )  # fmt: skip
         return StaresRequest(
             quiescent, frames.stare, self.draws, self.seed, start=start, method=method,
@@ -283,14 +274,25 @@ class CriticalAmplitudes:
 
     adds: ClassVar[bool] = False
 
+    survey: Survey  # of the frames
     sites: tuple[InjectionSite, ...]  # in the frames
     threshold: float
-    directions: Float  # of the bank, shape (n_temperature, n_sum)
-    response: Float  # see `Survey.response`
-    photons: Float  # see `Injections.photons`
     frames: SearchedFrames
-    start: int  # number of the first stare
-    refit: Refit
+    amplitudes: Float  # see `Injections.amplitudes`
+    temperature_k: float
+    fits_before: int  # number of the first stare without fits
+
+    @cached_property
+    def photons(self) -> Float:
+        """Root of the covariance that a flare of unit amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
+        values, vectors = np.linalg.eigh(self.survey.components.sum_cumulants(2)[1][len(STEADY)])
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    @cached_property
+    def surveys(self) -> tuple[Survey, ...]:
+        """Surveys of the frames of each site."""
+        stares = [select_frames(self.survey.stare, site.frames) for site in self.sites]
+        return tuple(replace(self.survey, stare=stare) for stare in stares)
 
     def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
         """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and the fits of some stares.
@@ -305,8 +307,8 @@ class CriticalAmplitudes:
                 if len(site.filters):
                     column[:] = self._critical(site, self.values(site, drawn))
         # Stares are processed one at a time, so that fits do not depend on the batch.
-        fitted = max(0, min(len(values), self.start + self.refit.count - first))
-        fits = {name: np.full((fitted, *self.refit.amplitudes.shape), np.nan, np.float32) for name in FIT_QUANTITIES}
+        fitted = max(0, min(len(values), self.fits_before - first))
+        fits = {name: np.full((fitted, *self.amplitudes.shape), np.nan, np.float32) for name in FIT_QUANTITIES}
         for k in range(fitted):
             estimates = {name: fit[k] for name, fit in fits.items()}
             self._fit(self.frame_noise(values[k : k + 1], glow[k : k + 1]), estimates)
@@ -316,68 +318,83 @@ class CriticalAmplitudes:
         """Prepare the random part of some stares."""
         n_sum = values.shape[2]
         noise = np.moveaxis(self.frames.net(values), 2, 0)
-        own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
-        return _multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else light[:1]
+        normals, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
+        return _multiple(noise, NOISE_STEP).astype(np.float64), normals, light if light.any() else light[:1]
 
     def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
         """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
-        (noise, normals, light), filters, here = drawn, site.weights, site.frames
-        mean, stare, width = site.mean * (1 + light[:, here]), self.frames.stare, site.half_width_s
-        since = stare.start_s[here] - site.peak_s
+        (noise, normals, light), filters, frames = drawn, site.weights, site.frames
+        mean, stare, width = site.mean * (1 + light[:, frames]), self.frames.stare, site.half_width_s
+        since = stare.start_s[frames] - site.peak_s
         lit = slice(np.searchsorted(since, -width - stare.frame_s, "right"), np.searchsorted(since, GLOW * width))
-        own = normals[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
+        photons = normals[:, :, frames][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
+        directions = self.survey.bank.directions
         return (
-            _combined(self.directions, noise[:, :, here] @ filters),
-            _combined((self.directions @ self.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
-            _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
+            _combined(directions, noise[:, :, frames] @ filters),
+            _combined((directions @ self.survey.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
+            _combined(directions @ self.photons, _multiple(photons, NOISE_STEP) @ filters[lit]),
         )
 
     def _critical(self, site: InjectionSite, values: tuple[Single, Single, Single]) -> Single:
         a, b, c = values
-        left = np.float32(self.threshold) - a
-        # Root of b x^2 + c x = left in its numerically stable form; zero if there is an alarm without the flare.
-        root = np.multiply(left, 4 * b)
+        missing = np.float32(self.threshold) - a
+        # Root of b x^2 + c x = missing in its numerically stable form; zero if there is an alarm without the flare.
+        root = np.multiply(missing, 4 * b)
         root += c * c
         np.sqrt(np.maximum(root, 0, out=root), out=root)
         root += c
         with np.errstate(divide="ignore", invalid="ignore"):
-            np.divide(2 * left, root, out=root)
+            np.divide(2 * missing, root, out=root)
         root[~((b > 0) & site.counts[:, None]).repeat(root.shape[1] // b.shape[1], axis=1)] = np.inf
-        np.copyto(root, 0, where=(left <= 0) & site.counts[:, None])
+        np.copyto(root, 0, where=(missing <= 0) & site.counts[:, None])
         return np.asarray(root.min(axis=(0, 2)) ** 2)
 
     def _fit(self, drawn: FrameNoise, estimates: Mapping[str, Single]) -> None:
         """Fit the detected flares of one stare, and set their estimates, shape (n_half_width, n_amplitude) each."""
-        (noise, normals, light), refit = (array[..., 0, :] for array in drawn), self.refit
-        for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
+        noise, normals, light = (array[..., 0, :] for array in drawn)
+        for d, (site, survey) in enumerate(zip(self.sites, self.surveys, strict=True)):
             if not len(site.filters):
                 continue
-            a, b, c = (each[:, 0] for each in self.values(site, drawn))
-            values = np.array([a + x * b + np.sqrt(x) * c for x in row.astype(np.float32)])
-            values[:, ~site.counts] = -np.inf
-            flat = values.reshape(len(row), -1).astype(np.float64)
-            alarm = flat.max(axis=1) >= self.threshold
-            if not alarm.any():
-                continue
-            which = flat.argmax(axis=1)[alarm] % len(site.filters)
-            # Frames with the flare less their known mean, (n_amplitude, n_frame, n_sum).
-            here, shining = site.frames, np.sqrt(np.maximum(site.mean, 0))
-            own = np.einsum("kj,jt->tk", self.photons.astype(np.float32), normals[:, here] * shining)
-            rise = (site.mean * (1 + light[here]))[:, None] * self.response.astype(np.float32)
-            sums = np.array([noise[:, here].T + x * rise + np.sqrt(x) * own for x in row[alarm].astype(np.float32)])
-            recovered = refit.fit.run(sums, self.frames.part(here), site.peaks_s[which], site.widths_s[which])
-            duration = row[alarm] * site.half_width_s * refit.fit.bank.shape.equivalent_duration
-            off = np.abs(recovered.equivalent_duration_s - duration)
-            compared = {
-                "energy": recovered.equivalent_duration_s / duration,
-                "amplitude": recovered.amplitude / row[alarm],
-                "half_width": recovered.half_width_s / site.half_width_s,
-                "temperature": recovered.temperature_k / refit.temperature_k,
-                "peak": (recovered.peak_s - site.peak_s) / site.half_width_s,
-                "covered": off <= recovered.equivalent_duration_error_s,
-            }
-            for name, values in compared.items():
-                estimates[name][d, alarm] = values
+            a, b, c = (term[:, 0] for term in self.values(site, drawn))
+            # Sums of the frames, (n_frame, n_sum): noise, and what a flare of unit amplitude and its photons add.
+            frames, shining = site.frames, np.sqrt(np.maximum(site.mean, 0))
+            glow = np.einsum("kj,jt->tk", self.photons.astype(np.float32), normals[:, frames] * shining)
+            rise = (site.mean * (1 + light[frames]))[:, None] * survey.response.astype(np.float32)
+            for s, amplitude in enumerate(self.amplitudes[d].astype(np.float32)):
+                values = np.where(site.counts, a + amplitude * b + np.sqrt(amplitude) * c, -np.inf)
+                direction, template = np.unravel_index(int(values.argmax()), values.shape)
+                if values[direction, template] < self.threshold:
+                    continue
+                sums = noise[:, frames].T + amplitude * rise + np.sqrt(amplitude) * glow
+                kelvin = survey.templates.temperatures_k[survey.templates.chosen[direction]]
+                size, width = values[direction, template] / b[direction, template], site.widths_s[template]
+                start = np.array([[np.log(size), site.peaks_s[template], np.log(width), np.log(kelvin)]])
+                comparison = self._comparison(site, self.amplitudes[d, s], _fitted(survey, sums, start))
+                for name, values in comparison.items():
+                    estimates[name][d, s] = values[0]
+
+    def _comparison(self, site: InjectionSite, amplitude: float, fit: FittedFlares) -> dict[str, NDArray[Any]]:
+        """Compare a fit with the injected flare; the keys are `FIT_QUANTITIES`."""
+        duration = amplitude * site.half_width_s * self.survey.bank.shape.equivalent_duration
+        return {
+            "energy": fit.equivalent_duration_s / duration,
+            "amplitude": fit.amplitude / amplitude,
+            "half_width": fit.half_width_s / site.half_width_s,
+            "temperature": fit.temperature_k / self.temperature_k,
+            "peak": (fit.peak_s - site.peak_s) / site.half_width_s,
+            "covered": np.abs(fit.equivalent_duration_s - duration) <= fit.equivalent_duration_error_s,
+        }
+
+
+def _fitted(survey: Survey, sums: Single, start: Float) -> FittedFlares:
+    """Fit one flare to sums of frames less their mean, (n_frame, n_sum), from starting parameters, (1, 4)."""
+    per_group = max(1, int(np.exp(start[0, WIDTH]) / survey.bank.frame_s / FINE))
+    block = SummedStare(survey, sums.astype(np.float64)).block(start, per_group=per_group)
+    best = block.fit(start)
+    snr = np.sqrt(max(block.without(best, 0).chi2 - best.chi2, 0.0))
+    area, coloured = survey.bank.shape.equivalent_duration, survey.templates.coloured
+    covariance = block.covariance(best.theta)[:, :, 0].transpose(0, 2, 1)
+    return FittedFlares.of(best.theta, covariance, area, np.array([snr]), coloured=coloured)
 
 
 def _multiple(values: Single, step: float) -> Single:

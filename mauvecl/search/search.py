@@ -174,13 +174,13 @@ class Search:
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
-        held = np.zeros((len(sums), sums.shape[2], self.n_grid), sums.dtype)
+        weighted = np.zeros((len(sums), sums.shape[2], self.n_grid), sums.dtype)
         levelled = np.moveaxis(sums, 2, 1)
         if self._terms:
             # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
             levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
-        held[:, :, self._at] = levelled * self._weight[self._at]
-        return [scipy.fft.rfft(held * series.astype(sums.dtype), self._size) for series in self._series]
+        weighted[:, :, self._at] = levelled * self._weight[self._at]
+        return [scipy.fft.rfft(weighted * series.astype(sums.dtype), self._size) for series in self._series]
 
     @cached_property
     def _level_span(self) -> Float:
@@ -191,11 +191,11 @@ class Search:
 
     def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
         """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
-        held = np.zeros(self._size, spectrum.real.dtype)
-        met = slice(max(0, 1 - self.n_grid - first), max(0, self.n_grid - first))
-        held[: kernel[met].size] = kernel[met]
-        other = np.conj(scipy.fft.rfft(np.roll(held, first + met.start)))
-        values: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
+        padded = np.zeros(self._size, spectrum.real.dtype)
+        overlap = slice(max(0, 1 - self.n_grid - first), max(0, self.n_grid - first))
+        padded[: kernel[overlap].size] = kernel[overlap]
+        of_kernel = np.conj(scipy.fft.rfft(np.roll(padded, first + overlap.start)))
+        values: NDArray[Any] = scipy.fft.irfft(spectrum * of_kernel, self._size)
         return values[..., : self.n_grid]
 
     def _onsets(self, template: Template) -> slice:
@@ -225,11 +225,11 @@ class Search:
         for phase, shape in enumerate(template.shapes):
             shared = np.reshape([over(0, a, shape * time**p) for p, a in self._terms], (n, peaks.size)).T
             solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
-            left = over(0, 0, shape**2) - 2 * np.sum(solved * shared, axis=1)
-            left += np.einsum("ni,nij,nj->n", solved, gram, solved)
+            power = over(0, 0, shape**2) - 2 * np.sum(solved * shared, axis=1)
+            power += np.einsum("ni,nij,nj->n", solved, gram, solved)
             without_gaps = template.detrended(phase, self.bank.baseline.powers)
-            tried = left >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
-            yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), solved.T)
+            tried = power >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
+            yield Row(template, phase, peaks, np.sqrt(np.where(tried, power, 0.0)), solved.T)
 
 
 def largest_values(
@@ -261,7 +261,7 @@ class Trend:
 
     of: tuple[Changing, ...]  # quantity that each unknown changes
     curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
-    known: Float  # means of the components in `STEADY`, shape (4, n_frame, n_sum)
+    means: Float  # means of the components in `STEADY`, shape (4, n_frame, n_sum)
     slope_per_c: float  # relative change of the dark current per deg C
 
     @cached_property
@@ -282,13 +282,13 @@ class Trend:
 
     def effect(self, amplitudes: Float) -> Float:
         """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum), for amplitudes as of `factors`."""
-        return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.known, optimize=True))
+        return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.means, optimize=True))
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
-        star, sky, dark, near = self.known.mean(axis=1)
-        each = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
-        linear = np.reshape([each[of] for of in self.of], (len(self.of), star.size))
+        star, sky, dark, near = self.means.mean(axis=1)
+        slopes = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
+        linear = np.reshape([slopes[of] for of in self.of], (len(self.of), star.size))
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
 
@@ -299,10 +299,10 @@ MIN_CURVE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SearchedFrames:
-    """Frames of a stare, and what their search takes for known."""
+    """Frames of a stare, and the mean, noise and unknown changes that their search assumes."""
 
     stare: Stare
-    known: NDArray[Any]  # mean of each frame's sums without a flare, shape (n_frame, n_sum)
+    mean: NDArray[Any]  # of each frame's sums without a flare, shape (n_frame, n_sum)
     variance: Float  # of each frame's sums, shape (n_frame,)
     curves: Float  # of unknown amplitude, shape (n_curve, n_frame)
     trend: Trend | None  # effect of the stare's unknowns if it is significant beyond first order
@@ -311,8 +311,8 @@ class SearchedFrames:
         """Return consecutive frames of these."""
         stare, trend = select_frames(self.stare, window), self.trend
         if trend is not None:
-            trend = replace(trend, curves=trend.curves[:, window], known=trend.known[:, window])
-        return SearchedFrames(stare, self.known[window], self.variance[window], self.curves[:, window], trend)
+            trend = replace(trend, curves=trend.curves[:, window], means=trend.means[:, window])
+        return SearchedFrames(stare, self.mean[window], self.variance[window], self.curves[:, window], trend)
 
     def search(self, bank: Bank) -> Search:
         """Return the search of the frames with a bank."""
@@ -320,7 +320,7 @@ class SearchedFrames:
 
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
         """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
-        return np.asarray(self.subtracted(sums - self.known), np.float32)
+        return np.asarray(self.subtracted(sums - self.mean), np.float32)
 
     def subtracted(self, sums: NDArray[Any]) -> NDArray[Any]:
         """Fit the trend, if there is one, to sums less their known mean, and subtract it beyond first order."""
@@ -335,12 +335,12 @@ class SearchedFrames:
         amplitudes, steps = np.zeros((1, n)), DIFFERENCE * np.eye(n + 1, n, -1)
         for _ in range(STEPS):
             effect = means.effect(amplitudes + steps)
-            left, gradient = y - effect[0], (effect[1:] - effect[0]) / DIFFERENCE
-            size = np.sqrt(np.sum(left**2, axis=1) * weight)
+            residuals, gradient = y - effect[0], (effect[1:] - effect[0]) / DIFFERENCE
+            size = np.sqrt(np.sum(residuals**2, axis=1) * weight)
             trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
             weighted = (gradient * trusted[:, None]).reshape(n, -1)
             information = weighted @ gradient.reshape(n, -1).T + np.eye(n)
-            amplitudes = amplitudes + np.linalg.solve(information, weighted @ left.ravel() - amplitudes[0])
+            amplitudes = amplitudes + np.linalg.solve(information, weighted @ residuals.ravel() - amplitudes[0])
         return amplitudes
 
     @cached_property
@@ -351,8 +351,8 @@ class SearchedFrames:
         first = np.flatnonzero(np.diff(number, prepend=-1))
         weight = np.add.reduceat(1.0 / self.variance, first)
         curves = np.add.reduceat(self.trend.curves / self.variance, first, axis=1) / weight
-        known = np.add.reduceat(self.trend.known / self.variance[:, None], first, axis=1) / weight[:, None]
-        return first, weight, replace(self.trend, curves=curves, known=known)
+        means = np.add.reduceat(self.trend.means / self.variance[:, None], first, axis=1) / weight[:, None]
+        return first, weight, replace(self.trend, curves=curves, means=means)
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,20 +395,20 @@ class Survey:
         if not self.bank.baseline.cycle:
             return np.zeros((0, self.stare.n_frames))
         of_unit_norm = [unknown.curve / (np.linalg.norm(unknown.curve) or 1.0) for unknown in self.stare.unknowns]
-        every = np.reshape(of_unit_norm, (len(of_unit_norm), self.stare.n_frames))
+        rows = np.reshape(of_unit_norm, (len(of_unit_norm), self.stare.n_frames))
         line = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
-        curves, size, _ = np.linalg.svd((every - every @ line @ line.T).T, full_matrices=False)
+        curves, size, _ = np.linalg.svd((rows - rows @ line @ line.T).T, full_matrices=False)
         return np.asarray(curves[:, size > MIN_CURVE].T)
 
     @cached_property
     def frames(self) -> SearchedFrames:
-        """Frames of the stare with what the search knows of them."""
-        known, trend = self.components.means(self.coefficients), None
+        """Frames of the stare, and what the search assumes of them."""
+        mean, trend = self.components.means(self.coefficients), None
         if self.stare.unknowns:
             effect = self.unknowns.nonlinear_effect(self.unknowns.extremes)
             power = np.sum(effect**2 / self.variance[:, None], axis=(1, 2))
             trend = self.unknowns if (power > LEAST**2).any() else None
-        return SearchedFrames(self.stare, known, self.variance, self.curves, trend)
+        return SearchedFrames(self.stare, mean, self.variance, self.curves, trend)
 
     @cached_property
     def search(self) -> Search:
@@ -419,10 +419,10 @@ class Survey:
     def unknowns(self) -> Trend:
         """Effect of the stare's unknowns."""
         steady = len(STEADY)
-        known = self.coefficients.T[:steady, :, None] * self.components.component_means[:steady, None]
-        unknown, slope = self.stare.unknowns, self.components.quiet.conditions["dark_slope_per_c"]
-        curves = np.reshape([one.sd * one.curve for one in unknown], (len(unknown), self.stare.n_frames))
-        return Trend(tuple(one.of for one in unknown), curves, known, slope)
+        means = self.coefficients.T[:steady, :, None] * self.components.component_means[:steady, None]
+        unknowns, slope = self.stare.unknowns, self.components.quiet.conditions["dark_slope_per_c"]
+        curves = np.reshape([unknown.sd * unknown.curve for unknown in unknowns], (len(unknowns), self.stare.n_frames))
+        return Trend(tuple(unknown.of for unknown in unknowns), curves, means, slope)
 
     def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns on the sums that is not subtracted before the search."""

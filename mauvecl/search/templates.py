@@ -207,8 +207,8 @@ class Templates:
         along = np.concatenate([[0.0], np.cumsum(steps)])
         # The outermost directions may be half a step from the ends.
         n = max(1, int(np.ceil(along[-1] / ANGLE)))
-        wanted = (np.arange(n) + 0.5) / n * along[-1]
-        return tuple(dict.fromkeys(int(np.argmin(np.abs(along - w))) for w in wanted))
+        angles = (np.arange(n) + 0.5) / n * along[-1]
+        return tuple(dict.fromkeys(int(np.argmin(np.abs(along - angle))) for angle in angles))
 
     @property
     def coloured(self) -> bool:

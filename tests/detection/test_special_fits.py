@@ -266,4 +266,16 @@ def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engin
     assert (found.low[0, :, area] == 0.0).sum() >= 15
     assert np.isinf(found.high[0, :, second]).sum() >= 15
     assert (found.low[0, :, 0] <= 9000.0).sum() >= 15
-    assert (found.estimates >= np.array(found.bounds)).all()
+    assert (np.isnan(found.estimates) | (found.estimates >= np.array(found.bounds))).all()
+
+
+def test_single_blackbody_has_no_second_temperature(engine: Engine) -> None:
+    """Exposures that a second blackbody does not fit better have none, and the other estimates of a plain fit."""
+    x, one, m = scene("M3V", 9.0, 0.5, 9000.0, distance_pc=5.0)
+    frames = engine.realise(one, count=4, seed=5)
+    found, single = mauvecl.fit_two_temperatures(frames, x, m, levels=(0.95,)), fit(frames, x, m)
+    second = found.estimates[:, found.column("second temperature")]
+    absent = found.estimates[:, found.column("second area")] == 0.0
+    assert absent.any()
+    assert (np.isnan(second) == absent).all()
+    assert (found.estimates[absent, : len(single.names)] == single.estimates[absent]).all()

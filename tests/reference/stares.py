@@ -214,5 +214,5 @@ def _sums(scene: StareScene, table: SumTable, z: Any, conditions: Any, flare: li
             total = fma(-s * s * z[a], fma(zz, np.float32(0.055555556), np.float32(-0.1388889)), total)
         x.append(total)
     u = [cumulant((a,)) + _chain((low[a, i], x[i]) for i in range(a + 1)) for a in range(n)]
-    whole = dict(zip(pairs, table.whole, strict=True))
+    whole = dict(zip(pairs, table.lower, strict=True))
     return [_chain((whole[a, i], u[i]) for i in range(a + 1)) for a in range(n)]
