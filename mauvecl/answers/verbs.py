@@ -130,14 +130,13 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
 
 
 def _formula_grid(given: dict[str, Any]) -> Study:
-    """Return a study that sweeps what no flag states: magnitudes, exposures, or both, as `gaussian` does."""
-    from mauvecl.study.questions import formula_grid
+    """Return a study that sweeps what no flag states: magnitudes, exposures, or both."""
+    from mauvecl.study.questions import Axis, Sweep
     from mauvecl.study.study import Study
 
-    magnitudes, exposure = given["magnitude"], given["exposure"]
-    if not magnitudes and exposure is None:
-        return Study()
-    return Study().model_copy(update={"sweep": formula_grid(magnitude=not magnitudes, exposure_s=exposure)})
+    magnitudes = [] if given["magnitude"] else [Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))]
+    exposures = (5.0, 50.0, 600.0) if given["exposure"] is None else (given["exposure"],)
+    return Study(sweep=Sweep(axes=(*magnitudes, Axis(quantity="exposure", values=exposures))))
 
 
 #: By name, in the order of `mauvecl --help`: one star, flares, hours and campaigns.
@@ -239,8 +238,8 @@ VERBS: dict[str, Verb] = {
 
     Its S/N, intervals and false alarms are compared with those of realisations.
 
-    Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, where --magnitude or --exposure states
-    no others.
+    Without a study or sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, where --magnitude or --exposure
+    states no others.
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """,

@@ -95,12 +95,26 @@ WRITTEN = {
     "solRad": "solar radii",
     "solMass": "solar masses",
     "1 / (cm2 s)": "cm^-2 s^-1",
+    "1 / h": "per hour",
+    "1 / d": "per day",
+    "1 / K": "per kelvin",
+    "DN / s": "DN/s",
+    "nm / pix": "nm/pix",
+    "uV / electron": "uV/electron",
 }
 
 
 def word_of(unit: str) -> str:
     """Return the words for a number in a unit in a message."""
-    return f"a number in {WRITTEN.get(unit, unit)}" if unit else "a number"
+    written = WRITTEN.get(unit, unit)
+    return f"a number {written}" if written.startswith("per ") else f"a number in {written}" if unit else "a number"
+
+
+def written_number(value: float) -> str:
+    """Return a number of a message as people write it: 0.001, 7000, 200 000, 1e-7, 1e12."""
+    if 1e5 <= abs(value) < 1e9 and value == int(value):
+        return f"{int(value):,}".replace(",", " ")
+    return str(value) if isinstance(value, int) else re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")
 
 
 @dataclass(frozen=True)
@@ -168,7 +182,7 @@ class Range:
     def words(self, unit: str = "", *, whole: bool = False) -> str:
         """Describe the accepted values, for error messages."""
         noun = "a whole number" if whole else "a number"
-        low, high = (str(end) if whole else f"{end:g}" for end in (self.low, self.high))
+        low, high = map(written_number, (self.low, self.high))
         has_low, has_high = math.isfinite(self.low), math.isfinite(self.high)
         after = f" {WRITTEN.get(unit, unit)}" if unit else ""
         if has_low and has_high and not (self.open_low or self.open_high):

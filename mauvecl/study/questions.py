@@ -269,13 +269,6 @@ class Sweep(Section):
         return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]
 
 
-def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
-    """Return the default sweep of `gaussian`, over magnitudes and over exposures, or at a given exposure."""
-    axes = [Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))] if magnitude else []
-    exposures = (5.0, 50.0, 600.0) if exposure_s is None else (exposure_s,)
-    return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
-
-
 def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
     """Raise InputError if a swept quantity has no effect on the stare."""
     fixed = {

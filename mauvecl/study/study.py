@@ -146,8 +146,8 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
 VERSION: Literal[2] = 2
 #: Sections that a study's text leaves out if they have their default values.
 OMITTED = (
-    "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data", "calibrate",
-    "change",
+    "signal", "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data",
+    "calibrate", "change",
 )  # fmt: skip
 #: Largest number of realisations to which too few are raised.
 MOST_RAISED = 1_000_000
@@ -317,7 +317,7 @@ class Study(Section):
     def _stated(self) -> dict[str, Any]:
         """Return the data of the study's text, without sections that have their default values."""
         data: dict[str, Any] = self.model_dump(exclude_none=True)
-        unused = {"sweep": not self.sweep.axes, "unknowns": not self.unknowns.draws, "signal": self.signal.snr is None}
+        unused = {"sweep": not self.sweep.axes, "unknowns": not self.unknowns.draws}
         fields = type(self).model_fields
         for name in [*data]:
             if unused.get(name) or (name in OMITTED and getattr(self, name) == fields[name].default):

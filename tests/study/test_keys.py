@@ -13,6 +13,7 @@ from refusals import refused
 from study_keys import NUMERIC, ends, fields, metadata, outside, reach
 
 from mauvecl import BalmerFlare, InputError, Instrument, Sky, Source, Study, TwoBlackbodies, expect
+from mauvecl.schema.fields import Range
 
 FIELDS = dict(fields())
 STUDIES = Path(__file__).parents[1] / "data" / "studies"
@@ -138,6 +139,23 @@ def test_paths_are_relative_to_the_study_file_and_absolute_in_its_text(tmp_path:
     np.savetxt(tmp_path / "there" / "f.txt", 2 * light)
     with pytest.raises(InputError, match=r"its file 'f.txt' with sha256 .* has changed"):
         Study.read(table)
+
+
+@pytest.mark.parametrize("settings", [{"at": 300.0}, {"per": "pixel"}, {"snr": 10.0}])
+def test_wavelength_and_bin_of_an_snr_are_kept_in_the_text(settings: dict[str, Any]) -> None:
+    """The study of `snr --at 300`, in which no S/N is wanted, keeps the wavelength."""
+    study = Study.of(**settings)
+    for text in (study.text(), study.toml()):
+        assert Study.build(tomllib.loads(text), "text") == study
+    assert "signal" not in tomllib.loads(Study().toml())
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [(0.0, 1e6, "0 and 1 000 000"), (1e-7, 1e12, "1e-7 and 1e12"), (0.001, 86_400.0, "0.001 and 86400")],
+)
+def test_ends_of_a_range_are_written_as_people_write_them(low: float, high: float, words: str) -> None:
+    assert Range(low, high).words() == f"a number between {words}"
 
 
 def test_study_of_an_older_version_is_read_and_keeps_its_keys() -> None:
