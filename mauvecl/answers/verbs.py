@@ -96,21 +96,18 @@ class Verb:
         `given` has the value of each keyword, or None, and also ``paper``, and ``setting``, texts of any keys. They
         change the study or, without one, the verb's default; `where` names their origin in messages.
         """
-        from mauvecl.study.study import Study, changes_of, stars_of
+        from mauvecl.study.study import Study, with_keywords
 
-        own = study is not None
+        is_default = study is None
         if study is None:
             for name, keyword in keywords.items():
                 if given[name] is None:
                     given[name] = (self.defaults or {}).get(keyword.path)
             study = self.default(given) if self.default else Study()
-        if given.get("paper"):
-            study = study.paper()
-        stars = stars_of(study.star, given, keywords, own=own)
-        study = study.with_changes(changes_of(given, keywords, study.nuisances), stars, where)
+        study = with_keywords(study, given, keywords, where, is_default=is_default)
         if given.get("setting"):
             study = study.with_settings(given["setting"], where)
-        if own or given.get("tails", study) is not None:
+        if not is_default or given.get("tails", study) is not None:
             return study, []
         # Maps and limits would sample a tail in each cell or step, which takes longer than more realisations.
         return study.with_enough_tails(sampled=self.counts != "cells", raised=self.counts in ("cells", "steps"))

@@ -10,7 +10,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from itertools import islice
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -159,26 +159,19 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
     Columns that a table lacks are masked, or NaN if they have a unit.
     """
     import numpy as np
+    from astropy.table import QTable, hstack, vstack
 
-    every = list(parts)
-    tables = [table for _, table in every]
+    rows, tables = zip(*parts, strict=True)
+    stack = vstack([QTable(table, copy=False) for table in tables], metadata_conflicts="silent")
+    for name, column in [*stack.columns.items()]:
+        if hasattr(column, "filled") and column.unit is not None:
+            stack[name] = column.filled(np.nan)
+    if first:
+        row_numbers = np.repeat(np.arange(len(rows)), list(map(len, tables)))
+        stack = hstack([table_of(first, rows)[row_numbers], stack])
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-
-    def values(part: tuple[object, Table], name: str) -> Any:
-        if name not in part[1].colnames:
-            return None
-        cells = getattr(part[1][name], "value", part[1][name])
-        return np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
-
-    def taken(name: str) -> Column:
-        having = [table[name] for table in tables if name in table.colnames]
-        (unit,) = {str(column.unit or "") for column in having}
-        kind = np.result_type(*(column.dtype for column in having)).type
-        text = having[0].info.description or ""
-        return Column(name, lambda part: values(part, name), unit, text, kind=kind)
-
-    names = dict.fromkeys(name for table in tables for name in table.colnames)
-    return table_of([*(column.of(itemgetter(0)) for column in first), *map(taken, names)], every, **shared | meta)
+    stack.meta = shared | meta
+    return stack
 
 
 def records(table: Table) -> list[dict[str, Any]]:

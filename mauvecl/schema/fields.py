@@ -111,9 +111,7 @@ def word_of(unit: str) -> str:
 
 
 def written_number(value: float) -> str:
-    """Return a number of a message as people write it: 0.001, 7000, 200 000, 1e-7, 1e12."""
-    if 1e5 <= abs(value) < 1e9 and value == int(value):
-        return f"{int(value):,}".replace(",", " ")
+    """Return a number for a message as people write and type it: 0.001, 200000, 1e-7, 1e6."""
     return str(value) if isinstance(value, int) else re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")
 
 

@@ -12,33 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from pydantic import Field, model_validator
 
 from mauvecl.host.stars.library import ALIASES
-from mauvecl.schema import section
+from mauvecl.schema import fields, section
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import (
-    Accepted,
-    DetectorTemperature,
-    Flag,
-    Help,
-    Magnitude,
-    Positive,
-    Probability,
-    Quantity,
-    Range,
-    Slider,
-    Unit,
-    Wavelength,
-    first,
-)
+from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, first
 from mauvecl.schema.section import Section, read_axis, setting
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star, unit_of_file
 from mauvecl.study.stare import SIZES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.stare import EventChoice, StareQuestion
+    from mauvecl.study.study import Study
 
 
 #: Quantities that vary, by name, with the unit and range of their fields.
@@ -66,12 +50,12 @@ class CampaignQuestion(Section):
     step: Annotated[int, Range(1)] | None = setting(
         None, "Frames from one stack of the search to the next", flag="--campaign-step", usual="a stack"
     )
-    fap: Probability | None = setting(
+    fap: fields.Probability | None = setting(
         None,
         "Wanted probability of any false alarm in the search; shows what each test may have",
         flag="--campaign-fap",
     )
-    alarms: Positive | None = setting(
+    alarms: fields.Positive | None = setting(
         None, "Wanted number of false alarms in the search; shows what each test may have", flag="--campaign-alarms"
     )
 
@@ -82,8 +66,8 @@ class CampaignQuestion(Section):
 class SignalQuestion(Section):
     """S/N that an exposure must reach."""
 
-    snr: Positive | None = setting(None, "Wanted signal-to-noise ratio", flag="--snr")
-    wavelength_nm: Wavelength | None = setting(None, "Wavelength", flag="--at")
+    snr: fields.Positive | None = setting(None, "Wanted signal-to-noise ratio", flag="--snr")
+    wavelength_nm: fields.Wavelength | None = setting(None, "Wavelength", flag="--at")
     per: Literal["element", "pixel"] = setting(
         "element", "Bin of the S/N", flag="--per", choices="element (10.5 nm) or pixel"
     )
@@ -130,7 +114,7 @@ class LimitQuestion(Section):
         "probability; all else is as entered. The tab Limit and map simulates it.",
         first="amplitude",
     )
-    power: Probability = setting(
+    power: fields.Probability = setting(
         0.9,
         "Wanted detection probability",
         flag="--power",
@@ -213,7 +197,7 @@ class MapQuestion(Section):
         "Vertical axis of the map; such as amplitude:0.01:1:16:log",
         flag=Flag("--y", kind=str, read=read_axis),
     )
-    contours: tuple[Probability, ...] = setting((0.1, 0.5, 0.9), "Detection probabilities of contours")
+    contours: tuple[fields.Probability, ...] = setting((0.1, 0.5, 0.9), "Detection probabilities of contours")
 
     def _check_values(self) -> None:
         if self.y.quantity == ("magnitude" if self.x is None else self.x.quantity):
@@ -269,14 +253,15 @@ class Sweep(Section):
         return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]
 
 
-def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
+def check_sweep(study: Study) -> None:
     """Raise InputError if a swept quantity has no effect on the stare."""
+    stare, events = study.stare, study.events
     fixed = {
         "exposure": True,
         "amplitude": all(section.given_keys(event, SIZES) for event in events) if events else bool(stare.energies_erg),
         "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
     }
-    for axis in sweep.axes:
+    for axis in study.sweep.axes:
         if fixed.get(axis.quantity):
             raise InputError(
                 f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare; "
@@ -292,9 +277,11 @@ class CalibrationObservation(Section):
     mapping: Path | None = setting(None, "Where time, flux and temperature are in that file (TOML)")
     library: str | None = setting(None, "Name of the standard star in the library")
     spectrum: Path | None = setting(None, "File with the spectrum of the standard star, such as CALSPEC's")
-    magnitude: Magnitude | None = setting(None, "Magnitude", usual="that of the spectrum")
+    magnitude: fields.Magnitude | None = setting(None, "Magnitude", usual="that of the spectrum")
     band: str = setting("V", "Band of the magnitude")
-    temperature_c: DetectorTemperature | None = setting(None, "Detector temperature, where the frames do not state it")
+    temperature_c: fields.DetectorTemperature | None = setting(
+        None, "Detector temperature, where the frames do not state it"
+    )
 
     def _check_values(self) -> None:
         section.check_one(self, "an observation", "spectrum", "library")
@@ -357,7 +344,7 @@ class CalibrateQuestion(Section):
 DEFAULT_CHANGES = ("Mg II", "Ca II", "H beta", "H alpha", "balmer jump", "200-320", "320-700", "colour")
 #: Name of the change that adds the light of `change.file`.
 SPECTRUM = "spectrum"
-Days = Annotated[Positive, Unit("d")]
+Days = Annotated[fields.Positive, Unit("d")]
 
 
 class ChangeQuestion(Section):
@@ -518,10 +505,10 @@ class MeasureQuestion(Section):
         (), "Line that the model 'lines' fits", flag=Flag("--fit-line", read=section.read_words), usual="the flare's"
     )
     fits: Annotated[int, Range(1, 1_000_000)] = setting(1000, "Simulated exposures of each flare", flag="--fits")
-    bands_nm: tuple[tuple[Wavelength, Wavelength], ...] = setting(
+    bands_nm: tuple[tuple[fields.Wavelength, fields.Wavelength], ...] = setting(
         ((200.0, 320.0), (200.0, 700.0)), "Wavelength ranges for which the flux is reported"
     )
-    skipped_nm: tuple[tuple[Wavelength, Wavelength], ...] = setting(
+    skipped_nm: tuple[tuple[fields.Wavelength, fields.Wavelength], ...] = setting(
         (),
         "Wavelengths that fits leave out, from:to; as in 322:368",
         flag=Flag(
@@ -533,7 +520,7 @@ class MeasureQuestion(Section):
         hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",
         unit="nm",
     )
-    snr_per_bin: Positive | None = setting(
+    snr_per_bin: fields.Positive | None = setting(
         None,
         "S/N of bins of frames in which the flares of the study's stare are measured against time",
         flag="--snr-per-bin",
