@@ -238,7 +238,7 @@ def serve(
     Example: mauvecl serve --show
     """
 
-    number = flags.whole_number(port, "--port", Range(1, 65535))
+    number = flags.read_whole_number(port, "--port", Range(1, 65535))
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve

@@ -545,7 +545,7 @@ def simulate(
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
 
-    number = flags.whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
+    number = flags.read_whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
     session.answer(compute(session.study, realisation=number, flaring=bool(session.given["amplitude"])))
 
 

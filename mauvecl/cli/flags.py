@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 import typer
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Help, Range, Unit, as_typed, first, whole
+from mauvecl.schema.fields import Help, Range, Unit, as_typed, first, whole_number
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Keyword
@@ -192,12 +192,12 @@ def numbers_of(keyword: Keyword, given: Any) -> Any:
     return [number_or_text(word.strip()) for text in given for word in text.split(",")]
 
 
-def whole_number(text: str, flag: str, reach: Range) -> int:
+def read_whole_number(text: str, flag: str, reach: Range) -> int:
     """Read a whole number of a range."""
     from mauvecl.schema.section import number_or_text
 
     try:
-        value = whole(number_or_text(text))
+        value = whole_number(number_or_text(text))
     except ValueError:
         value = None
     if value is None or value not in reach:

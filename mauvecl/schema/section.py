@@ -16,12 +16,10 @@ from pydantic import (
     Field,
     ValidationError,
     ValidationInfo,
-    ValidatorFunctionWrapHandler,
     field_validator,
     model_validator,
 )
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticCustomError
 
 from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown, together
@@ -41,16 +39,6 @@ class Record(BaseModel):
     # Nested records are not built by this method, so that the outer one names the full path of a wrong value.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
-    @field_validator("*", mode="wrap")
-    @classmethod
-    def _no_truth_as_number(cls, given: Any, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-        """Refuse true and false where a number or text is expected; pydantic takes them for 1 and 0."""
-        annotation = cls.model_fields[str(info.field_name)].annotation
-        values = list(given.values()) if isinstance(given, dict) and not model_in(annotation) else given
-        if holds_truth(values) and not _takes_truth(annotation):
-            raise PydanticCustomError("truth", "Input should be no truth value")
-        return validate(given)
-
     def __setattr__(self, name: str, value: Any) -> None:
         try:
             super().__setattr__(name, value)
@@ -59,17 +47,6 @@ class Record(BaseModel):
                 f"{type(self).__name__}.{name} cannot be set in place; use a changed copy: with_, with_settings, at",
                 key=name,
             ) from None
-
-
-def holds_truth(given: Any) -> bool:
-    """Return whether a value is true or false, or a list that has one; nested records check their own."""
-    if isinstance(given, list | tuple):
-        return any(map(holds_truth, given))
-    return fields.is_truth(given)
-
-
-def _takes_truth(annotation: Any) -> bool:
-    return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -83,6 +60,8 @@ def built(model: type[Model], values: Any, where: str) -> Model:
         raise input_error(where, model, error) from None
 
 
+#: Words for what pydantic calls a valid string, path, tuple and dictionary.
+TYPE_WORDS = {"string_type": "text", "path_type": "a path", "tuple_type": "a list", "dict_type": "a table"}
 #: Largest number of wrong values that one message names.
 MOST_FAULTS = 5
 
@@ -116,12 +95,8 @@ def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
             return _own_error(model, path, first)
         case "too_long" | "too_short":
             expected = message.partition("should have ")[2].partition(" after")[0]
-        case "truth":
-            expected = "a number or text" if fields.is_truth(value) else "free of true and false"
-        case "path_type":
-            expected = "a path"
         case _:
-            expected = message.removeprefix("Input should be ")
+            expected = TYPE_WORDS.get(first["type"], message.removeprefix("Input should be "))
             if expected == message:
                 return InputError(f"{key} = {shown(value)}: {message.lower()}", key=key)
     return InputError.of(key, value, expected)

@@ -76,7 +76,7 @@ class Observation(Section):
     )
     mode: Literal["auto", "frames", "stacked"] = setting("auto", "How the frames of an exposure are drawn")
     recipe: Literal["auto", "joint", "apart"] = setting("auto", "How the noise of a frame is drawn")
-    changes: dict[str, Annotated[float | int | str, Accepted("a number or text")]] = setting(
+    changes: dict[str, Annotated[fields.Number | fields.WholeNumber | str, Accepted("a number or text")]] = setting(
         dict, "Changed values of the instrument, by name"
     )
 
@@ -229,7 +229,9 @@ class OwnNuisance(Section):
     """User-defined nuisance spectrum: wavelength in nm and DN per exposure at unit amplitude, as a file or points."""
 
     file: Path | None = setting(None, "File with two columns, wavelength in nm and DN per exposure")
-    points: tuple[tuple[float, float], ...] | None = setting(None, "Wavelengths in nm, and DN per exposure")
+    points: tuple[tuple[fields.Number, fields.Number], ...] | None = setting(
+        None, "Wavelengths in nm, and DN per exposure"
+    )
     sd: Spread = setting("free", "Standard deviation of the amplitude, or free")
 
     def _check_values(self) -> None:

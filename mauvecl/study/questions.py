@@ -130,8 +130,7 @@ def _wrong_value(quantity: Quantity, text: str) -> InputError:
     return InputError(f"a value of the axis {quantity.name!r} must be {accepted}, not {text}", key="values")
 
 
-Number = Annotated[float, Range()]
-NumberOrName = Annotated[float | str, Accepted("a number or a name")]
+NumberOrName = Annotated[fields.Number | str, Accepted("a number or a name")]
 
 
 class Axis(Section):
@@ -139,8 +138,8 @@ class Axis(Section):
 
     quantity: Annotated[QuantityName, Help("Quantity that varies")]
     values: tuple[NumberOrName, ...] | None = setting(None, "Values")
-    start: Number | None = setting(None, "First of evenly spaced values")
-    stop: Number | None = setting(None, "Last of evenly spaced values")
+    start: fields.Number | None = setting(None, "First of evenly spaced values")
+    stop: fields.Number | None = setting(None, "Last of evenly spaced values")
     steps: Annotated[int, Range(2, 1000)] | None = setting(None, "Number of evenly spaced values")
     log: bool = setting(False, "Whether values are evenly spaced in the logarithm")
 

@@ -25,7 +25,7 @@ from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, NUISANCES, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, found, number
+from mauvecl.schema.fields import AnyUnit, Flag, Help, metadata_of, number
 from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
 from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -426,7 +426,7 @@ def keys_of(sections: tuple[str, ...] = ("",)) -> tuple[Keyword, ...]:
         for section in sections
         for key, field in study_keys().items()
         if not section or f"{key}.".startswith(f"{section}.")
-        for flag in found(field, Flag)
+        for flag in metadata_of(field, Flag)
     )
 
 
