@@ -24,7 +24,7 @@ from mauvecl.answers.verbs import DRAWS, FEWER, OBSERVATION, VERBS, Verb
 from mauvecl.cli import console, flags
 from mauvecl.cli.console import Meter, show, show_view, with_flags
 from mauvecl.schema.columns import Column, View
-from mauvecl.schema.errors import InputError, of_kind, reworded
+from mauvecl.schema.errors import InputError, of_kind
 from mauvecl.schema.fields import Range
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class Session(flags.Options):
         """Raise InputError if files of the answer could not be written."""
         if self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
-            raise reworded(self._lost[0], f"{self._lost[0]}{others}")
+            raise InputError(f"{self._lost[0]}{others}", key=self._lost[0].key)
 
     @cached_property
     def folder(self) -> Path:
