@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Keyword
 
 
-def option(*names: str, text: str, **how: Any) -> Any:
+def option(*names: str, text: str, **options: Any) -> Any:
     """Return an option without its default in the help text."""
-    return typer.Option(*names, help=text, show_default=False, **how)
+    return typer.Option(*names, help=text, show_default=False, **options)
 
 
 DeviceFlag = Annotated[str | None, option(metavar="TEXT", text="OpenCL device: number or part of its name [PoCL].")]
@@ -39,8 +39,8 @@ PaperFlag = Annotated[
 SHOWS_ALL = "mauvecl.help_all"
 
 
-def _show_all(context: typer.Context, wanted: bool) -> None:
-    if wanted:
+def _show_all(context: typer.Context, is_set: bool) -> None:
+    if is_set:
         context.meta[SHOWS_ALL] = True
         print(context.get_help())
         raise typer.Exit
@@ -107,14 +107,14 @@ def study_option(keyword: Keyword, defaults: Mapping[str, Any]) -> Any:
     kind = keyword.kind
     if keyword.each in (float, int):
         kind, metavar = (list[str], f"{metavar},...") if keyword.many else (str, metavar)
-    made = option(
+    annotation = option(
         *flag.names,
         text=text + (f" [{default}]" if default else "") + ".",
         rich_help_panel=path.partition(".")[0].capitalize(),
         autocompletion=COMPLETIONS.get(path),
         metavar=metavar,
     )
-    return Annotated[kind | None, made]
+    return Annotated[kind | None, annotation]
 
 
 def option_of(key: str) -> Any:
@@ -128,33 +128,32 @@ def option_of(key: str) -> Any:
 
 def _words(annotation: Any) -> str:
     """Return the accepted words of a field as text; empty if there are none."""
+    inner = [argument for argument in get_args(annotation) if argument not in (NoneType, ...)]
     if get_origin(annotation) is Literal:
-        *others, last = get_args(annotation)
-        return f"{', '.join(others)} or {last}"
-    inner = [part for part in get_args(annotation) if part not in (NoneType, ...)]
+        return f"{', '.join(inner[:-1])} or {inner[-1]}"
     return _words(inner[0]) if len(inner) == 1 else ""
 
 
-def is_star(given: Path) -> bool:
+def is_star(argument: Path) -> bool:
     """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
     from mauvecl.host.stars.library import resolve
     from mauvecl.host.tables.files import as_text, read_bytes, toml
     from mauvecl.study.study import is_there
 
-    text = str(given)
-    if given.suffix.lower() == ".toml" or given.is_dir():
+    text = str(argument)
+    if argument.suffix.lower() == ".toml" or argument.is_dir():
         return False
     if not is_there(text):
         # The first name decides; a wrong name among others has its own message.
         first = text.split(",")[0].strip()
         return bool(first) and resolve(first) is not None
-    if given.suffix.lower() == ".ecsv":
-        return not holds_study(given)
-    if not given.is_file():
+    if argument.suffix.lower() == ".ecsv":
+        return not holds_study(argument)
+    if not argument.is_file():
         return True
     try:
         # TOML is a study, whatever the name of its file.
-        toml(as_text(read_bytes(given, "file")[:1_000_000], "file"), "file")
+        toml(as_text(read_bytes(argument, "file")[:1_000_000], "file"), "file")
     except InputError as error:
         # A key that has a value which no study may have is for the study to report.
         return error.key in ("file", None)
@@ -181,15 +180,15 @@ PLACES: dict[str, tuple[str, str, Callable[[Path], bool]]] = {
 }
 
 
-def numbers_of(keyword: Keyword, given: Any) -> Any:
+def numbers_of(keyword: Keyword, value: Any) -> Any:
     """Convert the texts of a flag of numbers, which may hold several with commas between them."""
     from mauvecl.schema.section import number_or_text
 
-    if given is None or keyword.each not in (float, int):
-        return given
+    if value is None or keyword.each not in (float, int):
+        return value
     if not keyword.many:
-        return number_or_text(given)
-    return [number_or_text(word.strip()) for text in given for word in text.split(",")]
+        return number_or_text(value)
+    return [number_or_text(word.strip()) for text in value for word in text.split(",")]
 
 
 def read_whole_number(text: str, flag: str, reach: Range) -> int:
@@ -239,6 +238,6 @@ COMPLETIONS = {
 def _continued(typed: str, names: Iterable[str], ending: str = "") -> list[str]:
     """Return names that begin with a text in any case, as it was typed, and folders and files with this ending."""
     words = [typed + name[len(typed) :] for name in names if name.casefold().startswith(typed.casefold())]
-    found = sorted(glob(escape(typed) + "*"))
-    folders = [f"{path}/" for path in found if Path(path).is_dir()]
-    return [*words, *folders, *(path for path in found if not Path(path).is_dir() and path.endswith(ending))]
+    paths = sorted(glob(escape(typed) + "*"))
+    folders = [f"{path}/" for path in paths if Path(path).is_dir()]
+    return [*words, *folders, *(path for path in paths if not Path(path).is_dir() and path.endswith(ending))]

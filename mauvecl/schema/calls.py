@@ -12,7 +12,7 @@ import os
 import sys
 from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import cached_property, partial, wraps
+from functools import cache, cached_property, partial, wraps
 from itertools import chain, repeat
 from pathlib import Path
 from pkgutil import resolve_name
@@ -193,6 +193,30 @@ def _validated(function: Public, owner: type | None = None) -> Public:
     return cast(Public, call)
 
 
+def checked(kind: Any, name: str, value: Any) -> Any:
+    """Return a value as its annotation, such as `Magnitude`, converts it; raises InputError for a wrong one."""
+    return _converted(_validator(kind), name, value)
+
+
+@cache
+def _validator(kind: Any) -> Callable[[Any], Any]:
+    return SchemaValidator(schema_of(kind)).validate_python
+
+
+def _converted(validate: Callable[[Any], Any], name: str, value: Any) -> Any:
+    try:
+        return validate(value)
+    except ValidationError as error:
+        faults = [(tuple(step for step in fault["loc"] if step != ALTERNATIVE), fault) for fault in error.errors()]
+    # The innermost wrong value, with the alternatives that it may be.
+    place, first = max(faults, key=lambda item: len(item[0]))
+    expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
+    path = name + "".join(f"[{step!r}]" for step in place if step != "[key]")
+    refused = InputError.of(path, first["input"], " or ".join(expected))
+    refused.key = name.replace(" ", "_")
+    raise refused
+
+
 class _Parameter:
     """A parameter, whose annotation is resolved when it is first given an argument."""
 
@@ -211,17 +235,7 @@ class _Parameter:
     def __call__(self, value: Any) -> Any:
         if value is self.default or self.text is inspect.Parameter.empty:
             return value
-        try:
-            return self.validate(value)
-        except ValidationError as error:
-            faults = [(tuple(step for step in fault["loc"] if step != ALTERNATIVE), fault) for fault in error.errors()]
-        # The innermost wrong value, with the alternatives that it may be.
-        place, first = max(faults, key=lambda item: len(item[0]))
-        expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
-        where = self.name + "".join(f"[{step!r}]" for step in place if step != "[key]")
-        refused = InputError.of(where, first["input"], " or ".join(expected))
-        refused.key = self.name
-        raise refused
+        return _converted(self.validate, self.name, value)
 
     def annotation(self) -> Any:
         """Return the resolved annotation."""

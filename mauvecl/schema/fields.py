@@ -19,8 +19,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
-from mauvecl.schema.errors import InputError
-
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
     from pydantic_core import CoreSchema
@@ -199,24 +197,6 @@ class Range:
 def is_truth(value: Any) -> bool:
     """Return whether a value is true or false; NumPy's own type counts too and need not be loaded."""
     return type(value).__name__ in ("bool", "bool_")
-
-
-def number(name: str, value: Any, unit: str = "", reach: Range | None = None) -> float:
-    """Return one finite number in a unit, as astropy reads it, and a range, from a number or a Quantity.
-
-    Wavelengths may come as frequencies or energies, temperatures on any scale. Raises InputError for other values.
-    """
-    reach = reach or Range()
-    try:
-        plain = without_unit(value, unit) if is_quantity(value) else value
-        if is_truth(plain) or isinstance(plain, str | bytes) or getattr(plain, "ndim", False):
-            raise TypeError("no number")
-        plain = float(plain)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError.of(name, value, reach.words(unit)) from error
-    if plain not in reach:
-        raise InputError.of(name, plain, reach.words(unit))
-    return plain
 
 
 def whole_number(value: Any) -> int:
@@ -430,11 +410,6 @@ def as_typed(value: Any, *, truth: tuple[str, str] = ("false", "true")) -> str:
 def range_of(kind: Any) -> Range:
     """Return the range of an annotation such as `Magnitude`."""
     return first(kind, Range) or Range()
-
-
-def checked(kind: Any, name: str, value: Any) -> float:
-    """Return a number in the unit and range of an annotation such as `Magnitude`."""
-    return number(name, value, (first(kind, Unit) or Unit("")).name, range_of(kind))
 
 
 #: Finite number, and finite whole number.

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 #: Quantities that vary, by name, with the unit and range of their fields.
 QUANTITIES = {
-    one.name: replace(one, path=path, unit=(first(field, Unit) or Unit("")).name, range=first(field, Range))
+    quantity.name: replace(quantity, path=path, unit=(first(field, Unit) or Unit("")).name, range=first(field, Range))
     for name, kind in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
     for path, field in section.fields_of(kind, (name,))
-    if (one := first(field, Quantity)) is not None
+    if (quantity := first(field, Quantity)) is not None
 }
 if TYPE_CHECKING:
     QuantityName = str
@@ -145,14 +145,14 @@ class Axis(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _without_units(cls, given: Any) -> Any:
+    def _without_units(cls, data: Any) -> Any:
         """Convert values with a unit, such as "10 min", to the unit of the quantity."""
-        quantity = QUANTITIES.get(str(given.get("quantity"))) if isinstance(given, dict) else None
+        quantity = QUANTITIES.get(str(data.get("quantity"))) if isinstance(data, dict) else None
         if quantity is None or quantity.range is None:
-            return given
-        keys = [key for key in ("values", "start", "stop") if key in given]
+            return data
+        keys = [key for key in ("values", "start", "stop") if key in data]
         try:
-            return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
+            return data | {key: Unit(quantity.unit).plain(data[key]) for key in keys}
         except ValueError as error:
             raise _wrong_value(quantity, str(error)) from error
 
@@ -219,7 +219,7 @@ class Sweep(Section):
         flag=Flag(
             "--as-list",
             kind=bool,
-            read=lambda wanted, _: "list" if wanted else None,
+            read=lambda is_set, _: "list" if is_set else None,
             help=Help("Vary the quantities of a sweep together instead of in every combination"),
         ),
     )
@@ -517,7 +517,6 @@ class MeasureQuestion(Section):
         ),
         label="Leave out wavelengths",
         hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",
-        unit="nm",
     )
     snr_per_bin: fields.Positive | None = setting(
         None,
@@ -553,11 +552,11 @@ class MeasureQuestion(Section):
                     raise InputError.of(f"measure.{key}", (low, high), "ascending wavelengths", unit="nm")
 
 
-def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[FittedModel, bool, tuple[str, ...]]]:
+def fitted_models(question: MeasureQuestion, flare: Flare) -> list[tuple[FittedModel, bool, tuple[str, ...]]]:
     """Return the name of each fitted model, whether it has a Balmer continuum, and its lines."""
     light = flare.spectrum
-    lines = asked.lines or tuple(dict.fromkeys((*light.lines, *light.line_fluxes)))
-    models = list(asked.models)
+    lines = question.lines or tuple(dict.fromkeys((*light.lines, *light.line_fluxes)))
+    models = list(question.models)
     if not models:
         models = ["blackbody"]
         if light.second_area is not None:

@@ -23,9 +23,9 @@ from mauvecl.host.orbit import Limits
 from mauvecl.host.stars.library import resolve
 from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, NUISANCES, Processes
-from mauvecl.schema.calls import validated
+from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, metadata_of, number
+from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, metadata_of
 from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
 from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -387,7 +387,8 @@ class Study(Section):
             raise InputError.of("quantity", quantity, f"one of {', '.join(QUANTITIES)}")
         swept = QUANTITIES[quantity]
         if swept.range is not None:
-            value = number(quantity.replace("_", " "), value, swept.unit, swept.range)
+            kind = Annotated[float, Unit(swept.unit), swept.range]
+            value = checked(kind, quantity.replace("_", " "), value)
         return self.with_value(swept.path, value)
 
     @property
