@@ -237,8 +237,10 @@ def serve(
 
     Example: mauvecl serve --show
     """
+    from mauvecl.schema.calls import checked
+    from mauvecl.schema.section import number_or_text
 
-    number = flags.read_whole_number(port, "--port", Range(1, 65535))
+    number = checked(Annotated[int, Range(1, 65535)], "--port", number_or_text(port))
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve

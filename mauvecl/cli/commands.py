@@ -25,7 +25,7 @@ from mauvecl.cli import console, flags
 from mauvecl.cli.console import Meter, show, show_view, with_flags
 from mauvecl.schema.columns import Column, View
 from mauvecl.schema.errors import InputError, of_kind
-from mauvecl.schema.fields import Range
+from mauvecl.schema.fields import FirstRealisation
 
 if TYPE_CHECKING:
     from mauvecl.answers.answer import Answer
@@ -44,7 +44,7 @@ MOST_SPECTRA = 1e16
 def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
     """Raise InputError for values that a later step would reject, or that would keep a hundred cores busy for a year.
 
-    A verb that `detects` needs flares and thresholds; `insist` starts one that `draws` however long it takes.
+    A verb that `detects` needs flares and thresholds; `insist` lets one that `draws` take any time.
     """
     from mauvecl.detection import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
@@ -100,7 +100,7 @@ class Session(flags.Options):
     given: Mapping[str, Any]  # values of the flags of keys, None where they are not given
     resources: ExitStack  # releases the output folder
     draws: bool  # whether a pool draws
-    notes: Sequence[str] = ()  # what the flags did not state, which is printed with the messages of the answer
+    notes: Sequence[str] = ()  # messages on what the flags did not state, printed with those of the answer
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     opened: Device | None = None  # device on which something was drawn without a pool, for the run record
@@ -162,7 +162,7 @@ class Session(flags.Options):
             self._lost.append(error)
 
     def ask(self) -> Any:
-        """Return the answer of the session's verb to its study, with the progress of what the verb counts."""
+        """Return the verb's answer to the study, and show the progress of what the verb counts."""
         verb = VERBS[self.verb]
         if not verb.counts:
             return verb.ask(self.study)
@@ -189,9 +189,9 @@ class Session(flags.Options):
 
     @contextmanager
     def pool(self, counts: str, **options: Any) -> Iterator[tuple[Pool, Meter]]:
-        """Yield a pool of the workers that the flags name, and its meter; it ends at once if the work ends early.
+        """Yield a pool of the workers that the flags name, and its meter; the workers stop if the work ends early.
 
-        The pool itself reports progress in realisations; what else the meter `counts` is for others to report.
+        The pool reports progress in realisations; the caller reports anything else that the meter `counts`.
         """
         from mauvecl.runs.pool import LocalWorkers, Pool
 
@@ -542,8 +542,10 @@ def simulate(
 ) -> None:
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
+    from mauvecl.schema.calls import checked
+    from mauvecl.schema.section import number_or_text
 
-    number = flags.read_whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
+    number = checked(FirstRealisation, "--realisation", number_or_text(realisation))
     session.answer(compute(session.study, realisation=number, flaring=bool(session.given["amplitude"])))
 
 

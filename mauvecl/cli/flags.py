@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 import typer
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Help, Range, Unit, as_typed, first, whole_number
+from mauvecl.schema.fields import Help, Unit, as_typed, first
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Keyword
@@ -52,7 +52,7 @@ ReplaceFlag = Annotated[bool, option("--replace", text="Replace an existing entr
 
 @dataclass(eq=False, kw_only=True)
 class Options:
-    """Values of a call that are no keys of a study, each with its flag."""
+    """Options of a call that are not keys of a study, each with its flag."""
 
     output: Path | None = None  # where everything is written; its flag states the default of the command
     as_json: JsonFlag = False
@@ -155,13 +155,13 @@ def is_star(argument: Path) -> bool:
         # TOML is a study, whatever the name of its file.
         toml(as_text(read_bytes(argument, "file")[:1_000_000], "file"), "file")
     except InputError as error:
-        # A key that has a value which no study may have is for the study to report.
+        # The study itself reports keys with impossible values.
         return error.key in ("file", None)
     return False
 
 
 def holds_study(file: Path) -> bool:
-    """Return whether a file is not a plain table, such as CSV, or ECSV that no answer wrote."""
+    """Return whether a file may hold a study: plain tables, such as CSV and ECSV that no answer wrote, do not."""
     suffix = file.suffix.lower()
     if suffix != ".ecsv" or not file.is_file():
         return suffix not in (".csv", ".vot", ".votable", ".xml", ".fits", ".fit")
@@ -189,19 +189,6 @@ def numbers_of(keyword: Keyword, value: Any) -> Any:
     if not keyword.many:
         return number_or_text(value)
     return [number_or_text(word.strip()) for text in value for word in text.split(",")]
-
-
-def read_whole_number(text: str, flag: str, reach: Range) -> int:
-    """Read a whole number of a range."""
-    from mauvecl.schema.section import number_or_text
-
-    try:
-        value = whole_number(number_or_text(text))
-    except ValueError:
-        value = None
-    if value is None or value not in reach:
-        raise InputError.of(flag, text, reach.words(whole=True))
-    return value
 
 
 def complete_star(incomplete: str) -> list[str]:

@@ -1,7 +1,7 @@
 """Validation of the arguments of public functions by their annotations.
 
-Checks are stricter than pydantic's own: text, True and NaN are no numbers. They know what astronomers pass: NumPy's
-scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance`, never copied.
+Checks are stricter than pydantic's own: text, True and NaN are refused as numbers. They accept what astronomers pass:
+NumPy's scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance`, never copied.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SEQUENCES = (tuple, Sequence, Collection, Iterable)
 
 
 def schema_of(hint: Any) -> CoreSchema:
-    """Return the core schema of an annotation; raises TypeError if it has none, so that no argument goes unchecked."""
+    """Return the core schema of an annotation; raises TypeError if it has none, so that every argument is checked."""
     origin, args = _origin(hint), get_args(hint)
     if origin is Annotated:
         schema = schema_of(args[0])
@@ -213,7 +213,7 @@ def _converted(validate: Callable[[Any], Any], name: str, value: Any) -> Any:
     expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
     path = name + "".join(f"[{step!r}]" for step in place if step != "[key]")
     refused = InputError.of(path, first["input"], " or ".join(expected))
-    refused.key = name.replace(" ", "_")
+    refused.key = InputError.of(name, value, "").key
     raise refused
 
 

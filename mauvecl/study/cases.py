@@ -194,7 +194,7 @@ class Loader:
 class Case:
     """One star at one combination of sweep values.
 
-    Nothing is loaded or computed before it is asked for, and each thing only once.
+    Everything is loaded or computed when it is first used, and only once.
 
     Examples
     --------

@@ -271,7 +271,7 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     keys = [key for key in PlanTarget.model_fields if key != "unused"]
     columns = {key: rows.first((key, *TARGET_COLUMNS.get(key, ()))) for key in (*keys, "ra", "dec", "parallax")}
     if columns["alpha"] is not None and columns["ra"] == columns["alpha"]:
-        # A right ascension next to a declination, otherwise the exponent of a distribution.
+        # It is a right ascension next to a declination, and otherwise the exponent of a distribution.
         columns["alpha" if columns["dec"] is not None else "ra"] = None
     if columns["name"] is None:
         raise InputError(f"{named} needs a column called name, but has {shown(', '.join(rows.names), 200)}", key="name")
@@ -281,7 +281,7 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     for key in ("distance_pc", "mass_msun", "age_myr"):
         column = columns[key]
         if column and names.key_of(column) in ("distance", "dist", "mass", "age") and not rows.unit(column):
-            # A distance in an unknown unit is none.
+            # Without its unit, a distance, mass or age is unknown.
             columns[key] = None
     if not 1 <= rows.n <= MAX_TARGETS:
         raise InputError(f"{named} must hold 1 to {MAX_TARGETS} targets, but holds {rows.n}", key="name")
@@ -301,7 +301,7 @@ def _target(
         if column is None or not text or (key == "coordinates" and names.is_missing_position(text)):
             continue
         unit = first(field, Unit)
-        # A text that is no number is refused with the key's own sentence.
+        # The field itself refuses text that is not a number, in its own words.
         is_number = (unit or first(field, Range)) and not isinstance(number_or_text(text), str)
         target[key] = rows.number(column, row, unit.name if unit else "") if is_number else text
     _check_band(rows, columns["magnitude"], row)
@@ -326,7 +326,7 @@ def _target(
 
 
 def _check_band(rows: Rows, column: str | None, row: int) -> None:
-    """Raise InputError if a magnitude of no stated band in its name has another than V in brackets or in a column."""
+    """Raise InputError if brackets or another column state a band other than V for a magnitude of no named band."""
     if column is None or not rows.text(column, row):
         return
     if names.key_of(names.divided_unit(column)[0]) not in ("mag", "magnitude"):
@@ -339,7 +339,7 @@ def _check_band(rows: Rows, column: str | None, row: int) -> None:
 def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: dict[str, Any]) -> str | None:
     """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there.
 
-    Raises InputError for one of the two, for sexagesimal ones that differ, and for a star without any that is not in
+    Raises InputError if only one of the two is given, if sexagesimal ones differ, and if a star without any is not in
     the embedded list.
     """
     from mauvecl.host.stars.library import by_key, name_key
@@ -360,7 +360,7 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
     if "coordinates" not in target and name_key(name := target.get("name", "")) not in by_key():
         for column in filter(None, (ra, columns["coordinates"])):
             text = str(rows.table[column][row])
-            # The cell says that a coordinate, or a pair of them, is not a number, instead of being empty.
+            # The cell is not empty, but says that a coordinate or a pair of them is not a number.
             if text.strip().lower() == "nan" or names.is_missing_position(text):
                 fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
                 remedy = "give its coordinates, or a name of the list"

@@ -36,7 +36,7 @@ STAR_KEYS = (
 
 
 def unit_of_file(of: Literal["wavelength", "flux"], prefix: str, whose: str, label: str, group: str) -> Any:
-    """Return the key of a unit of spectra next to a star's; `prefix` begins its flag, and `whose` ends its help."""
+    """Return the field of a unit of spectra other than a star's; `prefix` begins its flag, and `whose` ends its help."""
     noun, examples, units = UNITS[of]
     return setting(
         None,
@@ -189,7 +189,7 @@ class Star(Section):
             return changed
         listed = listed_values(str(value))
         if self.magnitude not in (None, listed_values(self.library or "").get("magnitude")):
-            # A given magnitude is that of every star.
+            # A magnitude that is not from the list was set by the user, for every star.
             listed.pop("magnitude", None)
         return changed.model_copy(update=dict.fromkeys(STAR_KEYS) | listed)
 

@@ -312,7 +312,7 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
     priors = [_stare_prior(name, getattr(processes, name), instrument) for name, _ in processes.modulations]
     spreads: dict[Course, dict[Changing, float]] = {course: dict(getattr(question, course)) for course in COURSES}
     for course, changing, sd, _ in priors:
-        # Independent normal amplitudes of one change add up to one.
+        # Independent normal amplitudes of the same change add in quadrature.
         spreads[course][changing] = math.hypot(spreads[course].get(changing, 0.0), sd)
     spreads = {course: {name: sds[name] for name in CHANGING if name in sds} for course, sds in spreads.items()}
     if study.nuisances.usual:

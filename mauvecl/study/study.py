@@ -241,7 +241,7 @@ class Study(Section):
         <Study of M4V V = 11; flares of 5 %; 120 s on mauve>
         """
         count, where = Counter(keyword.name for keyword in keys_of()), "Study.of()"
-        # A name of several keys belongs to none of them.
+        # A name that several keys share is ambiguous.
         accepted = {keyword.name: keyword for keyword in keys_of() if count[keyword.name] == 1}
         return with_keywords(cls(), values_of(keywords, accepted, where), accepted, where, is_default=True)
 
@@ -284,7 +284,7 @@ class Study(Section):
                 raise InputError.of("setting", text, "key=value, such as run.fap=0.01")
             label, parsed = f"value {shortened(value)}", dict[str, Any]()
             files.check_keys(value, label)
-            # A bare word is text, as is one of several lines, which would define several keys.
+            # A bare word is text, and so are several lines, which would define several keys.
             with files.parsing(label, "give a TOML value"), contextlib.suppress(tomllib.TOMLDecodeError):
                 parsed = tomllib.loads(f"value = {value}")
             set_key(data, path.split("."), parsed["value"] if len(parsed) == 1 else value, text)
@@ -475,7 +475,7 @@ def plain_kind(annotation: Any) -> Any:
         return list[plain_kind(arguments[0])]  # type: ignore[misc]
     if origin in (Union, UnionType):
         kinds = {plain_kind(kind) for kind in arguments if kind is not NoneType}
-        # A number or a word is text.
+        # A field for a number or a word takes text.
         return kinds.pop() if len(kinds) == 1 else str
     return str if origin is Literal else annotation
 
@@ -508,7 +508,7 @@ def with_keywords(
 ) -> Study:
     """Return a study changed by the values of keywords, as `values_of` returns them.
 
-    The stars of a study that `is_default` are not meant where a keyword describes a star without naming it.
+    If the study `is_default`, keywords that describe a star must come with one that names it.
     """
     if values.get("paper"):
         study = study.paper()
@@ -529,7 +529,7 @@ def with_keywords(
 
 
 def _nuisances(spreads: Any, nuisances: NuisanceChoice) -> dict[str, Any]:
-    """Return the keys of nuisances that texts such as dark=0.1, or with the name of a file, stray.txt=free, set."""
+    """Return the keys of nuisances that are set by texts such as dark=0.1 or, for a file, stray.txt=free."""
     expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
     if not isinstance(spreads, Mapping):
         spreads = dict(read_assignment(text, "nuisance", expected) for text in spreads)
