@@ -1,7 +1,8 @@
 """Validation of the arguments of public functions by their annotations.
 
 Checks are stricter than pydantic's own: text, True and NaN are refused as numbers. They accept what astronomers pass:
-NumPy's scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance`, never copied.
+NumPy's scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance` and never
+copied.
 """
 
 from __future__ import annotations

@@ -271,7 +271,7 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     keys = [key for key in PlanTarget.model_fields if key != "unused"]
     columns = {key: rows.first((key, *TARGET_COLUMNS.get(key, ()))) for key in (*keys, "ra", "dec", "parallax")}
     if columns["alpha"] is not None and columns["ra"] == columns["alpha"]:
-        # It is a right ascension next to a declination, and otherwise the exponent of a distribution.
+        # Next to a declination it is a right ascension, otherwise the exponent of a distribution.
         columns["alpha" if columns["dec"] is not None else "ra"] = None
     if columns["name"] is None:
         raise InputError(f"{named} needs a column called name, but has {shown(', '.join(rows.names), 200)}", key="name")

@@ -36,7 +36,7 @@ STAR_KEYS = (
 
 
 def unit_of_file(of: Literal["wavelength", "flux"], prefix: str, whose: str, label: str, group: str) -> Any:
-    """Return the field of a unit of spectra other than a star's; `prefix` begins its flag, and `whose` ends its help."""
+    """Return the field of a unit of spectra next to a star's; `prefix` begins its flag, `whose` ends its help."""
     noun, examples, units = UNITS[of]
     return setting(
         None,
