@@ -7,7 +7,6 @@ import datetime
 import difflib
 import math
 from collections.abc import Iterator, Sequence
-from functools import cache
 from typing import Any, Self, TypeVar, get_args
 
 from pydantic import (
@@ -15,7 +14,6 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
-    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -136,19 +134,17 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
     return next((model for inner in get_args(annotation) if (model := model_in(inner))), None)
 
 
-def plain(key: str, value: Any, unit: str) -> Any:
-    """Convert Quantities, dates, times and coordinates to the numbers and text that a study stores."""
+def plain(value: Any) -> Any:
+    """Convert arrays, dates, times and coordinates to the lists, numbers and text that a study stores.
+
+    Quantities remain, since the type of a number converts them to its unit.
+    """
     if isinstance(value, datetime.datetime) and value.tzinfo is not None:
         value = value.astimezone(datetime.UTC).replace(tzinfo=None)
     if isinstance(value, datetime.date):
         return value.isoformat()
     if fields.is_quantity(value):
-        try:
-            value = fields.without_unit(value, unit)
-        except ValueError:
-            raise InputError.of(key, value, fields.word_of(unit)) from None
-    if isinstance(value, list | tuple) and any(map(fields.is_quantity, value)):
-        return [plain(key, item, unit) for item in value]
+        return list(map(plain, value)) if getattr(value, "ndim", 0) else value
     if hasattr(value, "tolist"):
         return value.tolist()
     if hasattr(value, "utc") and hasattr(value, "isot"):
@@ -184,21 +180,7 @@ class Section(Record):
             new = old.with_value(inner, value)
         return self.model_copy(update={key: new})
 
-    @field_validator("*", mode="before")
-    @classmethod
-    def _in_its_unit(cls, value: Any, info: ValidationInfo) -> Any:
-        """Convert a Quantity to the unit of the key, and times and coordinates to text."""
-        key = str(info.field_name)
-        unit = _unit_of(cls, key)
-        if unit is not None and not getattr(value, "ndim", 0):
-            # The annotation converts it.
-            return value
-        return plain(key, value, "" if unit is None else unit.name)
-
-
-@cache
-def _unit_of(section: type[Section], key: str) -> fields.Unit | None:
-    return fields.first(section.model_fields[key], fields.Unit)
+    _plain = field_validator("*", mode="before")(plain)
 
 
 def setting(

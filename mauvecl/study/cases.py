@@ -261,7 +261,7 @@ class Case:
         processes = self.study.processes
         documented = default_processes(self.instrument.temperature_c) if self.study.nuisances.usual else {}
         missing = {name: prior for name, prior in documented.items() if getattr(processes, name) is None}
-        return processes.model_copy(update=missing)
+        return cast("Processes", processes.model_copy(update=missing))
 
     @property
     def draw_options(self) -> dict[str, Any]:

@@ -149,7 +149,7 @@ class PlanTarget(Section):
         else:
             target = Target.of(self.coordinates, name=self.name)
             with contextlib.suppress(InputError):
-                position = {"ra_deg": target.ra_deg, "dec_deg": target.dec_deg, "source": "given"}
+                position: dict[str, Any] = {"ra_deg": target.ra_deg, "dec_deg": target.dec_deg, "source": "given"}
                 target = replace(Target.of(self.name), name=self.name, **position)
         values = {name: getattr(self, name) for name in ("spectral_type", "magnitude", "distance_pc")}
         return replace(target, **{name: value for name, value in values.items() if value not in (None, "")})

@@ -13,7 +13,7 @@ from functools import cache, reduce
 from operator import getitem
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field
 
@@ -503,9 +503,12 @@ def values_of(values: Mapping[str, Any], keywords: Mapping[str, Keyword], where:
     return by_name | {"paper": values.get("paper")}
 
 
+StudyOf = TypeVar("StudyOf", bound=Study)
+
+
 def with_keywords(
-    study: Study, values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str, *, is_default: bool
-) -> Study:
+    study: StudyOf, values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str, *, is_default: bool
+) -> StudyOf:
     """Return a study changed by the values of keywords, as `values_of` returns them.
 
     If the study `is_default`, keywords that describe a star must come with one that names it.
