@@ -334,7 +334,7 @@ class Case:
         return Setting(quiet, ~quiet.saturated, comparison, flares, self.unknowns(quiet), self.processes)
 
     def with_value(self, quantity: str, value: float | str) -> Self:
-        """Return the case at another value of a quantity of `quantities.QUANTITIES`."""
+        """Return the case at another value of a quantity of `questions.QUANTITIES`."""
         return replace(self, study=self.study.at(quantity, value))
 
     def with_sections(self, **sections: Any) -> Self:
