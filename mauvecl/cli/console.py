@@ -46,8 +46,8 @@ LONGEST = 1000
 #: Error numbers of full disks and quotas, which name no file.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
-#: What to do instead of giving a flag that has gone.
-GONE = {
+#: What to do instead of giving a flag that was removed.
+REMOVED = {
     "--forget": "leave it out, since a driver that failed is tried again by every run",
     "--keep-after": "leave it out, since finished parts of a run are saved after 20 s",
     "--trials": "give --set change.trials=NUMBER",
@@ -105,8 +105,8 @@ def _failed(error: Exception) -> int:
         # A usage error of Click, or the help text of an empty command line, which Click prints itself.
         text = str(error.format_message())
         flag = getattr(error, "option_name", "")
-        if flag in GONE:
-            text = f"the flag {flag} has gone: {GONE[flag]}"
+        if flag in REMOVED:
+            text = f"the flag {flag} was removed: {REMOVED[flag]}"
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
     # Python wraps an interrupt while a class is made, and pydantic one of its builders.
     if type(error).__name__ == "Abort" or "KeyboardInterrupt" in f"{error!r} {error.__cause__!r}":
