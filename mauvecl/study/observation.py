@@ -130,7 +130,7 @@ class SkyLight(Section):
         """Set the default brightness of a sky without keys, and no sky for the brightness "none"."""
         if isinstance(data, dict) and says_none(data.get("surface_brightness")):
             return data | {"surface_brightness": None, "none": True}
-        return data or {"surface_brightness": DEFAULT_SKY}
+        return {"surface_brightness": DEFAULT_SKY} if data == {} else data
 
     def _check_values(self) -> None:
         check_all(self, "the sky", "target", "time")
