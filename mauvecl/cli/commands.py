@@ -97,7 +97,7 @@ class Session(flags.Options):
 
     verb: str
     study: Study
-    given: Mapping[str, Any]  # values of the flags of keys, None where they are not given
+    flag_values: Mapping[str, Any]  # of the flags of keys, None where they are not given
     resources: ExitStack  # releases the output folder
     draws: bool  # whether a pool draws
     notes: Sequence[str] = ()  # messages on what the flags did not state, printed with those of the answer
@@ -340,27 +340,29 @@ class Command:
         """Run the command with the values of its flags and of its other options."""
         from mauvecl.study.study import Study
 
-        given = {name: flags.numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
-        for value in given.get("amplitude") or ():
+        flag_values = {name: flags.numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
+        for value in flag_values.get("amplitude") or ():
             if not isinstance(value, str) and value >= 1:
                 rise = f"--amplitude {value} is a rise of {100 * value:g} %"
                 warnings.warn(f"{rise}; --amplitude {value}% is one of {value} %", stacklevel=2)
-        given |= {name: values.pop(name, None) for name in ("setting", "paper")}
+        flag_values |= {name: values.pop(name, None) for name in ("setting", "paper")}
         for key, (_, plural, applies) in flags.PLACES.items():
             # A file that is no study is for the flag that takes such files.
-            if study_file is not None and key in given and applies(study_file):
-                if given[key]:
+            if study_file is not None and key in flag_values and applies(study_file):
+                if flag_values[key]:
                     fault = f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given"
                     raise InputError(fault, key=key)
-                given[key] = [str(study_file)] if applies is flags.is_star else study_file
+                flag_values[key] = [str(study_file)] if applies is flags.is_star else study_file
                 study_file = None
         options = {name: values.pop(name, default) for name, (_, default) in self._options().items()}
         read = None if study_file is None else Study.read(study_file)
-        study, messages = self.verb.study_of(given, keywords, read, "command line")
+        study, messages = self.verb.study_of(flag_values, keywords, read, "command line")
         detects = {"fap", "realisations"} <= keywords.keys()
         question_values(study, detects=detects, draws=self.draws, insist=options.get("insist", False))
         with ExitStack() as resources:
-            session = Session(self.verb.name, study, given, resources, draws=self.draws, notes=messages, **options)
+            session = Session(
+                self.verb.name, study, flag_values, resources, draws=self.draws, notes=messages, **options
+            )
             self.run(session, **values)
             session.report_lost()
 
@@ -546,7 +548,7 @@ def simulate(
     from mauvecl.schema.section import number_or_text
 
     number = checked(FirstRealisation, "--realisation", number_or_text(realisation))
-    session.answer(compute(session.study, realisation=number, flaring=bool(session.given["amplitude"])))
+    session.answer(compute(session.study, realisation=number, flaring=bool(session.flag_values["amplitude"])))
 
 
 def plan(session: Session) -> None:
@@ -565,8 +567,8 @@ def stare(session: Session, device: flags.DeviceFlag = None) -> None:
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares
 
-    given = session.given
-    if given["energy"] and (given["amplitude"] or given["flares"]):
+    values = session.flag_values
+    if values["energy"] and (values["amplitude"] or values["flares"]):
         raise InputError("only one of --energy, --amplitude and --flares may be given", key="energy")
 
     stares = Stares(device)

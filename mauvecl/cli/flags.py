@@ -103,9 +103,9 @@ def study_option(keyword: Keyword, defaults: Mapping[str, Any]) -> Any:
         default = help.default
     else:
         default = as_typed(field.get_default(call_default_factory=True))
-    metavar = {str: "TEXT", Path: "FILE", float: "NUMBER", int: "INTEGER"}.get(keyword.each)
+    metavar = {str: "TEXT", Path: "FILE", float: "NUMBER", int: "INTEGER"}.get(keyword.item_kind)
     kind = keyword.kind
-    if keyword.each in (float, int):
+    if keyword.item_kind in (float, int):
         kind, metavar = (list[str], f"{metavar},...") if keyword.many else (str, metavar)
     annotation = option(
         *flag.names,
@@ -184,7 +184,7 @@ def numbers_of(keyword: Keyword, value: Any) -> Any:
     """Convert the texts of a flag of numbers, which may hold several with commas between them."""
     from mauvecl.schema.section import number_or_text
 
-    if value is None or keyword.each not in (float, int):
+    if value is None or keyword.item_kind not in (float, int):
         return value
     if not keyword.many:
         return number_or_text(value)

@@ -108,8 +108,8 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
             text = files.read_text(study, "study file") if study.is_file() else ""
             tables = tables_in(files.toml(text, "study file 'study.toml'"))
             texts = (text for keys in tables for text in keys.values() if isinstance(text, str))
-            stated = (table.parent / text for text in texts if Path(text).name == name)
-            places = [table.parent / name, table.parent.parent / name, Path(name), *stated]
+            named = (table.parent / text for text in texts if Path(text).name == name)
+            places = [table.parent / name, table.parent.parent / name, Path(name), *named]
             existing = (place for place in places if files.without_columns(place)[0].is_file())
             file = next((place for place in existing if _digest(place) == digest), None)
             if file is None:
@@ -454,7 +454,7 @@ class Keyword(NamedTuple):
         return get_origin(self.kind) is list
 
     @property
-    def each(self) -> Any:
+    def item_kind(self) -> Any:
         """Type of one of its values on the command line."""
         return get_args(self.kind)[0] if self.many else self.kind
 
@@ -521,9 +521,9 @@ def with_keywords(
         section, _, key = keyword.path.rpartition(".")
         if values[name] is None or section == "star" or name == "nuisance":
             continue
-        other = names.setdefault(keyword.path, name)
-        if other != name:
-            raise InputError(f"give either `{other}` or `{name}`: both set {keyword.path}", key=other)
+        first_name = names.setdefault(keyword.path, name)
+        if first_name != name:
+            raise InputError(f"give either `{first_name}` or `{name}`: both set {keyword.path}", key=first_name)
         changes.setdefault(section, {})[key] = keyword.value(values[name])
     if spreads := values.get("nuisance"):
         changes.setdefault("nuisances", {}).update(_nuisances(spreads, study.nuisances))
