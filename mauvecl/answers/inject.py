@@ -319,7 +319,7 @@ def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress
     report(len(stars), 0.0)
     messages = [text for star in stars for text in star.messages]
     messages += collect_messages([star.survey.components.quiet for star in stars])
-    messages += orbit_lines(study, prepared[0].instrument.frame_s)
+    messages += orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
     return InjectAnswer(study, stars, messages)
 
 

@@ -496,7 +496,7 @@ def measure(study: Study, engine: Engine | Pool | None = None, progress: Progres
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added', since fits take light for added")
     if study.measure.along_stare:
-        check_sweep(study)
+        check_sweep(study.sweep, study.stare, study.events)
     prepared = cases(study)
     if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
         raise InputError.of("flare.amplitudes", 0, "above 0 in a measurement")

@@ -378,7 +378,7 @@ def stare(
     checkpoint : Checkpoint, optional
         Keeps the frames that are drawn and the thresholds of searches.
     """
-    check_sweep(study)
+    check_sweep(study.sweep, study.stare, study.events)
     prepared = cases(study)
     # Sweeps do not change the frames.
     frames = prepared[0].stare.n_frames
@@ -391,7 +391,7 @@ def stare(
     quiet = [case.stare_expectation.quiet for case in prepared]
     engine = engine or Stares()
     drawn = [_draw(case, engine, checkpoint) for case in reported(prepared, len(prepared), progress)]
-    messages = collect_messages(quiet) + orbit_lines(study, prepared[0].instrument.frame_s)
+    messages = collect_messages(quiet) + orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
     messages += dict.fromkeys(chain.from_iterable(map(_unused_lines, prepared)))
     messages += [star.unsearched for star in drawn if star.unsearched]
     messages += [threshold_line(star.title, star.threshold) for star in drawn if star.shifted]

@@ -376,7 +376,8 @@ class Case:
     @cached_property
     def stare(self) -> Stare:
         """The study's stare."""
-        return stare_of(self.study, self.instrument)
+        s = self.study
+        return stare_of(s.stare, self.instrument, s.processes, orbit=s.orbit, plan=s.plan, usual=s.nuisances.usual)
 
     @cached_property
     def stare_expectation(self) -> StareExpectation:

@@ -21,8 +21,10 @@ from mauvecl.study.star import Flare, Star, unit_of_file
 from mauvecl.study.stare import SIZES
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.study import Study
+    from mauvecl.study.stare import EventChoice, StareQuestion
 
 
 #: Quantities that vary, by name, with the unit and range of their fields.
@@ -252,15 +254,14 @@ class Sweep(Section):
         return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]
 
 
-def check_sweep(study: Study) -> None:
+def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
     """Raise InputError if a swept quantity has no effect on the stare."""
-    stare, events = study.stare, study.events
     fixed = {
         "exposure": True,
         "amplitude": all(section.given_keys(event, SIZES) for event in events) if events else bool(stare.energies_erg),
         "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
     }
-    for axis in study.sweep.axes:
+    for axis in sweep.axes:
         if fixed.get(axis.quantity):
             raise InputError(
                 f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare; "

@@ -21,9 +21,10 @@ from mauvecl.study.observation import Spread, sd_of
 if TYPE_CHECKING:
     from mauvecl.flares.stare import Event, Stare
     from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.noise.unknowns import Processes
     from mauvecl.search.templates import Bank, Baseline
+    from mauvecl.study.plan import OrbitQuestion, PlanQuestion
     from mauvecl.study.star import Flare
-    from mauvecl.study.study import Study
 
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
@@ -304,25 +305,32 @@ def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Cours
     return course, process.of, abs(upper - mean) / mean, mean
 
 
-def stare_of(study: Study, instrument: Instrument) -> Stare:
-    """Return the stare of a study for an instrument, with the documented set of unknowns if the study has it."""
+def stare_of(
+    question: StareQuestion,
+    instrument: Instrument,
+    processes: Processes,
+    *,
+    orbit: OrbitQuestion,
+    plan: PlanQuestion,
+    usual: bool,
+) -> Stare:
+    """Return the stare of a study's sections; `usual` adds the documented set of unknowns."""
     from mauvecl.flares.stare import Stare
 
-    question, processes = study.stare, study.processes
     priors = [_stare_prior(name, getattr(processes, name), instrument) for name, _ in processes.modulations]
     spreads: dict[Course, dict[Changing, float]] = {course: dict(getattr(question, course)) for course in COURSES}
     for course, changing, sd, _ in priors:
         # Independent normal amplitudes of the same change add in quadrature.
         spreads[course][changing] = math.hypot(spreads[course].get(changing, 0.0), sd)
     spreads = {course: {name: sds[name] for name in CHANGING if name in sds} for course, sds in spreads.items()}
-    if study.nuisances.usual:
+    if usual:
         spreads = {course: documented | spreads[course] for course, documented in DEFAULT_SPREADS.items()}
 
     names = (*KNOWN_CHANGES, "pointing", "orbit_s")
     changes: dict[str, Any] = {name: getattr(question, name) for name in names} | spreads
     changes["frame_s"] = instrument.frame_s
     if question.along_orbit:
-        stare = _along_orbit(study, changes)
+        stare = _along_orbit(question, orbit, plan, changes)
     else:
         n_orbits = math.ceil(question.duration_s / question.orbit_s) if question.orbit_gap_s else 0
         ends = [(n + 1) * question.orbit_s for n in range(n_orbits)]
@@ -335,31 +343,30 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
     return stare
 
 
-def _along_orbit(study: Study, changes: dict[str, Any]) -> Stare:
+def _along_orbit(question: StareQuestion, orbit: OrbitQuestion, plan: PlanQuestion, changes: dict[str, Any]) -> Stare:
     """Return the stare at the target of the study's ``orbit``, with gaps and temperatures along the orbit."""
     from mauvecl.flares.stare import stare_along
     from mauvecl.study.plan import targets_of
 
-    stare, orbit = study.stare, study.orbit
-    if stare.gaps or stare.orbit_gap_s or stare.thermal is not None:
+    if question.gaps or question.orbit_gap_s or question.thermal is not None:
         fault = "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit"
         raise InputError(fault, key="stare.along_orbit")
-    targets = targets_of(orbit, study.plan)
+    targets, duration_s = targets_of(orbit, plan), question.duration_s
     if len(targets) != 1:
         fault = f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}"
         raise InputError(fault, key="stare.along_orbit")
-    return stare_along(orbit.orbit(), targets[0], orbit.start, stare.duration_s, limits=orbit.limits, **changes).stare
+    return stare_along(orbit.orbit(), targets[0], orbit.start, duration_s, limits=orbit.limits, **changes).stare
 
 
-def orbit_lines(study: Study, frame_s: float) -> list[str]:
+def orbit_lines(question: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
     from mauvecl.host.orbit.orbit import TimeGrid
 
-    if not study.stare.along_orbit:
+    if not question.along_orbit:
         return []
-    times = TimeGrid(study.orbit.start, study.stare.duration_s / DAY_S, frame_s)
+    times = TimeGrid(orbit.start, question.duration_s / DAY_S, frame_s)
     assumed = "Limits, temperatures and windows of a stare along the orbit are assumptions"
-    return [*study.orbit.orbit().messages(times), f"{assumed}; stray light is not modelled."]
+    return [*orbit.orbit().messages(times), f"{assumed}; stray light is not modelled."]
 
 
 def threshold_line(title: str, threshold: float) -> str:
