@@ -134,10 +134,8 @@ class Session(flags.Options):
         def saved() -> str:
             if not checkpoint.kept:
                 return "nothing was written, and nothing is half written"
-            count = f"{checkpoint.kept} part{'s' if checkpoint.kept > 1 else ''} of the work"
-            return (
-                f"{count} kept in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
-            )
+            parts = f"{checkpoint.kept} part{'s' if checkpoint.kept > 1 else ''} of the work kept"
+            return f"{parts} in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
 
         checkpoint = Checkpoint(self.folder, self.verb, self.study, resume=self.resume, restart=self.restart, held=True)
         with report_interrupts(saved), checkpoint:

@@ -16,6 +16,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -266,16 +267,11 @@ def _console(**options: Any) -> Console:
 def show(lines: Sequence[str]) -> None:
     """Print plain lines on standard output; on a terminal they are broken between words, and continued indented."""
     console = _console(soft_wrap=True)
+    fill = partial(textwrap.fill, break_long_words=False, break_on_hyphens=False)
     for line in lines:
         if console.is_terminal:
             indent = " " * (len(line) - len(line.lstrip()))
-            line = textwrap.fill(
-                line,
-                max(console.width, len(indent) + 1),
-                subsequent_indent=2 * indent,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
+            line = fill(line, max(console.width, len(indent) + 1), subsequent_indent=2 * indent)
         console.print(line)
 
 
