@@ -57,13 +57,13 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "an ideal answer of Python with the unknowns": (
         "test_keywords_ask_what_flags_ask[ideal]",
-        ('        values["with_unknowns"] = False', "        pass"),
+        ('        by_name["with_unknowns"] = False', "        pass"),
     ),
     "pairs of values without their units": (
         "test_studies_are_built_from_the_same_keywords",
         (
-            '((part, fields.with_unit(part, unit)) for part in text.split(":"))',
-            '((part, fields.with_unit(part, "s")) for part in text.split(":"))',
+            '((word, fields.with_unit(word, unit)) for word in text.split(":"))',
+            '((word, fields.with_unit(word, "s")) for word in text.split(":"))',
         ),
     ),
     "unknowns fitted with the wrong sign": (

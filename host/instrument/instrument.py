@@ -23,7 +23,7 @@ from mauvecl.host.tables.files import read_text, toml
 from mauvecl.schema import fields
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Help, Range, Unit, whole, word_of
+from mauvecl.schema.fields import Help, Range, Unit, whole_number, word_of
 from mauvecl.schema.section import Section, built
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def _read_path(value: Any, kind: type[SpectralCurve | PixelMap | ThroughputError
 Efficiency = Annotated[SpectralCurve, BeforeValidator(partial(_as_curve, unit=""))]
 Responsivity = Annotated[SpectralCurve, BeforeValidator(partial(_as_curve, unit="A / W"))]
 Loss = Annotated[float, Range(0, 1, open_high=True)]
-Whole = Annotated[int, BeforeValidator(whole)]
+Whole = Annotated[int, BeforeValidator(whole_number)]
 Count = Annotated[Whole, Range(0, 20)]
 #: Width of a line spread function; 0 for none.
 Width = Annotated[float, Unit("nm"), Range(0, 500)]
@@ -174,7 +174,7 @@ class Instrument(Section):
         Help("Uncertainty of the calibrated throughput"),
     ] = None
     throughput_amplitudes: Annotated[
-        tuple[float, ...],
+        tuple[fields.Number, ...],
         Help("Amplitudes of the first modes of `throughput_errors`, by which the throughput is not the calibrated"),
     ] = ()
 

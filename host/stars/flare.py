@@ -21,9 +21,9 @@ from mauvecl.host.arrays import ContentEquality, Float, array_cache, set_read_on
 from mauvecl.host.stars.spectrum import ANGSTROM, NEEDED_NM, attached, check_points, photons, supplemented
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.schema import fields
-from mauvecl.schema.calls import validated
+from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.fields import Range, Unit, checked, number
+from mauvecl.schema.fields import Range, Unit
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -220,7 +220,8 @@ class EmissionLine:
             nm = float(name)
         except ValueError:
             raise InputError.of("lines", name, f"a wavelength in nm or one of {', '.join(names)}") from None
-        return cls(name.strip(), (number(f"wavelength of the line {name!r}", nm, "nm", Range(100.0, 1000.0)),))
+        kind = Annotated[float, Unit("nm"), Range(100.0, 1000.0)]
+        return cls(name.strip(), (checked(kind, f"wavelength of the line {name!r}", nm),))
 
     @property
     def nodes_nm(self) -> Float:

@@ -16,12 +16,13 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from mauvecl.host.tables.files import Numbers, parse_numbers, read_ecsv
+from mauvecl.schema.calls import checked
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, Temperature, checked, number
+from mauvecl.schema.fields import Range, Temperature
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 #: Examples of formulas, by name.
 EXAMPLES = ("blackbody 9000 K", "power law -2")
 #: Accepted indices of power laws; steeper spectra are no approximation of stars (assumed).
-INDEX = Range(-10, 10)
+Index = Annotated[float, Range(-10, 10)]
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _NAME = re.compile(
     rf"\s*(?:(?P<body>black[ -]?body|planck)\s+(?P<kelvin>{_NUMBER})\s*K?|power[ -]?law\s+(?P<index>{_NUMBER}))\s*",
@@ -301,7 +302,7 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
             kelvin = checked(Temperature, "temperature of the blackbody", float(formula["kelvin"]))
             model = ModelStar(f"blackbody {kelvin:.15g} K", "Planck's law", kelvin)
         else:
-            index = number("index of the power law", float(formula["index"]), "", INDEX)
+            index = checked(Index, "index of the power law", float(formula["index"]))
             origin = f"flux per wavelength proportional to its power {index:g}"
             model = ModelStar(f"power law {index:.15g}", origin, None, index)
         return NamedStar(model.name, light=model)

@@ -23,9 +23,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.host.arrays import Float
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.columns import Column, number, table_of
-from mauvecl.study.observation import Observation
-from mauvecl.study.questions import formula_grid
-from mauvecl.study.study import PAPER_STARS, Study
+from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -217,17 +215,12 @@ def _most_wrong(ratios: Any) -> int:
 
 @by_keywords("stars, each of which is drawn for its S/N and then for its flares")
 def gaussian(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> GaussianAnswer:
-    """Compare the usual formula with the simulation, over magnitude and exposure or the study's sweep.
+    """Compare the usual formula with the simulation, for every star and sweep value of a study.
 
-    Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless the study states the magnitudes of
-    its stars, or another exposure than the default. Usual unknowns are left out: the question is about the noise.
+    Without a study, and unless keywords state a sweep, magnitude or exposure: magnitudes from 4 to 12 and exposures of
+    5, 50 and 600 s. Usual unknowns are left out: the question is about the noise.
     """
     engine, study = engine or Engine(), study.ideal()
-    has_magnitudes = study.star != PAPER_STARS and all(star.magnitude is not None for star in study.star)
-    if not study.sweep.axes and not has_magnitudes:
-        exposure_s = study.observation.exposure_s
-        usual = exposure_s == Observation().exposure_s
-        study = study.model_copy(update={"sweep": formula_grid(exposure_s=None if usual else exposure_s)})
 
     def report(stage: int, number: int, total: int) -> None:
         if progress is not None:

@@ -30,7 +30,7 @@ from mauvecl.noise.unknowns import values_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, table_of
-from mauvecl.schema.errors import InputError, Message, of_kind, reworded
+from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.schema.fields import DAY_S
 from mauvecl.study.cases import (
     SATURATED,
@@ -235,7 +235,7 @@ def settle(question: LimitSearch, start: float) -> Interval:
     except InputError as error:
         outside = off_centre([question.pair(start)[0]], question.case.processes)
         if outside:
-            raise reworded(error, "; ".join([str(error), *outside])) from error
+            raise InputError("; ".join([str(error), *outside]), key=error.key) from error
         raise
 
 

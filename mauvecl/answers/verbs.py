@@ -96,21 +96,18 @@ class Verb:
         `values` has that of each keyword, or None, and also ``paper``, and ``setting``, texts of any keys. They
         change the study or, without one, the verb's default; `where` names their origin in messages.
         """
-        from mauvecl.study.study import Study, changes_of, stars_of
+        from mauvecl.study.study import Study, with_keywords
 
-        is_given = study is not None
+        is_default = study is None
         if study is None:
             for name, keyword in keywords.items():
                 if values[name] is None:
                     values[name] = (self.defaults or {}).get(keyword.path)
             study = self.default(values) if self.default else Study()
-        if values.get("paper"):
-            study = study.paper()
-        stars = stars_of(study.star, values, keywords, own=is_given)
-        study = study.with_changes(changes_of(values, keywords, study.nuisances), stars, where)
+        study = with_keywords(study, values, keywords, where, is_default=is_default)
         if values.get("setting"):
             study = study.with_settings(values["setting"], where)
-        if is_given or values.get("tails", study) is not None:
+        if not is_default or values.get("tails", study) is not None:
             return study, []
         # Maps and limits would sample a tail in each cell or step, which takes longer than more realisations.
         return study.with_enough_tails(sampled=self.counts != "cells", raised=self.counts in ("cells", "steps"))
@@ -130,14 +127,13 @@ def _budgets_or_star(values: dict[str, Any]) -> Study:
 
 
 def _formula_grid(values: dict[str, Any]) -> Study:
-    """Return a study that sweeps what no flag states: magnitudes, exposures, or both, as `gaussian` does."""
-    from mauvecl.study.questions import formula_grid
+    """Return a study that sweeps what no flag states: magnitudes, exposures, or both."""
+    from mauvecl.study.questions import Axis, Sweep
     from mauvecl.study.study import Study
 
-    magnitudes, exposure = values["magnitude"], values["exposure"]
-    if not magnitudes and exposure is None:
-        return Study()
-    return Study().model_copy(update={"sweep": formula_grid(magnitude=not magnitudes, exposure_s=exposure)})
+    magnitudes = [] if values["magnitude"] else [Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))]
+    exposures = (5.0, 50.0, 600.0) if values["exposure"] is None else (values["exposure"],)
+    return Study(sweep=Sweep(axes=(*magnitudes, Axis(quantity="exposure", values=exposures))))
 
 
 #: By name, in the order of `mauvecl --help`: one star, flares, hours and campaigns.
@@ -239,8 +235,8 @@ VERBS: dict[str, Verb] = {
 
     Its S/N, intervals and false alarms are compared with those of realisations.
 
-    Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, where --magnitude or --exposure states
-    no others.
+    Without a study or sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, where --magnitude or --exposure
+    states no others.
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """,

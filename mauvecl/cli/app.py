@@ -47,11 +47,11 @@ def devices(
     """
     from mauvecl.device.selftest import DEVICE_COLUMNS, list_devices
 
-    found = list_devices(measure=rate)
+    drivers = list_devices(measure=rate)
     if as_json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(drivers, indent=2))
         return
-    numbered = [{"number": number} | record for number, record in enumerate(found)]
+    numbered = [{"number": number} | driver for number, driver in enumerate(drivers)]
     show_view(View("OpenCL devices; choose with --device NUMBER or part of a name", DEVICE_COLUMNS, numbered))
 
 
@@ -237,8 +237,10 @@ def serve(
 
     Example: mauvecl serve --show
     """
+    from mauvecl.schema.calls import checked
+    from mauvecl.schema.section import number_or_text
 
-    number = flags.whole_number(port, "--port", Range(1, 65535))
+    number = checked(Annotated[int, Range(1, 65535)], "--port", number_or_text(port))
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise missing_package("bokeh", "the page", "web")
     from mauvecl.web.server import serve
@@ -260,18 +262,16 @@ class CommandWithHelp(TyperCommand):
         shows_all = ctx.meta.get(flags.SHOWS_ALL, False)
         shown = self.common | {"help", "help_all"}
         groups: dict[str, list[tuple[str, str]]] = {}
-        for one in self.get_params(ctx):
-            record = one.get_help_record(ctx)
-            if one.param_type_name == "argument":
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if parameter.param_type_name == "argument":
                 heading = "Arguments"
             elif shows_all:
                 # Flags that set no key of a study have no panel.
-                heading = getattr(one, "rich_help_panel", None) or "Output and devices"
-            elif self.common:
-                heading = "Common flags"
+                heading = getattr(parameter, "rich_help_panel", None) or "Output and devices"
             else:
-                heading = "Options"
-            if record is not None and (heading != "Common flags" or one.name in shown):
+                heading = "Common flags" if self.common else "Options"
+            if record is not None and (heading != "Common flags" or parameter.name in shown):
                 groups.setdefault(heading, []).append(record)
         for heading, lines in groups.items():
             with formatter.section(heading):
@@ -283,8 +283,8 @@ def text_of(text: str | None) -> str:
 
     def broken(command: re.Match[str]) -> str:
         # Lines end in a backslash before a flag.
-        glued = re.sub(r" (?!-)", "\0", command[0])
-        lines = textwrap.wrap(glued, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+        joined = re.sub(r" (?!-)", "\0", command[0])
+        lines = textwrap.wrap(joined, 73, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
         return "\b\n" + " \\\n".join(lines).replace("\0", " ")
 
     text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
@@ -310,14 +310,14 @@ class _Commands(UserDict[str, Any]):
         if self.data[name] is not None:
             return self.data[name]
         if name == "library":
-            one = library_app
-            for inner in one.registered_commands:
+            application = library_app
+            for inner in application.registered_commands:
                 inner.help = text_of(inner.callback and inner.callback.__doc__)
         else:
-            one = typer.Typer(add_completion=False, rich_markup_mode=None)
+            application = typer.Typer(add_completion=False, rich_markup_mode=None)
             function = COMMANDS[name].build() if name in COMMANDS else OTHERS[name]
-            one.command(name, help=HELP[name], cls=CommandWithHelp)(function)
-        command: Any = get_command(one)
+            application.command(name, help=HELP[name], cls=CommandWithHelp)(function)
+        command: Any = get_command(application)
         if name in COMMANDS:
             command.common = frozenset((*COMMON, *COMMANDS[name].verb.common))
         self.data[name] = command
@@ -327,8 +327,8 @@ class _Commands(UserDict[str, Any]):
 class _Group(TyperGroup):
     """Group that builds only the command that is called, so that `mauvecl --help` needs no flags of a study."""
 
-    def __init__(self, **how: Any) -> None:
-        super().__init__(**how)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
         self.commands = _Commands(dict.fromkeys(HELP))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
@@ -340,7 +340,8 @@ class _Group(TyperGroup):
             with formatter.section(heading):
                 formatter.write_dl([(name.ljust(width), HELP[name].partition("\n")[0]) for name in names])
         with formatter.section("Options"):
-            formatter.write_dl([record for one in self.get_params(ctx) if (record := one.get_help_record(ctx))])
+            records = (parameter.get_help_record(ctx) for parameter in self.get_params(ctx))
+            formatter.write_dl(list(filter(None, records)))
 
 
 app = typer.Typer(
@@ -359,8 +360,8 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(is_set: bool) -> None:
+    if is_set:
         print(f"mauvecl {VERSION}")
         raise typer.Exit
 

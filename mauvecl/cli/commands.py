@@ -24,8 +24,8 @@ from mauvecl.answers.verbs import DRAWS, FEWER, OBSERVATION, VERBS, Verb
 from mauvecl.cli import console, flags
 from mauvecl.cli.console import Meter, show, show_view, with_flags
 from mauvecl.schema.columns import Column, View
-from mauvecl.schema.errors import InputError, of_kind, reworded
-from mauvecl.schema.fields import Range
+from mauvecl.schema.errors import InputError, of_kind
+from mauvecl.schema.fields import FirstRealisation
 
 if TYPE_CHECKING:
     from mauvecl.answers.answer import Answer
@@ -44,7 +44,7 @@ MOST_SPECTRA = 1e16
 def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
     """Raise InputError for values that a later step would reject, or that would keep a hundred cores busy for a year.
 
-    A verb that `detects` needs flares and thresholds; `insist` starts one that `draws` however long it takes.
+    A verb that `detects` needs flares and thresholds; `insist` lets one that `draws` take any time.
     """
     from mauvecl.detection import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
@@ -78,10 +78,10 @@ def question_room(store: Store, *, insist: bool) -> None:
     """Raise InputError, with the required and the available space, for a store that does not fit on its disk."""
     if insist:
         return
-    there = next(folder for folder in (store.path, *store.path.absolute().parents) if folder.is_dir())
+    folder = next(folder for folder in (store.path, *store.path.absolute().parents) if folder.is_dir())
     # An unfinished store already has some of its bytes.
-    held = sum(path.stat().st_size for path in store.path.glob("star-*/*/c/*/*"))
-    free = shutil.disk_usage(there).free + held
+    written = sum(path.stat().st_size for path in store.path.glob("star-*/*/c/*/*"))
+    free = shutil.disk_usage(folder).free + written
     if store.n_bytes > free:
         rows = free // (store.n_bytes // store.rows)
         raise InputError(
@@ -97,10 +97,10 @@ class Session(flags.Options):
 
     verb: str
     study: Study
-    given: Mapping[str, Any]  # values of the flags of keys, None where they are not given
-    held: ExitStack  # releases the output folder
+    flag_values: Mapping[str, Any]  # of the flags of keys, None where they are not given
+    resources: ExitStack  # releases the output folder
     draws: bool  # whether a pool draws
-    notes: Sequence[str] = ()  # what the flags did not state, which is printed with the messages of the answer
+    notes: Sequence[str] = ()  # messages on what the flags did not state, printed with those of the answer
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     opened: Device | None = None  # device on which something was drawn without a pool, for the run record
@@ -111,8 +111,9 @@ class Session(flags.Options):
     def report_lost(self) -> None:
         """Raise InputError if files of the answer could not be written."""
         if self._lost:
-            others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
-            raise reworded(self._lost[0], f"{self._lost[0]}{others}")
+            first, n_more = self._lost[0], len(self._lost) - 1
+            more = f"; the same holds for {n_more} more files of this answer" if n_more else ""
+            raise InputError(f"{first}{more}", key=first.key)
 
     @cached_property
     def folder(self) -> Path:
@@ -122,7 +123,7 @@ class Session(flags.Options):
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
         console.folder = folder
-        self.held.enter_context(locked(folder, "output folder"))
+        self.resources.enter_context(locked(folder, "output folder"))
         return folder
 
     @contextmanager
@@ -130,15 +131,14 @@ class Session(flags.Options):
         """Keep finished parts of the work in the output folder, and report interruptions."""
         from mauvecl.runs.checkpoint import Checkpoint
 
-        def kept() -> str:
+        def saved() -> str:
             if not checkpoint.kept:
                 return "nothing was written, and nothing is half written"
-            parts = f"{checkpoint.kept} part{'s' if checkpoint.kept > 1 else ''} of the work"
-            where = f"kept in {str(checkpoint.folder)!r}"
-            return f"{parts} {where}, and the same command with --resume continues from there"
+            parts = f"{checkpoint.kept} part{'s' if checkpoint.kept > 1 else ''} of the work kept"
+            return f"{parts} in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
 
         checkpoint = Checkpoint(self.folder, self.verb, self.study, resume=self.resume, restart=self.restart, held=True)
-        with report_interrupts(kept), checkpoint:
+        with report_interrupts(saved), checkpoint:
             self.say(checkpoint.messages)
             yield checkpoint
             if checkpoint.damaged:
@@ -146,10 +146,6 @@ class Session(flags.Options):
                     [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
                 )
         self._checkpoint = checkpoint
-
-    def metered(self, unit: str) -> Meter:
-        """Return the progress in a unit, for a `with` block."""
-        return Meter(quiet=self.quiet or self.as_json, unit=unit)
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
@@ -164,12 +160,12 @@ class Session(flags.Options):
             self._lost.append(error)
 
     def ask(self) -> Any:
-        """Return the answer of the session's verb to its study, with the progress of what the verb counts."""
+        """Return the verb's answer to the study, and show the progress of what the verb counts."""
         verb = VERBS[self.verb]
         if not verb.counts:
             return verb.ask(self.study)
         if not self.draws:
-            with self.metered(verb.counts) as meter:
+            with Meter(quiet=self.quiet or self.as_json, unit=verb.counts) as meter:
                 return verb.ask(self.study, progress=meter)
 
         def prepare() -> None:
@@ -190,14 +186,14 @@ class Session(flags.Options):
             return verb.ask(self.study, self._pool, None if verb.counts == "realisations" else meter)
 
     @contextmanager
-    def pool(self, counts: str, **how: Any) -> Iterator[tuple[Pool, Meter]]:
-        """Yield a pool of the workers that the flags name, and its meter; it ends at once if the work ends early.
+    def pool(self, counts: str, **options: Any) -> Iterator[tuple[Pool, Meter]]:
+        """Yield a pool of the workers that the flags name, and its meter; the workers stop if the work ends early.
 
-        The pool itself reports progress in realisations; what else the meter `counts` is for others to report.
+        The pool reports progress in realisations; the caller reports anything else that the meter `counts`.
         """
         from mauvecl.runs.pool import LocalWorkers, Pool
 
-        with self.metered(counts) as meter:
+        with Meter(quiet=self.quiet or self.as_json, unit=counts) as meter:
             if self.cluster is not None:
                 from mauvecl.runs.cluster import DaskWorkers
 
@@ -206,7 +202,7 @@ class Session(flags.Options):
                 words = [] if self.device is None else self.device.split(",")
                 workers = LocalWorkers([word.strip() for word in words] or [None])
             with closing(workers):
-                pool = Pool(workers, progress=meter if counts == "realisations" else None, **how)
+                pool = Pool(workers, progress=meter if counts == "realisations" else None, **options)
                 meter.standing = lambda: pool.standing
                 yield pool, meter
 
@@ -214,20 +210,20 @@ class Session(flags.Options):
         """Print an answer and write its files."""
 
         def written() -> str:
-            whole = ", ".join(path.name for path in self.files) or "nothing"
-            again = " with --resume" if self._checkpoint is not None and self._checkpoint.kept else ""
-            whole += f" written to {str(self.folder)!r}, each file whole"
-            return f"{whole}, and the same command{again} writes all of them"
+            names = ", ".join(path.name for path in self.files) or "nothing"
+            flag = " with --resume" if self._checkpoint is not None and self._checkpoint.kept else ""
+            place = f"written to {str(self.folder)!r}, each file whole"
+            return f"{names} {place}, and the same command{flag} writes all of them"
 
         with report_interrupts(written):
             self._leave_all(answer)
         # A note on sampled thresholds is left out where the answer has its own.
-        told = of_kind(self.notes, "sampled") if of_kind(answer.messages, "sampled") else []
-        notes = [note for note in self.notes if note not in told]
+        repeated = of_kind(self.notes, "sampled") if of_kind(answer.messages, "sampled") else []
+        notes = [note for note in self.notes if note not in repeated]
         if self.as_json:
             content = answer.as_json()
-            said = [with_flags(line) for line in (*notes, *content.pop("messages"))]
-            self.print_json({"headline": answer.headline, "assumed": answer.assumed, "messages": said} | content)
+            messages = [with_flags(line) for line in (*notes, *content.pop("messages"))]
+            self.print_json({"headline": answer.headline, "assumed": answer.assumed, "messages": messages} | content)
             return
         self.say([answer.headline])
         left_out = [show_view(view, wide=self.wide) for view in answer.all_views]
@@ -251,11 +247,11 @@ class Session(flags.Options):
             self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
         for name, write in writers.items():
             self.leave(partial(write, self.folder / name))
-        how: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "files": self.files}
-        how |= {"seconds": time.perf_counter() - self.started, "messages": [*answer.messages, *answer.remarks]}
         data = answer.study.model_dump(mode="json", exclude_none=True)
+        about: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "files": self.files}
+        about |= {"seconds": time.perf_counter() - self.started, "messages": [*answer.messages, *answer.remarks]}
         # Only a complete answer replaces another's files.
-        self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, whole=not self._lost, **how))
+        self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, whole=not self._lost, **about))
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
@@ -307,8 +303,8 @@ class Command:
         verb = self.verb
         keywords = {keyword.name: keyword for keyword in keys_of(verb.keys)}
         kinds = get_type_hints(self.run, localns={"Session": Any}, include_extras=True)
-        _, *own = inspect.signature(self.run).parameters.values()
-        other = next((f", or {what}" for flag, (what, *_) in flags.PLACES.items() if flag in keywords and what), "")
+        _, *parameters_of_run = inspect.signature(self.run).parameters.values()
+        other = next((f", or {noun}" for flag, (noun, *_) in flags.PLACES.items() if flag in keywords and noun), "")
         argument = typer.Argument(
             help=f"Study (TOML), the ECSV table of an answer{other}; flags override it.",
             show_default=False,
@@ -320,7 +316,7 @@ class Command:
             **{name: (flags.study_option(keyword, verb.defaults or {}), None) for name, keyword in keywords.items()},
             "setting": (flags.SetFlag, None),
             **({"paper": (flags.PaperFlag, False)} if verb.accepts("observation.instrument") else {}),
-            **{p.name: (kinds[p.name], p.default) for p in own},
+            **{p.name: (kinds[p.name], p.default) for p in parameters_of_run},
             **self._options(),
             "help_all": (Annotated[bool, flags.HELP_ALL], False),
         }
@@ -330,8 +326,8 @@ class Command:
             self._call(study_file, keywords, values)
 
         parameters = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=kind)
-            for name, (kind, usual) in options.items()
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            for name, (kind, default) in options.items()
         ]
         command.__name__ = verb.name
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -342,34 +338,36 @@ class Command:
         """Run the command with the values of its flags and of its other options."""
         from mauvecl.study.study import Study
 
-        given = {name: flags.numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
-        for value in given.get("amplitude") or ():
+        flag_values = {name: flags.numbers_of(keyword, values.pop(name)) for name, keyword in keywords.items()}
+        for value in flag_values.get("amplitude") or ():
             if not isinstance(value, str) and value >= 1:
                 rise = f"--amplitude {value} is a rise of {100 * value:g} %"
                 warnings.warn(f"{rise}; --amplitude {value}% is one of {value} %", stacklevel=2)
-        given |= {name: values.pop(name, None) for name in ("setting", "paper")}
+        flag_values |= {name: values.pop(name, None) for name in ("setting", "paper")}
         for key, (_, plural, applies) in flags.PLACES.items():
             # A file that is no study is for the flag that takes such files.
-            if study_file is not None and key in given and applies(study_file):
-                if given[key]:
+            if study_file is not None and key in flag_values and applies(study_file):
+                if flag_values[key]:
                     fault = f"{str(study_file)!r} and --{key} are both {plural}, but only one may be given"
                     raise InputError(fault, key=key)
-                given[key] = [str(study_file)] if applies is flags.is_star else study_file
+                flag_values[key] = [str(study_file)] if applies is flags.is_star else study_file
                 study_file = None
-        how = {name: values.pop(name, usual) for name, (_, usual) in self._options().items()}
-        own = None if study_file is None else Study.read(study_file)
-        study, messages = self.verb.study_of(given, keywords, own, "command line")
+        options = {name: values.pop(name, default) for name, (_, default) in self._options().items()}
+        read = None if study_file is None else Study.read(study_file)
+        study, messages = self.verb.study_of(flag_values, keywords, read, "command line")
         detects = {"fap", "realisations"} <= keywords.keys()
-        question_values(study, detects=detects, draws=self.draws, insist=how.get("insist", False))
-        with ExitStack() as held:
-            session = Session(self.verb.name, study, given, held, draws=self.draws, notes=messages, **how)
+        question_values(study, detects=detects, draws=self.draws, insist=options.get("insist", False))
+        with ExitStack() as resources:
+            session = Session(
+                self.verb.name, study, flag_values, resources, draws=self.draws, notes=messages, **options
+            )
             self.run(session, **values)
             session.report_lost()
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
         """Return the options of the session, with their defaults."""
-        usual = self.writes or f"the folder mauvecl-{self.verb.name}"
-        output = flags.option("--output", "-o", metavar="PATH", text=f"Where to write [{usual}].")
+        default = self.writes or f"the folder mauvecl-{self.verb.name}"
+        output = flags.option("--output", "-o", metavar="PATH", text=f"Where to write [{default}].")
         workers = flags.WORKERS if self.draws else flags.RESUMING if self.resumes else ()
         names = ("as_json", "quiet", "wide", *(["pictures"] if self.pictures else []), *workers)
         kinds = get_type_hints(flags.Options, include_extras=True)
@@ -468,7 +466,7 @@ def verify(
             raise InputError(f"{text}give the command of the answer with --restart to write it again", key="store")
         faults: Sequence[Any] = verify_answer(store)
         columns: Sequence[Column] = FAULT_COLUMNS
-        left = len(faults)
+        n_left = len(faults)
         outcome = "" if faults else "Every file agrees with the run record, and the record with its own digest."
     else:
         from mauvecl.device.engine import Engine
@@ -477,17 +475,17 @@ def verify(
         engine = Engine(device) if repair or redraw else None
         with Meter(quiet=quiet or as_json, unit="chunks") as meter:
             faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
-        columns, left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
-        whole = f"Everything agrees with what {'the engine draws' if redraw else 'was written'}."
-        outcome = f"{len(faults) - left} repaired, {left} left as found." if faults else whole
-    found = [asdict(fault) for fault in faults]
+        columns, n_left = bulk.FAULT_COLUMNS, sum(not fault.mended for fault in faults)
+        sound = f"Everything agrees with what {'the engine draws' if redraw else 'was written'}."
+        outcome = f"{len(faults) - n_left} repaired, {n_left} left as found." if faults else sound
+    rows_of_faults = [asdict(fault) for fault in faults]
     if as_json:
-        print(json.dumps(found, indent=2))
-    elif found:
-        show_view(View(f"Not as it was written: {store}", columns, found))
+        print(json.dumps(rows_of_faults, indent=2))
+    elif faults:
+        show_view(View(f"Not as it was written: {store}", columns, rows_of_faults))
     if outcome and not as_json:
         show([outcome])
-    if left:
+    if n_left:
         raise typer.Exit(1)
 
 
@@ -544,9 +542,11 @@ def simulate(
 ) -> None:
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal import simulate as compute
+    from mauvecl.schema.calls import checked
+    from mauvecl.schema.section import number_or_text
 
-    number = flags.whole_number(realisation, "--realisation", Range(0, 2**63 - 1))
-    session.answer(compute(session.study, realisation=number, flaring=bool(session.given["amplitude"])))
+    number = checked(FirstRealisation, "--realisation", number_or_text(realisation))
+    session.answer(compute(session.study, realisation=number, flaring=bool(session.flag_values["amplitude"])))
 
 
 def plan(session: Session) -> None:
@@ -565,8 +565,8 @@ def stare(session: Session, device: flags.DeviceFlag = None) -> None:
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares
 
-    given = session.given
-    if given["energy"] and (given["amplitude"] or given["flares"]):
+    values = session.flag_values
+    if values["energy"] and (values["amplitude"] or values["flares"]):
         raise InputError("only one of --energy, --amplitude and --flares may be given", key="energy")
 
     stares = Stares(device)

@@ -16,6 +16,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -46,8 +47,8 @@ LONGEST = 1000
 #: Error numbers of full disks and quotas, which name no file.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
-#: What to do instead of giving a flag that has gone.
-GONE = {
+#: What to do instead of giving a flag that was removed.
+REMOVED = {
     "--forget": "leave it out, since a driver that failed is tried again by every run",
     "--keep-after": "leave it out, since finished parts of a run are saved after 20 s",
     "--trials": "give --set change.trials=NUMBER",
@@ -105,18 +106,18 @@ def _failed(error: Exception) -> int:
         # A usage error of Click, or the help text of an empty command line, which Click prints itself.
         text = str(error.format_message())
         flag = getattr(error, "option_name", "")
-        if flag in GONE:
-            text = f"the flag {flag} has gone: {GONE[flag]}"
+        if flag in REMOVED:
+            text = f"the flag {flag} was removed: {REMOVED[flag]}"
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
     # Python wraps an interrupt while a class is made, and pydantic one of its builders.
     if type(error).__name__ == "Abort" or "KeyboardInterrupt" in f"{error!r} {error.__cause__!r}":
         return _say("interrupted", INTERRUPTED)
     if device is not None and isinstance(error, device.DeviceError):
-        return _say(str(error), BAD_INPUT, whole=error.kind == "kernel")
-    where = _write_traceback(error)
-    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        return _say(str(error), BAD_INPUT, keep_lines=error.kind == "kernel")
+    file = _write_traceback(error)
+    name = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return _say(
-        f"something unforeseen happened, a fault of mauvecl ({what[:200]}); its traceback is in {str(where)!r}, and "
+        f"something unforeseen happened, a fault of mauvecl ({name[:200]}); its traceback is in {str(file)!r}, and "
         "what was written before is kept",
         UNFORESEEN,
     )
@@ -141,9 +142,9 @@ def _failed_call(error: OSError) -> int:
     )
 
 
-def _say(text: str, code: int, *, whole: bool = False) -> int:
-    """Print one sentence on standard error; `whole` keeps the lines of a compiler's log."""
-    if not whole:
+def _say(text: str, code: int, *, keep_lines: bool = False) -> int:
+    """Print one sentence on standard error, and return the exit code; `keep_lines` is for a compiler's log."""
+    if not keep_lines:
         text = printable(re.sub(r"[\n\t]", " ", text), LONGEST)
     with contextlib.suppress(OSError, ValueError):
         print(f"mauvecl: {text}", file=sys.stderr, flush=True)
@@ -242,34 +243,35 @@ class Meter:
         self._last, self._total = done, total
         if self._quiet or now - self._started < PATIENCE_S or now - self._shown < (0.2 if self._changes else 10.0):
             return
-        self._shown, left, standing = now, "time left unknown", None if self.standing is None else self.standing()
+        self._shown, time_left = now, "time left unknown"
+        standing = None if self.standing is None else self.standing()
         # Parts from a checkpoint took no time.
         counted = done - (standing.resumed if standing is not None and self._unit == "realisations" else 0)
         rate = counted / max(now - self._started, 1e-9)
         if counted >= TOLD_FROM * total:
             seconds = (total - done) / rate
             unit, size = next((row for row in UNITS if seconds > 3 * row[1]), ("s", 1.0))
-            left = f"{seconds / size:.0f} {unit} left"
-        again = f", {standing.retries} parts counted again" if standing is not None and standing.retries else ""
-        line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{again}"
+            time_left = f"{seconds / size:.0f} {unit} left"
+        retries = f", {standing.retries} parts counted again" if standing is not None and standing.retries else ""
+        line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {time_left}{retries}"
         print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
 
 
-def _console(**how: Any) -> Console:
+def _console(**options: Any) -> Console:
     from rich.console import Console
 
     # Names may contain brackets and colons, which are not markup here.
-    return Console(highlight=False, markup=False, emoji=False, **how)
+    return Console(highlight=False, markup=False, emoji=False, **options)
 
 
 def show(lines: Sequence[str]) -> None:
     """Print plain lines on standard output; on a terminal they are broken between words, and continued indented."""
     console = _console(soft_wrap=True)
+    fill = partial(textwrap.fill, break_long_words=False, break_on_hyphens=False)
     for line in lines:
         if console.is_terminal:
             indent = " " * (len(line) - len(line.lstrip()))
-            how: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
-            line = textwrap.fill(line, max(console.width, len(indent) + 1), subsequent_indent=2 * indent, **how)
+            line = fill(line, max(console.width, len(indent) + 1), subsequent_indent=2 * indent)
         console.print(line)
 
 
@@ -300,7 +302,7 @@ def show_view(view: View, *, wide: bool = True) -> bool:
             title = "; ".join([title, *(f"{heading} {cell}" for heading, cell, *_ in columns[:shared])])
             columns = columns[shared:]
     show([title])
-    for part in _parts(columns, room):
+    for part in _divided(columns, room):
         table = Table(box=box.SIMPLE_HEAD)
         for heading, *cells in part:
             numeric = bool(cells) and all(cell[:1] in "0123456789-+.<>=" for cell in cells)
@@ -325,7 +327,7 @@ def _width(columns: Sequence[list[str]]) -> int:
     return 1 + sum(3 + max(map(cell_len, column)) for column in columns)
 
 
-def _parts(columns: list[list[str]], room: int) -> list[list[list[str]]]:
+def _divided(columns: list[list[str]], room: int) -> list[list[list[str]]]:
     """Divide a table: each part has the first columns, which identify rows, and as many others as fit."""
     if _width(columns) <= room:
         return [columns]
@@ -333,17 +335,17 @@ def _parts(columns: list[list[str]], room: int) -> list[list[list[str]]]:
     n_lines = len(columns[0])
     apart = next((n for n in (1, 2, 3) if len(set(zip(*columns[:n], strict=True))) == n_lines), 3)
     first = columns[: next((n for n in range(apart, 1, -1) if _width(columns[:n]) <= room / 2), 1)]
-    together: list[list[list[str]]] = []
+    groups: list[list[list[str]]] = []
     for column in columns[len(first) :]:
-        if together and column[0] == INTERVAL:
-            together[-1].append(column)
+        if groups and column[0] == INTERVAL:
+            groups[-1].append(column)
         else:
-            together.append([column])
+            groups.append([column])
     parts = [[*first]]
-    for some in together:
-        if len(parts[-1]) > len(first) and _width([*parts[-1], *some]) > room:
+    for group in groups:
+        if len(parts[-1]) > len(first) and _width([*parts[-1], *group]) > room:
             parts.append([*first])
-        parts[-1] += some
+        parts[-1] += group
     return parts
 
 
@@ -361,14 +363,14 @@ def _flags(name: str, *, off: bool = False) -> list[str]:
         command = getattr(command, "commands", {}).get(word, command)
     # If a key has several flags, the last takes its value unchanged.
     keywords = {keyword.path: keyword for keyword in keys_of() if f".{keyword.path}".endswith(f".{name}")}
-    wanted = {name, *(keyword.name for keyword in keywords.values())}
+    names = {name, *(keyword.name for keyword in keywords.values())}
     for parameter in getattr(command, "params", ()):
-        if parameter.name in wanted:
+        if parameter.name in names:
             flags = parameter.secondary_opts if off else parameter.opts
             return sorted((flag for flag in flags if flag.startswith("-")), key=len, reverse=True)
-    known = next((keyword for keyword in keys_of() if keyword.name in wanted), None)
-    on, *others = known.flag.names[0].split("/") if known else [""]
-    return others if off else [on] if known else []
+    keyword = next((keyword for keyword in keys_of() if keyword.name in names), None)
+    on, _, switched_off = keyword.flag.names[0].partition("/") if keyword else ("", "", "")
+    return [flag for flag in [switched_off if off else on] if flag]
 
 
 def with_flags(text: str) -> str:
@@ -397,9 +399,9 @@ def name_flag(error: InputError) -> str:
     name = re.sub(r"\.\d+(?=\.|$)", "", key)
     names = (name, name.removeprefix("flare_"), name.rpartition(".")[0])
     flags = next(filter(None, map(_flags, filter(None, names))), [])
-    given = (
+    is_typed = any(
         word.partition("=")[0] == flag if flag.startswith("--") else word.startswith(flag)
         for word in sys.argv[1:]
         for flag in flags
     )
-    return f"{flags[0]} {begin['verb'].removeprefix('= ')}{text[begin.end() :]}" if any(given) else text
+    return f"{flags[0]} {begin['verb'].removeprefix('= ')}{text[begin.end() :]}" if is_typed else text

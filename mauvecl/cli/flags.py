@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 import typer
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Help, Range, Unit, as_typed, first, whole
+from mauvecl.schema.fields import Help, Unit, as_typed, first
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Keyword
 
 
-def option(*names: str, text: str, **how: Any) -> Any:
+def option(*names: str, text: str, **options: Any) -> Any:
     """Return an option without its default in the help text."""
-    return typer.Option(*names, help=text, show_default=False, **how)
+    return typer.Option(*names, help=text, show_default=False, **options)
 
 
 DeviceFlag = Annotated[str | None, option(metavar="TEXT", text="OpenCL device: number or part of its name [PoCL].")]
@@ -39,8 +39,8 @@ PaperFlag = Annotated[
 SHOWS_ALL = "mauvecl.help_all"
 
 
-def _show_all(context: typer.Context, wanted: bool) -> None:
-    if wanted:
+def _show_all(context: typer.Context, is_set: bool) -> None:
+    if is_set:
         context.meta[SHOWS_ALL] = True
         print(context.get_help())
         raise typer.Exit
@@ -52,7 +52,7 @@ ReplaceFlag = Annotated[bool, option("--replace", text="Replace an existing entr
 
 @dataclass(eq=False, kw_only=True)
 class Options:
-    """Values of a call that are no keys of a study, each with its flag."""
+    """Options of a call that are not keys of a study, each with its flag."""
 
     output: Path | None = None  # where everything is written; its flag states the default of the command
     as_json: JsonFlag = False
@@ -103,18 +103,18 @@ def study_option(keyword: Keyword, defaults: Mapping[str, Any]) -> Any:
         default = help.default
     else:
         default = as_typed(field.get_default(call_default_factory=True))
-    metavar = {str: "TEXT", Path: "FILE", float: "NUMBER", int: "INTEGER"}.get(keyword.each)
+    metavar = {str: "TEXT", Path: "FILE", float: "NUMBER", int: "INTEGER"}.get(keyword.item_kind)
     kind = keyword.kind
-    if keyword.each in (float, int):
+    if keyword.item_kind in (float, int):
         kind, metavar = (list[str], f"{metavar},...") if keyword.many else (str, metavar)
-    made = option(
+    annotation = option(
         *flag.names,
         text=text + (f" [{default}]" if default else "") + ".",
         rich_help_panel=path.partition(".")[0].capitalize(),
         autocompletion=COMPLETIONS.get(path),
         metavar=metavar,
     )
-    return Annotated[kind | None, made]
+    return Annotated[kind | None, annotation]
 
 
 def option_of(key: str) -> Any:
@@ -128,41 +128,40 @@ def option_of(key: str) -> Any:
 
 def _words(annotation: Any) -> str:
     """Return the accepted words of a field as text; empty if there are none."""
+    inner = [argument for argument in get_args(annotation) if argument not in (NoneType, ...)]
     if get_origin(annotation) is Literal:
-        *others, last = get_args(annotation)
-        return f"{', '.join(others)} or {last}"
-    inner = [part for part in get_args(annotation) if part not in (NoneType, ...)]
+        return f"{', '.join(inner[:-1])} or {inner[-1]}"
     return _words(inner[0]) if len(inner) == 1 else ""
 
 
-def is_star(given: Path) -> bool:
+def is_star(argument: Path) -> bool:
     """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
     from mauvecl.host.stars.library import resolve
     from mauvecl.host.tables.files import as_text, read_bytes, toml
     from mauvecl.study.study import is_there
 
-    text = str(given)
-    if given.suffix.lower() == ".toml" or given.is_dir():
+    text = str(argument)
+    if argument.suffix.lower() == ".toml" or argument.is_dir():
         return False
     if not is_there(text):
         # The first name decides; a wrong name among others has its own message.
         first = text.split(",")[0].strip()
         return bool(first) and resolve(first) is not None
-    if given.suffix.lower() == ".ecsv":
-        return not holds_study(given)
-    if not given.is_file():
+    if argument.suffix.lower() == ".ecsv":
+        return not holds_study(argument)
+    if not argument.is_file():
         return True
     try:
         # TOML is a study, whatever the name of its file.
-        toml(as_text(read_bytes(given, "file")[:1_000_000], "file"), "file")
+        toml(as_text(read_bytes(argument, "file")[:1_000_000], "file"), "file")
     except InputError as error:
-        # A key that has a value which no study may have is for the study to report.
+        # The study itself reports keys with impossible values.
         return error.key in ("file", None)
     return False
 
 
 def holds_study(file: Path) -> bool:
-    """Return whether a file is not a plain table, such as CSV, or ECSV that no answer wrote."""
+    """Return whether a file may hold a study: plain tables, such as CSV and ECSV that no answer wrote, do not."""
     suffix = file.suffix.lower()
     if suffix != ".ecsv" or not file.is_file():
         return suffix not in (".csv", ".vot", ".votable", ".xml", ".fits", ".fit")
@@ -181,28 +180,15 @@ PLACES: dict[str, tuple[str, str, Callable[[Path], bool]]] = {
 }
 
 
-def numbers_of(keyword: Keyword, given: Any) -> Any:
+def numbers_of(keyword: Keyword, value: Any) -> Any:
     """Convert the texts of a flag of numbers, which may hold several with commas between them."""
     from mauvecl.schema.section import number_or_text
 
-    if given is None or keyword.each not in (float, int):
-        return given
+    if value is None or keyword.item_kind not in (float, int):
+        return value
     if not keyword.many:
-        return number_or_text(given)
-    return [number_or_text(word.strip()) for text in given for word in text.split(",")]
-
-
-def whole_number(text: str, flag: str, reach: Range) -> int:
-    """Read a whole number of a range."""
-    from mauvecl.schema.section import number_or_text
-
-    try:
-        value = whole(number_or_text(text))
-    except ValueError:
-        value = None
-    if value is None or value not in reach:
-        raise InputError.of(flag, text, reach.words(whole=True))
-    return value
+        return number_or_text(value)
+    return [number_or_text(word.strip()) for text in value for word in text.split(",")]
 
 
 def complete_star(incomplete: str) -> list[str]:
@@ -239,6 +225,6 @@ COMPLETIONS = {
 def _continued(typed: str, names: Iterable[str], ending: str = "") -> list[str]:
     """Return names that begin with a text in any case, as it was typed, and folders and files with this ending."""
     words = [typed + name[len(typed) :] for name in names if name.casefold().startswith(typed.casefold())]
-    found = sorted(glob(escape(typed) + "*"))
-    folders = [f"{path}/" for path in found if Path(path).is_dir()]
-    return [*words, *folders, *(path for path in found if not Path(path).is_dir() and path.endswith(ending))]
+    paths = sorted(glob(escape(typed) + "*"))
+    folders = [f"{path}/" for path in paths if Path(path).is_dir()]
+    return [*words, *folders, *(path for path in paths if not Path(path).is_dir() and path.endswith(ending))]

@@ -44,9 +44,9 @@ from mauvecl.host.stars.spectrum import band as find_band
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import Rows
-from mauvecl.schema.calls import validated
+from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import Distance, Energy, Positive, Radius, Range, RateExponent, Temperature, Unit, checked
+from mauvecl.schema.fields import Distance, Energy, Positive, Radius, Range, RateExponent, Temperature, Unit
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source

@@ -13,7 +13,7 @@ from pydantic import AfterValidator
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Duration, Help, Range, Temperature, Unit
+from mauvecl.schema.fields import Duration, Help, Number, Range, Temperature, Unit
 from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class Curve(Section):
     amplitude: Annotated[float, Range()] | None = setting(None, "Half the range of a sinusoid")
     period_s: Duration | None = setting(None, "Period of the sinusoid", usual="the orbit's")
     phase: Annotated[float, Unit("rad"), Range()] = setting(0.0, "Phase of the sinusoid at the start of the stare")
-    points: tuple[tuple[float, float], ...] | None = setting(None, "Times in s, and values")
+    points: tuple[tuple[Number, Number], ...] | None = setting(None, "Times in s, and values")
     file: Path | None = setting(None, "File with two columns, time in s and value")
 
     def _check_values(self) -> None:

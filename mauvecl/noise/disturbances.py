@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonS
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Duration, Range, Unit, is_quantity, without_unit
+from mauvecl.schema.fields import Duration, Number, Range, Unit, is_quantity, without_unit
 from mauvecl.schema.section import Section, setting
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ class CosmicRays(AdditiveProcess):
     rate_per_cm2_s: ParticleRate = 1.0
     area_cm2: Annotated[float, Unit("cm2"), Range(0, 1e4, open_low=True)] = 0.057
     pixels: Annotated[int, Range(1)] = 2048
-    electrons: tuple[float, float] = (500.0, 1000.0)
-    weights: tuple[float, ...] | None = None
+    electrons: tuple[Number, Number] = (500.0, 1000.0)
+    weights: tuple[Number, ...] | None = None
 
     def _check_values(self) -> None:
         low, high = self.electrons

@@ -16,7 +16,7 @@ from mauvecl.host.tables.files import read_text, toml
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
 from mauvecl.host.tables.table import TableFile, Values, converted, unit_in, unit_in_name
 from mauvecl.schema.errors import InputError, shortened
-from mauvecl.schema.fields import DAY_S, Accepted, Exposure
+from mauvecl.schema.fields import DAY_S, Accepted, Exposure, WholeNumber
 from mauvecl.schema.section import Record
 
 
@@ -28,7 +28,7 @@ class FrameMapping(Record):
     """
 
     #: Extension of a FITS file whose columns are meant; by default the first table.
-    hdu: Annotated[str | int | None, Accepted("a name or number")] = None
+    hdu: Annotated[str | WholeNumber | None, Accepted("a name or number")] = None
     #: Times, as numbers or ISO 8601 dates; or start and end of each frame; ``wcs`` for the second axis of an image.
     time: Annotated[str | tuple[str, str], Accepted("the name of a column, or of two")]
     time_unit: str | None = None  #: unit of the times, if the file does not state it
@@ -46,7 +46,7 @@ class FrameMapping(Record):
     quality: str | None = None
     #: Bits of the quality that exclude a frame: their sum, "all", "none", or names and numbers such as "Desat, 128". By
     #: default lightkurve's default for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all for others.
-    quality_bits: Annotated[str | int | None, Accepted("text or a whole number")] = None
+    quality_bits: Annotated[str | WholeNumber | None, Accepted("text or a whole number")] = None
     exposure: str | None = None  #: exposure times of the frames
     exposure_s: Exposure | None = None  #: exposure time of every frame
     exposure_unit: str | None = None  #: unit of the exposure times, if the file does not state it

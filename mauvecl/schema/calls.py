@@ -1,7 +1,8 @@
 """Validation of the arguments of public functions by their annotations.
 
-Checks are stricter than pydantic's own: text, True and NaN are no numbers. They know what astronomers pass: NumPy's
-scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance`, never copied.
+Checks are stricter than pydantic's own: text, True and NaN are refused as numbers. They accept what astronomers pass:
+NumPy's scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance` and never
+copied.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import os
 import sys
 from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import cached_property, partial, wraps
+from functools import cache, cached_property, partial, wraps
 from itertools import chain, repeat
 from pathlib import Path
 from pkgutil import resolve_name
@@ -22,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import is_quantity, is_truth, or_error, whole, without_unit
+from mauvecl.schema.fields import is_quantity, is_truth, or_error, whole_number, without_unit
 
 #: Place of an error inside an alternative of a union.
 ALTERNATIVE = "|"
@@ -31,7 +32,7 @@ SEQUENCES = (tuple, Sequence, Collection, Iterable)
 
 
 def schema_of(hint: Any) -> CoreSchema:
-    """Return the core schema of an annotation; raises TypeError if it has none, so that no argument goes unchecked."""
+    """Return the core schema of an annotation; raises TypeError if it has none, so that every argument is checked."""
     origin, args = _origin(hint), get_args(hint)
     if origin is Annotated:
         schema = schema_of(args[0])
@@ -39,8 +40,8 @@ def schema_of(hint: Any) -> CoreSchema:
             schema = metadata.__get_pydantic_core_schema__(args[0], lambda _, inner=schema: inner)
         return schema
     if origin in (Union, UnionType) and NoneType in args:
-        others = tuple(kind for kind in args if kind is not NoneType)
-        return core_schema.nullable_schema(schema_of(Union[others]))  # noqa: UP007
+        kinds = tuple(kind for kind in args if kind is not NoneType)
+        return core_schema.nullable_schema(schema_of(Union[kinds]))  # noqa: UP007
     if numpy := sys.modules.get("numpy"):
         if hint == numpy.typing.ArrayLike:
             return _leaf(_array, "numbers")
@@ -57,12 +58,10 @@ def schema_of(hint: Any) -> CoreSchema:
         return _sequence(origin, args)
     if origin in (dict, Mapping):
         return core_schema.dict_schema(*map(schema_of, args))
-    if origin in (Any, object):
+    # Methods of a protocol are checked when they are called.
+    if origin in (Any, object) or getattr(origin, "_is_protocol", False):
         return core_schema.any_schema()
     if inspect.isclass(origin):
-        if getattr(origin, "_is_protocol", False):
-            # Methods of a protocol are checked when they are called.
-            return core_schema.any_schema()
         article = "an" if origin.__name__[0] in "AEIOU" else "a"
         return or_error(core_schema.is_instance_schema(origin), f"{article} {origin.__name__}")
     raise TypeError(f"arguments of the type {hint} cannot be validated")
@@ -116,7 +115,7 @@ def _items(value: Any, size: int | None = None) -> Any:
 #: Schemas of annotations of single values.
 LEAVES: dict[Any, CoreSchema] = {
     float: _leaf(_number, "a number"),
-    int: _leaf(whole, "a whole number"),
+    int: _leaf(whole_number, "a whole number"),
     bool: _leaf(_truth, "true or false"),
     str: or_error(core_schema.is_instance_schema(str), "text"),
     Path: or_error(core_schema.is_instance_schema((str, os.PathLike)), "a path"),
@@ -129,8 +128,8 @@ def _sequence(origin: Any, args: tuple[Any, ...]) -> CoreSchema:
     if origin is tuple and ... not in args:
         schema = core_schema.tuple_positional_schema(items)
         return core_schema.no_info_before_validator_function(partial(_items, size=len(items)), schema)
-    some = core_schema.list_schema(items[0]) if origin is list else core_schema.tuple_variable_schema(items[0])
-    return core_schema.no_info_before_validator_function(_items, some)
+    schema_of_items = core_schema.list_schema if origin is list else core_schema.tuple_variable_schema
+    return core_schema.no_info_before_validator_function(_items, schema_of_items(items[0]))
 
 
 def _origin(hint: Any) -> Any:
@@ -158,34 +157,34 @@ def _require(condition: bool) -> None:
 Public = TypeVar("Public", bound=Callable[..., Any])
 
 
-def validated(thing: Public) -> Public:
+def validated(target: Public) -> Public:
     """Validate the arguments of a function, or of a class's constructor and public methods, when they are called.
 
     Arguments are checked against the annotations; `schema_of` and `fields.Unit` state what is converted. Defaults
     are not checked. A wrong argument raises InputError.
     """
-    if not inspect.isclass(thing):
-        return _validated(thing)
-    for name, member in list(vars(thing).items()):
+    if not inspect.isclass(target):
+        return _validated(target)
+    for name, member in list(vars(target).items()):
         if name.startswith("_") and name != "__init__":
             continue
         if isinstance(member, classmethod | staticmethod):
-            setattr(thing, name, type(member)(_validated(member.__func__)))
+            setattr(target, name, type(member)(_validated(member.__func__)))
         elif inspect.isfunction(member):
-            setattr(thing, name, _validated(member, thing))
-    return thing
+            setattr(target, name, _validated(member, target))
+    return target
 
 
 def _validated(function: Public, owner: type | None = None) -> Public:
     parameters = list(inspect.signature(function).parameters.values())
     in_order = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    rest = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
+    variadic = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
     checks = {p.name: _Parameter(function, p, owner) for p in parameters if p.kind is not p.VAR_KEYWORD}
 
     @wraps(function)
     def call(*args: Any, **named: Any) -> Any:
         # Python itself reports missing, unknown and superfluous arguments.
-        names = chain(in_order, repeat(rest))
+        names = chain(in_order, repeat(variadic))
         return function(
             *[checks[name](value) if name else value for name, value in zip(names, args, strict=False)],
             **{name: checks[name](value) if name in checks else value for name, value in named.items()},
@@ -193,6 +192,30 @@ def _validated(function: Public, owner: type | None = None) -> Public:
 
     vars(call)["__validated__"] = checks
     return cast(Public, call)
+
+
+def checked(kind: Any, name: str, value: Any) -> Any:
+    """Return a value as its annotation, such as `Magnitude`, converts it; raises InputError for a wrong one."""
+    return _converted(_validator(kind), name, value)
+
+
+@cache
+def _validator(kind: Any) -> Callable[[Any], Any]:
+    return SchemaValidator(schema_of(kind)).validate_python
+
+
+def _converted(validate: Callable[[Any], Any], name: str, value: Any) -> Any:
+    try:
+        return validate(value)
+    except ValidationError as error:
+        faults = [(tuple(step for step in fault["loc"] if step != ALTERNATIVE), fault) for fault in error.errors()]
+    # The innermost wrong value, with the alternatives that it may be.
+    place, first = max(faults, key=lambda item: len(item[0]))
+    expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
+    path = name + "".join(f"[{step!r}]" for step in place if step != "[key]")
+    refused = InputError.of(path, first["input"], " or ".join(expected))
+    refused.key = InputError.of(name, value, "").key
+    raise refused
 
 
 class _Parameter:
@@ -213,17 +236,7 @@ class _Parameter:
     def __call__(self, value: Any) -> Any:
         if value is self.default or self.text is inspect.Parameter.empty:
             return value
-        try:
-            return self.validate(value)
-        except ValidationError as error:
-            faults = [(tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault) for fault in error.errors()]
-        # The innermost wrong value, with the alternatives that it may be.
-        place, first = max(faults, key=lambda item: len(item[0]))
-        expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
-        where = self.name + "".join(f"[{part!r}]" for part in place if part != "[key]")
-        refused = InputError.of(where, first["input"], " or ".join(expected))
-        refused.key = self.name
-        raise refused
+        return _converted(self.validate, self.name, value)
 
     def annotation(self) -> Any:
         """Return the resolved annotation."""

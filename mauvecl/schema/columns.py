@@ -10,7 +10,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from itertools import islice
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -96,12 +96,12 @@ class View:
 
     def texts(self, hidden: Collection[str] = (), *, empty: bool = True) -> tuple[list[str], list[list[str]]]:
         """Return headings and cells, without `hidden` columns and, unless `empty`, those whose cells are all empty."""
-        shown = [column for column in self.columns if column.heading and column.name not in hidden]
+        columns = [column for column in self.columns if column.heading and column.name not in hidden]
         table = [] if self.table is None else self.table
         rows = table if isinstance(table, Sequence) else records(table)
-        cells = [[column.text(record) for column in shown] for record in rows]
-        kept = [k for k in range(len(shown)) if empty or not cells or any(row[k] for row in cells)]
-        return [shown[k].heading for k in kept], [[row[k] for k in kept] for row in cells]
+        cells = [[column.text(record) for column in columns] for record in rows]
+        shown = [k for k in range(len(columns)) if empty or not cells or any(row[k] for row in cells)]
+        return [columns[k].heading for k in shown], [[row[k] for k in shown] for row in cells]
 
     @property
     def details(self) -> set[str]:
@@ -135,9 +135,9 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
 
     table, unit_of = QTable(), cache(u.Unit)
     named = [column for column in columns if column.name]
-    parts = [np.broadcast_arrays(*(np.atleast_1d(column.value(row)) for column in named)) for row in rows]
+    blocks = [np.broadcast_arrays(*(np.atleast_1d(column.value(row)) for column in named)) for row in rows]
     for k, column in enumerate(named):
-        values = np.concatenate([part[k].ravel() for part in parts] or [np.array([], column.kind or float)])
+        values = np.concatenate([block[k].ravel() for block in blocks] or [np.array([], column.kind or float)])
         if values.dtype == object:
             missing = np.array([value is None for value in values])
             if column.unit:
@@ -159,26 +159,19 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
     Columns that a table lacks are masked, or NaN if they have a unit.
     """
     import numpy as np
+    from astropy.table import QTable, hstack, vstack
 
-    every = list(parts)
-    tables = [table for _, table in every]
+    rows, tables = zip(*parts, strict=True)
+    stack = vstack([QTable(table, copy=False) for table in tables], metadata_conflicts="silent")
+    for name, column in [*stack.columns.items()]:
+        if hasattr(column, "filled") and column.unit is not None:
+            stack[name] = column.filled(np.nan)
+    if first:
+        row_numbers = np.repeat(np.arange(len(rows)), list(map(len, tables)))
+        stack = hstack([table_of(first, rows)[row_numbers], stack])
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-
-    def values(part: tuple[object, Table], name: str) -> Any:
-        if name not in part[1].colnames:
-            return None
-        cells = getattr(part[1][name], "value", part[1][name])
-        return np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
-
-    def taken(name: str) -> Column:
-        having = [table[name] for table in tables if name in table.colnames]
-        (unit,) = {str(column.unit or "") for column in having}
-        kind = np.result_type(*(column.dtype for column in having)).type
-        text = having[0].info.description or ""
-        return Column(name, lambda part: values(part, name), unit, text, kind=kind)
-
-    names = dict.fromkeys(name for table in tables for name in table.colnames)
-    return table_of([*(column.of(itemgetter(0)) for column in first), *map(taken, names)], every, **shared | meta)
+    stack.meta = shared | meta
+    return stack
 
 
 def records(table: Table) -> list[dict[str, Any]]:
@@ -244,9 +237,9 @@ T = TypeVar("T")
 class First(list[T]):
     """The first items of a list, with a `note` such as "6 of 9 stars shown" if it has more."""
 
-    def __init__(self, things: Collection[T], most: int, name: str) -> None:
-        super().__init__(islice(things, most))
-        self.note = part_note(len(self), len(things), name)
+    def __init__(self, items: Collection[T], most: int, name: str) -> None:
+        super().__init__(islice(items, most))
+        self.note = part_note(len(self), len(items), name)
 
 
 def part_note(shown: int, total: int, name: str) -> str:
@@ -254,9 +247,9 @@ def part_note(shown: int, total: int, name: str) -> str:
     return f"{shown} of {total} {name} shown" if shown < total else ""
 
 
-def note_of(things: Iterable[object]) -> str:
+def note_of(items: Iterable[object]) -> str:
     """Return the note of items that are a part of a list, or nothing."""
-    return things.note if isinstance(things, First) else ""
+    return items.note if isinstance(items, First) else ""
 
 
 class Drawable:

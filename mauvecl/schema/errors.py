@@ -28,9 +28,9 @@ class Message(str):
         """Return the arguments of the constructor, for pickle."""
         return str(self), self.kind
 
-    def about(self, what: str) -> Message:
+    def about(self, subject: str) -> Message:
         """Return the message with its subject in parentheses at its end."""
-        return Message(f"{self[:-1]} ({what}).", self.kind)
+        return Message(f"{self[:-1]} ({subject}).", self.kind)
 
 
 def of_kind(messages: Iterable[str], kind: str) -> list[str]:
@@ -93,7 +93,7 @@ class InputError(ValueError):
 
     def within(self, place: str) -> InputError:
         """Return the same error with a place before its sentence, such as the name of a file."""
-        return reworded(self, f"{place}: {self}")
+        return InputError(f"{place}: {self}", key=self.key)
 
     @classmethod
     def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:
@@ -112,15 +112,10 @@ def missing_package(package: str, purpose: str, extra: str) -> InputError:
     return InputError(f"{purpose} needs {package}, which is missing: `pip install 'mauvecl[{extra}]'`", key=package)
 
 
-def reworded(error: InputError, sentence: str, key: str | None = None) -> InputError:
-    """Return the same error with another sentence and, if given, another key."""
-    return InputError(sentence, key=key or error.key)
-
-
 def together(errors: Sequence[InputError]) -> InputError:
     """Return one error for several wrong values, or the only one of them."""
     if len(errors) == 1:
         return errors[0]
-    whole = reworded(errors[0], "; ".join(map(str, errors)))
-    whole.parts = tuple(errors)
-    return whole
+    joint = InputError("; ".join(map(str, errors)), key=errors[0].key)
+    joint.parts = tuple(errors)
+    return joint

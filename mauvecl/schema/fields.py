@@ -19,8 +19,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
-from mauvecl.schema.errors import InputError
-
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
     from pydantic_core import CoreSchema
@@ -40,14 +38,14 @@ def without_unit(value: Any, unit: str) -> Any:
     import astropy.units as u
 
     # Detector counts are called DN here and adu elsewhere.
-    equivalent: Any = [(u.adu, u.DN)]
-    wanted = u.Unit(unit)
-    if wanted.is_equivalent(u.nm):
-        equivalent = u.spectral()
-    elif wanted.is_equivalent(u.K) or wanted == u.deg_C:
-        equivalent = u.temperature()
+    equivalencies: Any = [(u.adu, u.DN)]
+    target = u.Unit(unit)
+    if target.is_equivalent(u.nm):
+        equivalencies = u.spectral()
+    elif target.is_equivalent(u.K) or target == u.deg_C:
+        equivalencies = u.temperature()
     try:
-        converted = value.to_value(wanted, equivalent)
+        converted = value.to_value(target, equivalencies)
     except u.UnitsError as error:
         raise ValueError(str(error)) from error
     return converted if getattr(converted, "ndim", 0) else float(converted)
@@ -69,17 +67,17 @@ def with_unit(text: str, unit: str) -> float | None:
 
     Raises ValueError if the unit is unknown or has no equivalent in `unit`.
     """
-    found = _MEASURE.fullmatch(text)
-    if found is None:
+    match = _MEASURE.fullmatch(text)
+    if match is None:
         return None
     import astropy.units as u
 
-    word = re.sub(r"^(?:/|per (?!cent))", "1 / ", found[2].strip())
+    word = re.sub(r"^(?:/|per (?!cent))", "1 / ", match[2].strip())
     word = (SPELLED | {written: name for name, written in WRITTEN.items()}).get(word, word)
     # Astropy has no plurals.
     for spelling in (word, word[:-1])[: 2 if len(word) > 2 and word.endswith("s") else 1]:
         try:
-            return float(without_unit(u.Quantity(float(found[1]), spelling), unit))
+            return float(without_unit(u.Quantity(float(match[1]), spelling), unit))
         except (TypeError, ValueError, ArithmeticError):
             continue
     raise ValueError(text)
@@ -95,12 +93,24 @@ WRITTEN = {
     "solRad": "solar radii",
     "solMass": "solar masses",
     "1 / (cm2 s)": "cm^-2 s^-1",
+    "1 / h": "per hour",
+    "1 / d": "per day",
+    "1 / K": "per kelvin",
+    "DN / s": "DN/s",
+    "nm / pix": "nm/pix",
+    "uV / electron": "uV/electron",
 }
 
 
 def word_of(unit: str) -> str:
     """Return the words for a number in a unit in a message."""
-    return f"a number in {WRITTEN.get(unit, unit)}" if unit else "a number"
+    written = WRITTEN.get(unit, unit)
+    return f"a number {written}" if written.startswith("per ") else f"a number in {written}" if unit else "a number"
+
+
+def written_number(value: float) -> str:
+    """Return a number for a message as people write and type it: 0.001, 200000, 1e-7, 1e6."""
+    return str(value) if isinstance(value, int) else re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")
 
 
 @dataclass(frozen=True)
@@ -121,9 +131,14 @@ class Unit:
         return _or_text(handler(schema))
 
     def plain(self, value: Any) -> Any:
-        """Convert Quantities and texts with a unit, also in a list, to plain numbers; return other values unchanged."""
+        """Convert Quantities and texts with a unit, also in a list, to plain numbers; return other values unchanged.
+
+        Raises ValueError for true and false, which pydantic takes for 1 and 0.
+        """
         if type(value) in (float, int):
             return value
+        if is_truth(value):
+            raise ValueError(value)
         if isinstance(value, str):
             return value if (read := with_unit(value, self.name)) is None else read
         if isinstance(value, list | tuple):
@@ -145,8 +160,7 @@ class Range:
         unit = (inner.get("metadata") or {}).get("unit", "")
         words = self.words(unit, whole=int in (source, *get_args(source)))
         # A number without a unit may be written in per cent.
-        before = None if unit else lambda value: Unit("").plain(value) if isinstance(value, str) else value
-        return or_error(inner, words, before=before, after=self._check, unit=unit)
+        return or_error(inner, words, before=None if unit else Unit("").plain, after=self._check, unit=unit)
 
     def __contains__(self, value: Any) -> bool:
         if not math.isfinite(value) or not self.low <= value <= self.high:
@@ -168,7 +182,7 @@ class Range:
     def words(self, unit: str = "", *, whole: bool = False) -> str:
         """Describe the accepted values, for error messages."""
         noun = "a whole number" if whole else "a number"
-        low, high = (str(end) if whole else f"{end:g}" for end in (self.low, self.high))
+        low, high = map(written_number, (self.low, self.high))
         has_low, has_high = math.isfinite(self.low), math.isfinite(self.high)
         after = f" {WRITTEN.get(unit, unit)}" if unit else ""
         if has_low and has_high and not (self.open_low or self.open_high):
@@ -185,25 +199,7 @@ def is_truth(value: Any) -> bool:
     return type(value).__name__ in ("bool", "bool_")
 
 
-def number(what: str, value: Any, unit: str = "", reach: Range | None = None) -> float:
-    """Return one finite number in a unit, as astropy reads it, and a range, from a number or a Quantity.
-
-    Wavelengths may come as frequencies or energies, temperatures on any scale. Raises InputError for other values.
-    """
-    reach = reach or Range()
-    try:
-        plain = without_unit(value, unit) if is_quantity(value) else value
-        if is_truth(plain) or isinstance(plain, str | bytes) or getattr(plain, "ndim", False):
-            raise TypeError("no number")
-        plain = float(plain)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError.of(what, value, reach.words(unit)) from error
-    if plain not in reach:
-        raise InputError.of(what, plain, reach.words(unit))
-    return plain
-
-
-def whole(value: Any) -> int:
+def whole_number(value: Any) -> int:
     """Return a whole number as an int, from a number such as 1e5 or a Quantity without unit, or raise ValueError."""
     if is_quantity(value):
         value = without_unit(value, "")
@@ -263,8 +259,8 @@ def _or_text(schema: dict[str, Any]) -> dict[str, Any]:
     if schema.get("type") == "number":
         return schema | {"type": ["number", "string"]}
     items = {"items": _or_text(schema["items"])} if isinstance(schema.get("items"), dict) else {}
-    several = {"anyOf": [_or_text(each) for each in schema["anyOf"]]} if "anyOf" in schema else {}
-    return schema | items | several
+    choices = {"anyOf": [_or_text(choice) for choice in schema["anyOf"]]} if "anyOf" in schema else {}
+    return schema | items | choices
 
 
 def or_error(
@@ -376,28 +372,27 @@ class Widget:
         return 100.0 if self.unit == "%" else 1
 
 
-def found(kind: Any, of: type[Metadata]) -> list[Metadata]:
+def metadata_of(kind: Any, of: type[Metadata]) -> list[Metadata]:
     """Return all metadata of a class in an annotation or field, outermost first."""
     return [entry for entry in _metadata(kind) if isinstance(entry, of)]
 
 
 def first(kind: Any, of: type[Metadata]) -> Metadata | None:
     """Return the outermost metadata of a class in an annotation or field, or None."""
-    return next(iter(found(kind, of)), None)
+    return next(iter(metadata_of(kind, of)), None)
 
 
 def _metadata(kind: Any) -> Iterator[Any]:
+    inner = get_args(kind)
     if hasattr(kind, "annotation") and hasattr(kind, "metadata"):
         # A pydantic field.
         yield from kind.metadata
-        yield from _metadata(kind.annotation)
+        inner = (kind.annotation,)
     elif get_origin(kind) is Annotated:
-        inner, *own = get_args(kind)
-        yield from own
-        yield from _metadata(inner)
-    else:
-        for part in get_args(kind):
-            yield from _metadata(part)
+        yield from inner[1:]
+        inner = inner[:1]
+    for annotation in inner:
+        yield from _metadata(annotation)
 
 
 def as_typed(value: Any, *, truth: tuple[str, str] = ("false", "true")) -> str:
@@ -417,10 +412,9 @@ def range_of(kind: Any) -> Range:
     return first(kind, Range) or Range()
 
 
-def checked(kind: Any, what: str, value: Any) -> float:
-    """Return a number in the unit and range of an annotation such as `Magnitude`."""
-    return number(what, value, (first(kind, Unit) or Unit("")).name, range_of(kind))
-
+#: Finite number, and finite whole number.
+Number = Annotated[float, Range()]
+WholeNumber = Annotated[int, Range()]
 
 # Physical quantities, which study keys, flags, sweeps, page fields and Python arguments share.
 

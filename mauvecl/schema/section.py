@@ -7,7 +7,6 @@ import datetime
 import difflib
 import math
 from collections.abc import Iterator, Sequence
-from functools import cache
 from typing import Any, Self, TypeVar, get_args
 
 from pydantic import (
@@ -15,13 +14,10 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
     field_validator,
     model_validator,
 )
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticCustomError
 
 from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown, together
@@ -41,16 +37,6 @@ class Record(BaseModel):
     # Nested records are not built by this method, so that the outer one names the full path of a wrong value.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
-    @field_validator("*", mode="wrap")
-    @classmethod
-    def _no_truth_as_number(cls, given: Any, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-        """Refuse true and false where a number or text is expected; pydantic takes them for 1 and 0."""
-        annotation = cls.model_fields[str(info.field_name)].annotation
-        values = list(given.values()) if isinstance(given, dict) and not model_in(annotation) else given
-        if holds_truth(values) and not _takes_truth(annotation):
-            raise PydanticCustomError("truth", "Input should be no truth value")
-        return validate(given)
-
     def __setattr__(self, name: str, value: Any) -> None:
         try:
             super().__setattr__(name, value)
@@ -59,17 +45,6 @@ class Record(BaseModel):
                 f"{type(self).__name__}.{name} cannot be set in place; use a changed copy: with_, with_settings, at",
                 key=name,
             ) from None
-
-
-def holds_truth(given: Any) -> bool:
-    """Return whether a value is true or false, or a list that has one; nested records check their own."""
-    if isinstance(given, list | tuple):
-        return any(map(holds_truth, given))
-    return fields.is_truth(given)
-
-
-def _takes_truth(annotation: Any) -> bool:
-    return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -83,6 +58,8 @@ def built(model: type[Model], values: Any, where: str) -> Model:
         raise input_error(where, model, error) from None
 
 
+#: Words for what pydantic calls a valid string, path, tuple and dictionary.
+TYPE_WORDS = {"string_type": "text", "path_type": "a path", "tuple_type": "a list", "dict_type": "a table"}
 #: Largest number of wrong values that one message names.
 MOST_FAULTS = 5
 
@@ -92,64 +69,61 @@ def input_error(where: str, model: type[BaseModel], error: ValidationError) -> I
     faults: dict[tuple[int | str, ...], Any] = {}
     for fault in error.errors():
         # A list of which an entry is wrong counts as too short.
-        if not any(other[: len(fault["loc"])] == fault["loc"] for other in faults):
+        if not any(place[: len(fault["loc"])] == fault["loc"] for place in faults):
             faults[fault["loc"]] = fault
-    first, *others = (_input_error_of(model, fault) for fault in [*faults.values()][:MOST_FAULTS])
-    left = len(faults) - MOST_FAULTS
-    more = [InputError(f"and {left} more values are wrong", key=first.key)] if left > 0 else []
-    return together([first.within(where), *others, *more])
+    errors = [_input_error_of(model, fault) for fault in [*faults.values()][:MOST_FAULTS]]
+    errors[0] = errors[0].within(where)
+    if len(faults) > MOST_FAULTS:
+        errors.append(InputError(f"and {len(faults) - MOST_FAULTS} more values are wrong", key=errors[0].key))
+    return together(errors)
 
 
-def _input_error_of(model: type[BaseModel], first: Any) -> InputError:
-    path = [str(part) for part in first["loc"] if part != "[key]"]
+def _input_error_of(model: type[BaseModel], fault: Any) -> InputError:
+    path = [str(step) for step in fault["loc"] if step != "[key]"]
     key = ".".join(path) or model.__name__.lower()
-    value, message = first.get("input"), first["msg"]
-    match first["type"]:
+    value, message = fault.get("input"), fault["msg"]
+    match fault["type"]:
         case "extra_forbidden":
-            known = list(_fields(model, path[:-1]))
-            near = difflib.get_close_matches(path[-1], known, n=1)
-            remedy = f", did you mean {near[0]!r}?" if near else f": use one of {', '.join(known)}"
+            names = list(_fields(model, path[:-1]))
+            near = difflib.get_close_matches(path[-1], names, n=1)
+            remedy = f", did you mean {near[0]!r}?" if near else f": use one of {', '.join(names)}"
             return InputError(f"unknown key {shortened(key)}{remedy}", key=key)
         case "missing":
             return InputError(f"{key!r} is missing, but needs a value", key=key)
         case "value_error":
-            return _own_error(model, path, first)
+            return _error_of_validator(model, path, fault)
         case "too_long" | "too_short":
             expected = message.partition("should have ")[2].partition(" after")[0]
-        case "truth":
-            expected = "a number or text" if fields.is_truth(value) else "free of true and false"
-        case "path_type":
-            expected = "a path"
         case _:
-            expected = message.removeprefix("Input should be ")
+            expected = TYPE_WORDS.get(fault["type"], message.removeprefix("Input should be "))
             if expected == message:
                 return InputError(f"{key} = {shown(value)}: {message.lower()}", key=key)
     return InputError.of(key, value, expected)
 
 
-def _own_error(model: type[BaseModel], path: list[str], first: Any) -> InputError:
+def _error_of_validator(model: type[BaseModel], path: list[str], fault: Any) -> InputError:
     """Return the error that a validator raised, with the key where its sentence does not name it."""
     key, field = ".".join(path), _fields(model, path[:-1]).get(path[-1]) if path else None
     is_value = field is not None and model_in(field.annotation) is None
-    found = first["ctx"]["error"]
-    if not isinstance(found, InputError):
-        found = InputError(str(found))
-    name = found.key
+    error = fault["ctx"]["error"]
+    if not isinstance(error, InputError):
+        error = InputError(str(error))
+    name = error.key
     # A record's own error names the key; that of a single value's validator may not.
-    if is_value and path[-1] not in str(found):
-        found = found.within(key)
+    if is_value and path[-1] not in str(error):
+        error = error.within(key)
     if name is None or path[-1:] == [name]:
-        found.key = key or None
-    elif name in _fields(model, path) or (is_value and isinstance(first.get("input"), dict)):
+        error.key = key or None
+    elif name in _fields(model, path) or (is_value and isinstance(fault.get("input"), dict)):
         # Validators of records, and of tables that are no records, name a key of them.
-        found.key = ".".join([*path, name])
-    return found
+        error.key = ".".join([*path, name])
+    return error
 
 
 def _fields(model: type[BaseModel], path: list[str]) -> Any:
-    for part in path:
-        if part in model.model_fields:
-            model = model_in(model.model_fields[part].annotation) or model
+    for key in path:
+        if key in model.model_fields:
+            model = model_in(model.model_fields[key].annotation) or model
     return model.model_fields
 
 
@@ -157,29 +131,27 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
     """Return the model in a type such as `Star | None` or `tuple[Star, ...]`, or None."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return next((model for part in get_args(annotation) if (model := model_in(part))), None)
+    return next((model for inner in get_args(annotation) if (model := model_in(inner))), None)
 
 
-def plain(key: str, given: Any, unit: str) -> Any:
-    """Convert Quantities, dates, times and coordinates to the numbers and text that a study stores."""
-    if isinstance(given, datetime.datetime) and given.tzinfo is not None:
-        given = given.astimezone(datetime.UTC).replace(tzinfo=None)
-    if isinstance(given, datetime.date):
-        return given.isoformat()
-    if fields.is_quantity(given):
-        try:
-            given = fields.without_unit(given, unit)
-        except ValueError:
-            raise InputError.of(key, given, fields.word_of(unit)) from None
-    if isinstance(given, list | tuple) and any(map(fields.is_quantity, given)):
-        return [plain(key, item, unit) for item in given]
-    if hasattr(given, "tolist"):
-        return given.tolist()
-    if hasattr(given, "utc") and hasattr(given, "isot"):
-        return str(given.utc.isot)
-    if hasattr(given, "icrs") and hasattr(given, "to_string"):
-        return str(given.icrs.to_string("decimal", precision=6))
-    return given
+def plain(value: Any) -> Any:
+    """Convert arrays, dates, times and coordinates to the lists, numbers and text that a study stores.
+
+    Quantities remain, since the type of a number converts them to its unit.
+    """
+    if isinstance(value, datetime.datetime) and value.tzinfo is not None:
+        value = value.astimezone(datetime.UTC).replace(tzinfo=None)
+    if isinstance(value, datetime.date):
+        return value.isoformat()
+    if fields.is_quantity(value):
+        return list(map(plain, value)) if getattr(value, "ndim", 0) else value
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if hasattr(value, "utc") and hasattr(value, "isot"):
+        return str(value.utc.isot)
+    if hasattr(value, "icrs") and hasattr(value, "to_string"):
+        return str(value.icrs.to_string("decimal", precision=6))
+    return value
 
 
 class Section(Record):
@@ -200,29 +172,15 @@ class Section(Record):
         """
         key, *inner = path
         old = getattr(self, key)
-        new = value
-        if inner:
-            many = tuple(section.with_value(inner, value) for section in (old if isinstance(old, tuple) else (old,)))
-            new = many if isinstance(old, tuple) else many[0]
+        if not inner:
+            new = (value,) if isinstance(old, tuple) else value
         elif isinstance(old, tuple):
-            new = (value,)
+            new = tuple(section.with_value(inner, value) for section in old)
+        else:
+            new = old.with_value(inner, value)
         return self.model_copy(update={key: new})
 
-    @field_validator("*", mode="before")
-    @classmethod
-    def _in_its_unit(cls, given: Any, info: ValidationInfo) -> Any:
-        """Convert a Quantity to the unit of the key, and times and coordinates to text."""
-        key = str(info.field_name)
-        unit = _unit_of(cls, key)
-        if unit is not None and not getattr(given, "ndim", 0):
-            # The annotation converts it.
-            return given
-        return plain(key, given, "" if unit is None else unit.name)
-
-
-@cache
-def _unit_of(section: type[Section], key: str) -> fields.Unit | None:
-    return fields.first(section.model_fields[key], fields.Unit)
+    _plain = field_validator("*", mode="before")(plain)
 
 
 def setting(
@@ -245,8 +203,8 @@ def setting(
     """
     flags = flag if isinstance(flag, tuple) else (fields.Flag(*flag.split()) if isinstance(flag, str) else flag,)
     if isinstance(text, str):
-        text, _, more = text.partition("; ")
-        text = fields.Help(text, more, usual, choices if isinstance(choices, str) else ", ".join(choices))
+        noun, _, explanation = text.partition("; ")
+        text = fields.Help(noun, explanation, usual, choices if isinstance(choices, str) else ", ".join(choices))
     if page:
         page["choices"] = page.pop("options", () if isinstance(choices, str) else choices)
     field: FieldInfo = Field(default_factory=dict) if default is dict else Field(default=default, min_length=min_length)
@@ -266,39 +224,39 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
 
 
 def given_keys(section: Section, keys: Sequence[str]) -> list[str]:
-    """Return those of some keys that a section gives."""
+    """Return those of `keys` that a section gives."""
     return [key for key in keys if (value := getattr(section, key)) is not None and value is not False]
 
 
-def check_one(section: Section, what: str, *keys: str, needed: bool = False) -> None:
+def check_one(section: Section, subject: str, *keys: str, needed: bool = False) -> None:
     """Raise InputError if several of these keys are given or, where one is needed, none."""
-    given = given_keys(section, keys)
-    if len(given) > 1 or (needed and not given):
-        has, number = " and ".join(given) or "none", "one" if needed else "only one"
-        raise InputError(f"{what} needs {number} of {', '.join(keys)}, but has {has}", key=[*given, *keys][0])
+    present = given_keys(section, keys)
+    if len(present) > 1 or (needed and not present):
+        has, number = " and ".join(present) or "none", "one" if needed else "only one"
+        raise InputError(f"{subject} needs {number} of {', '.join(keys)}, but has {has}", key=[*present, *keys][0])
 
 
-def check_all(section: Section, what: str, *keys: str) -> None:
+def check_all(section: Section, subject: str, *keys: str) -> None:
     """Raise InputError if only a part of these keys is given."""
-    given = given_keys(section, keys)
-    if 0 < len(given) < len(keys):
+    present = given_keys(section, keys)
+    if 0 < len(present) < len(keys):
         raise InputError(
-            f"{what} needs all of {', '.join(keys)} or none, but has only {' and '.join(given)}", key=given[0]
+            f"{subject} needs all of {', '.join(keys)} or none, but has only {' and '.join(present)}", key=present[0]
         )
 
 
-def check_needs(section: Section, what: str, keys: Sequence[str], needed: str) -> None:
+def check_needs(section: Section, subject: str, keys: Sequence[str], needed: str) -> None:
     """Raise InputError if one of these keys is given without the key that it needs."""
-    given = given_keys(section, keys)
-    if given and getattr(section, needed) is None:
-        raise InputError(f"{what} has {' and '.join(given)}, which needs {needed} as well", key=given[0])
+    present = given_keys(section, keys)
+    if present and getattr(section, needed) is None:
+        raise InputError(f"{subject} has {' and '.join(present)}, which needs {needed} as well", key=present[0])
 
 
-def check_different(names: Sequence[str], what: str, key: str) -> None:
+def check_different(names: Sequence[str], subject: str, key: str) -> None:
     """Raise InputError if a name is given twice; its sentence begins with what is named."""
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"{what} {shortened(twice)} is named twice, but must be given once", key=key)
+        raise InputError(f"{subject} {shortened(twice)} is named twice, but must be given once", key=key)
 
 
 # Readers of values that are written as text, as on the command line; each receives the value's name for messages.
@@ -323,21 +281,21 @@ def read_axis(text: str, name: str) -> dict[str, Any]:
     """Read an axis: magnitude:4:10:16, amplitude:0.01:1:16:log, or exposure=5,50,600."""
     if "=" in text:
         quantity, _, values = text.partition("=")
-        parts = [part.strip() for part in values.split(",")]
-        return {"quantity": quantity, "values": parts if quantity == "star" else list(map(number_or_text, parts))}
+        words = [word.strip() for word in values.split(",")]
+        return {"quantity": quantity, "values": words if quantity == "star" else list(map(number_or_text, words))}
     try:
-        quantity, start, stop, steps, *rest = text.split(":")
+        quantity, start, stop, steps, *ending = text.split(":")
         spaced = {"start": number_or_text(start), "stop": number_or_text(stop), "steps": int(steps)}
     except ValueError as error:
         raise InputError.of(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
-    if rest not in ([], ["log"]):
+    if ending not in ([], ["log"]):
         raise InputError.of(name, text, "quantity:start:stop:steps with :log or nothing at its end")
-    return {"quantity": quantity, "log": bool(rest)} | spaced
+    return {"quantity": quantity, "log": bool(ending)} | spaced
 
 
 def read_assignment(text: str, name: str, expected: str) -> tuple[str, str]:
     """Read a name and its value, with an equals sign between them."""
-    key, _, value = (part.strip() for part in text.rpartition("="))
+    key, _, value = map(str.strip, text.rpartition("="))
     if not (key and value):
         raise InputError.of(name, text, expected)
     return key, value
@@ -367,15 +325,15 @@ def read_declinations(text: str, name: str) -> tuple[float, float] | str:
 def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]:
     """Read two numbers, each of which may have a unit of its own."""
     try:
-        measures = ((part, fields.with_unit(part, unit)) for part in text.split(":"))
-        low, high = (float(part) if value is None else value for part, value in measures)
+        measures = ((word, fields.with_unit(word, unit)) for word in text.split(":"))
+        low, high = (float(word) if value is None else value for word, value in measures)
     except ValueError as error:
         raise InputError.of(name, text, expected) from error
     return low, high
 
 
 def read_frames(text: str, name: str) -> str | list[int]:
-    """Read which frames are kept: stack, all, or numbers such as 0,4,9."""
+    """Read which frames are stored: stack, all, or numbers such as 0,4,9."""
     if text in ("stack", "all"):
         return text
     try:

@@ -48,24 +48,24 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
     orbit, limits = study.orbit.tle, study.orbit.limits
-    least = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
-    kept = ", ".join(f"{name} {value:g} deg" for name, value in least.items() if value is not None)
+    angles = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
+    least = ", ".join(f"{name} {value:g} deg" for name, value in angles.items() if value is not None)
     words: dict[str, Callable[[], str]] = {
         "instrument": lambda: _instrument(study, swept, along_orbit="orbit" in uses and study.plan.along_orbit),
         "sky": lambda: "sky as swept" if "sky" in swept else study.sky.describe(),
         "flare": lambda: _flare(study, swept),
-        "orbit": lambda: f"orbit of {orbit.name if orbit else 'embedded elements'}; least angles: {kept or 'none'}",
+        "orbit": lambda: f"orbit of {orbit.name if orbit else 'embedded elements'}; least angles: {least or 'none'}",
         "unknowns": lambda: _unknowns(study, uses),
         "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
         "seed": lambda: f"seed {study.run.seed}",
     }
-    stated = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
+    parts: set[str] = {*uses, "unknowns"} if {*UNKNOWN_USES} & {*uses} else {*uses}
     # Verbs of an orbit look at targets, not at the study's star.
     observes = "instrument" in uses and "orbit" not in uses
     unused = [key for use, keys in _given_unknowns(study).items() if use not in uses for key in keys]
     unused += [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
     ignored = [f"not used: {', '.join(unused)}"] if unused else []
-    return [*(words[use]() for use in words if use in stated), *ignored]
+    return [*(clause() for part, clause in words.items() if part in parts), *ignored]
 
 
 def _instrument(study: Study, swept: set[str], *, along_orbit: bool) -> str:
@@ -110,14 +110,13 @@ def _given_unknowns(study: Study) -> dict[Use, dict[str, str]]:
 
 def _unknowns(study: Study, uses: Collection[Use]) -> str:
     """List the unknowns that an answer draws, marginalises over or averages over."""
-    given = {use: words.values() for use, words in _given_unknowns(study).items() if use in uses}
-    how = {"drawn": {"processes", "stare"}, "marginalised": {"nuisances", "stare"}}
-    usual = " and ".join(word for word, of in how.items() if of & {*uses})
-    parts = [f"the usual unknowns {usual}"] if study.nuisances.usual else []
-    drawn = [*given.get("processes", ()), *given.get("stare", ())]
-    parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
-    parts += [f"marginalised: {', '.join(named)}"] if (named := given.get("nuisances")) else []
-    return "; ".join([*parts, *given.get("values", ())]) or "everything known but the noise"
+    words = {use: [*of_key.values()] if use in uses else [] for use, of_key in _given_unknowns(study).items()}
+    treatments = {"drawn": {"processes", "stare"}, "marginalised": {"nuisances", "stare"}}
+    usual = " and ".join(treatment for treatment, of in treatments.items() if of & {*uses})
+    clauses = [f"the usual unknowns {usual}"] if study.nuisances.usual else []
+    clauses += [f"drawn: {', '.join(drawn)}"] if (drawn := words["processes"] + words["stare"]) else []
+    clauses += [f"marginalised: {', '.join(words['nuisances'])}"] if words["nuisances"] else []
+    return "; ".join(clauses + words["values"]) or "everything known but the noise"
 
 
 def star_label(star: Star, x: Expectation) -> str:
@@ -154,9 +153,12 @@ def amplitude_column(get: str | Callable[[Any], Any] = "amplitude", description:
 
 def full_label(name: str, at: Mapping[str, float | str]) -> str:
     """Return a star's label with the swept values that the label does not contain, for plots."""
-    others = {key: value for key, value in at.items() if key not in ("magnitude", "star")}
-    parts = (f"{key.replace('_', ' ')} {value:g}{QUANTITIES[key].suffix}" for key, value in others.items())
-    return ", ".join([name, *parts])
+    values = (
+        f"{key.replace('_', ' ')} {value:g}{QUANTITIES[key].suffix}"
+        for key, value in at.items()
+        if key not in ("magnitude", "star")
+    )
+    return ", ".join([name, *values])
 
 
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
@@ -179,20 +181,20 @@ class Loader:
         """Return the instrument of an observation."""
         from mauvecl.host.instrument.instrument import Instrument
 
-        file, kept = observation.instrument, self._instruments
+        file, loaded = observation.instrument, self._instruments
         key = repr((file, observation.temperature_c, sorted(observation.changes.items())))
-        if key not in kept:
+        if key not in loaded:
             # A file is read once, since each draw of unknowns and each temperature of a sweep changes it.
-            kept[file] = kept.get(file) or Instrument.load(file)
-            kept[key] = observation.changed(kept[file])
-        return kept[key]
+            loaded[file] = loaded.get(file) or Instrument.load(file)
+            loaded[key] = observation.changed(loaded[file])
+        return loaded[key]
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
     """One star at one combination of sweep values.
 
-    Nothing is loaded or computed before it is asked for, and each thing only once.
+    Everything is loaded or computed when it is first used, and only once.
 
     Examples
     --------
@@ -256,11 +258,10 @@ class Case:
     @cached_property
     def processes(self) -> Processes:
         """Noise processes to draw: those given and, with the usual unknowns, those of the documented set."""
-        named = self.study.processes
-        added = default_processes(self.instrument.temperature_c) if self.study.nuisances.usual else {}
-        update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
-        every: Processes = named.model_copy(update=update)
-        return every
+        processes = self.study.processes
+        documented = default_processes(self.instrument.temperature_c) if self.study.nuisances.usual else {}
+        missing = {name: prior for name, prior in documented.items() if getattr(processes, name) is None}
+        return cast("Processes", processes.model_copy(update=missing))
 
     @property
     def draw_options(self) -> dict[str, Any]:
@@ -270,18 +271,23 @@ class Case:
 
     def flaring(self, amplitude: float, temperature_k: float | None = None) -> Source:
         """Return the star with a flare, by default of the study's temperature."""
-        f = self.study.flare
-        how: dict[str, Any] = {"geometry": f.geometry, "photosphere_temperature": f.photosphere_temperature_k}
-        return self.source.flaring(amplitude, spectrum=f.light(temperature_k), band=f.band, **how)
+        flare = self.study.flare
+        return self.source.flaring(
+            amplitude,
+            spectrum=flare.light(temperature_k),
+            band=flare.band,
+            geometry=flare.geometry,
+            photosphere_temperature=flare.photosphere_temperature_k,
+        )
 
     def expect(self, *sources: Source) -> list[Expectation]:
         """Compute the expectations of sources for the instrument, sky and exposure."""
         from mauvecl.host.exposure.expectation import expect
 
-        o = self.study.observation
-        how: dict[str, Any] = {"exposure": o.exposure_s, "order": o.order, "signal": o.signal}
-        how |= {"sky": self.loader.sky(self.study.sky), "neighbours": self.neighbours}
-        return [expect(source, self.instrument, **how) for source in sources]
+        o, sky = self.study.observation, self.loader.sky(self.study.sky)
+        options: dict[str, Any] = {"exposure": o.exposure_s, "order": o.order, "signal": o.signal}
+        options |= {"sky": sky, "neighbours": self.neighbours}
+        return [expect(source, self.instrument, **options) for source in sources]
 
     def unknowns(self, quiet: Expectation | None = None) -> Nuisances | None:
         """Return the nuisance parameters that statistics are marginalised over, or None.
@@ -299,16 +305,16 @@ class Case:
         from mauvecl.noise.scene import WEIGHTS, drawn_factors
 
         quiet = self.quiet if quiet is None else quiet
-        unknown, given = self.unknowns(quiet), self.study.nuisances.light
-        if unknown is None or "light" not in unknown.names or given == "free":
+        unknown, light_sd = self.unknowns(quiet), self.study.nuisances.light
+        if unknown is None or "light" not in unknown.names or light_sd == "free":
             return unknown
-        if given is None and "star" not in unknown.names:
+        if light_sd is None and "star" not in unknown.names:
             unknown = unknown.with_spectrum("star", quiet.net_source_dn, math.inf)
         light = drawn_factors(self.processes, quiet).get("light") if stare is None else None
         if light is None:
-            return unknown.without(["light"]) if given is None else unknown
-        if given is not None:
-            return unknown.with_prior("light", light.mean - 1.0, given)
+            return unknown.without(["light"]) if light_sd is None else unknown
+        if light_sd is not None:
+            return unknown.with_prior("light", light.mean - 1.0, light_sd)
         unknown = unknown.with_prior("light", light.mean - 1.0, light.sd)
         if light.normal:
             return unknown
@@ -317,8 +323,8 @@ class Case:
     def detect_options(self, quiet: Expectation | None = None) -> dict[str, Any]:
         """Return all arguments of `Engine.detect` except expectations and seed; `quiet` as for `unknowns`."""
         run = self.study.run
-        how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
-        return self.draw_options | how | {"nuisances": self.unknowns(quiet), "comparison": run.comparison()}
+        options = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
+        return self.draw_options | options | {"nuisances": self.unknowns(quiet), "comparison": run.comparison()}
 
     def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
         """Return the input of statistics for closed forms."""
@@ -328,7 +334,7 @@ class Case:
         return Setting(quiet, ~quiet.saturated, comparison, flares, self.unknowns(quiet), self.processes)
 
     def with_value(self, quantity: str, value: float | str) -> Self:
-        """Return the case at another value of a quantity of `quantities.QUANTITIES`."""
+        """Return the case at another value of a quantity of `questions.QUANTITIES`."""
         return replace(self, study=self.study.at(quantity, value))
 
     def with_sections(self, **sections: Any) -> Self:
@@ -345,8 +351,8 @@ class Case:
 
         flare, star, observed = self.study.flare, self.source, self.study.flare.light()
         check_scales(observed)
-        how = flare.band, flare.geometry, flare.photosphere_temperature_k
-        light = added_light(star.wavelength_nm, star.flux_flam, observed, *how)
+        geometry = flare.geometry, flare.photosphere_temperature_k
+        light = added_light(star.wavelength_nm, star.flux_flam, observed, flare.band, *geometry)
         scaled = flare.spectrum.model_copy(update={"as_observed": False})
         return self.with_sections(flare=flare.model_copy(update={"amplitudes": (1.0 / light.hot,), "spectrum": scaled}))
 
@@ -461,8 +467,8 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
             )
             messages.append(Message(text, "no light"))
         # A flare saturates the pixels that its star saturates without it, which is one fact.
-        known = of_kind(x.messages, SATURATED) if flaring and star in saturated else []
-        messages += [message for message in x.messages if message not in known]
+        reported = of_kind(x.messages, SATURATED) if flaring and star in saturated else []
+        messages += [message for message in x.messages if message not in reported]
         quiet = float(np.min(x.read_noise_dn)) < NOISY_DN
         if quiet and (coarse := int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))):
             text = (
@@ -482,28 +488,26 @@ def _star_of(x: Expectation) -> tuple[tuple[object, ...], bool]:
 
 def off_centre(expectations: list[Expectation], processes: Processes) -> list[str]:
     """Return a clause for each prior that excludes the value of an expectation."""
-    sentences = []
+    clauses = []
     for name, _ in processes.modulations:
         first, last = getattr(processes, name).quantile(np.array([0.0, 1.0]))
         expected = PROCESSES[name].expected
         values = {x.conditions[expected] if isinstance(expected, str) else expected for x in expectations}
         outside = sorted(value for value in values if not first - TINY <= value <= last + TINY)
         if outside:
-            sentences.append(
+            clauses.append(
                 f"{name} is drawn from {first:g} to {last:g}, and the expectation, which is "
                 f"subtracted, has {', '.join(f'{value:g}' for value in outside)}: every exposure differs from it, and "
                 "thresholds hold that difference"
             )
-    return sentences
+    return clauses
 
 
 def worst_first(messages: Iterable[str]) -> list[str]:
     """Remove duplicates, put messages on saturation first, and summarise these beyond `MAX_SATURATED`."""
-    once = list(dict.fromkeys(messages))
-    saturated = of_kind(once, SATURATED)
-    others = [text for text in once if text not in set(saturated)]
-    rest = len(saturated) - MAX_SATURATED
-    if rest > 0:
-        more = f"SATURATED: pixels of {rest} more stars, flares or exposures of this answer saturate."
-        return [*saturated[:MAX_SATURATED], Message(more, SATURATED), *others]
-    return [*saturated, *others]
+    messages = dict.fromkeys(messages)
+    saturated = of_kind(messages, SATURATED)
+    n_more = len(saturated) - MAX_SATURATED
+    more = f"SATURATED: pixels of {n_more} more stars, flares or exposures of this answer saturate."
+    summary = [Message(more, SATURATED)] if n_more > 0 else []
+    return [*saturated[:MAX_SATURATED], *summary, *(text for text in messages if text not in saturated)]

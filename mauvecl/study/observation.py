@@ -76,7 +76,7 @@ class Observation(Section):
     )
     mode: Literal["auto", "frames", "stacked"] = setting("auto", "How the frames of an exposure are drawn")
     recipe: Literal["auto", "joint", "apart"] = setting("auto", "How the noise of a frame is drawn")
-    changes: dict[str, Annotated[float | int | str, Accepted("a number or text")]] = setting(
+    changes: dict[str, Annotated[fields.Number | fields.WholeNumber | str, Accepted("a number or text")]] = setting(
         dict, "Changed values of the instrument, by name"
     )
 
@@ -126,11 +126,11 @@ class SkyLight(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _default_brightness(cls, given: Any) -> Any:
+    def _default_brightness(cls, data: Any) -> Any:
         """Set the default brightness of a sky without keys, and no sky for the brightness "none"."""
-        if isinstance(given, dict) and says_none(given.get("surface_brightness")):
-            return given | {"surface_brightness": None, "none": True}
-        return given or {"surface_brightness": DEFAULT_SKY}
+        if isinstance(data, dict) and says_none(data.get("surface_brightness")):
+            return data | {"surface_brightness": None, "none": True}
+        return {"surface_brightness": DEFAULT_SKY} if data == {} else data
 
     def _check_values(self) -> None:
         check_all(self, "the sky", "target", "time")
@@ -163,7 +163,7 @@ class Run(Section):
         fields.DEFAULT_SEED, "Seed", flag="--seed", hint="The same seed gives the same noise, to the bit.", place=3
     )
     statistics: Annotated[
-        tuple[str, ...], AfterValidator(lambda given: STATISTIC_NAMES if "all" in given else given)
+        tuple[str, ...], AfterValidator(lambda names: STATISTIC_NAMES if "all" in names else names)
     ] = setting(
         (RECOMMENDED,),
         "Detection statistic",
@@ -229,7 +229,9 @@ class OwnNuisance(Section):
     """User-defined nuisance spectrum: wavelength in nm and DN per exposure at unit amplitude, as a file or points."""
 
     file: Path | None = setting(None, "File with two columns, wavelength in nm and DN per exposure")
-    points: tuple[tuple[float, float], ...] | None = setting(None, "Wavelengths in nm, and DN per exposure")
+    points: tuple[tuple[fields.Number, fields.Number], ...] | None = setting(
+        None, "Wavelengths in nm, and DN per exposure"
+    )
     sd: Spread = setting("free", "Standard deviation of the amplitude, or free")
 
     def _check_values(self) -> None:
@@ -317,12 +319,12 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
     def _check_values(self) -> None:
         if self.draws == 1:
             raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
-        other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
-        if other is not None:
-            raise InputError.of("unknowns.known", other, f"some of {', '.join(INSTRUMENT_VALUES)}")
+        for name in self.known:
+            if name not in INSTRUMENT_VALUES:
+                raise InputError.of("unknowns.known", name, f"some of {', '.join(INSTRUMENT_VALUES)}")
 
     def priors(self, instrument: Instrument) -> dict[str, Prior]:
         """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.values_of`."""
         rows = {name: row for name, row in values_of(instrument).items() if name not in self.known}
-        given: dict[str, Any] = {name: getattr(self, name, row.prior) for name, row in rows.items()}
-        return {name: prior for name, prior in given.items() if prior is not None}
+        priors: dict[str, Any] = {name: getattr(self, name, row.prior) for name, row in rows.items()}
+        return {name: prior for name, prior in priors.items() if prior is not None}

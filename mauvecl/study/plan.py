@@ -46,7 +46,6 @@ class OrbitQuestion(Section):
         flag="--days",
         label="Days",
         hint="How many days from the first one on are looked at: 365 show every season.",
-        unit="d",
         most=1000,
         slider=Slider(5, 730, 5),
     )
@@ -61,15 +60,15 @@ class OrbitQuestion(Section):
 
     @field_validator("start")
     @classmethod
-    def _time(cls, given: str) -> str:
+    def _time(cls, text: str) -> str:
         # The default is a time, for which astropy need not be loaded.
-        if given != cls.model_fields["start"].default:
+        if text != cls.model_fields["start"].default:
             from mauvecl.host.exposure.background import parse_time
             from mauvecl.host.tables.units import offline
 
             with offline():
-                parse_time(given, "start")
-        return given
+                parse_time(text, "start")
+        return text
 
     def orbit(self) -> Orbit:
         """Load the orbit."""
@@ -135,12 +134,12 @@ class PlanTarget(Section):
         check_one(self, self.name, *RATES)
 
     def target(self, simbad: bool) -> Target:
-        """Look up the target; what is given replaces what is known by its name."""
+        """Look up the target; values that are given replace those that are known by its name."""
         from mauvecl.host.orbit.orbit import Target
 
         if self.coordinates is None:
             try:
-                found = Target.of(self.name, name=self.name, simbad=simbad)
+                target = Target.of(self.name, name=self.name, simbad=simbad)
             except InputError as error:
                 if simbad or not self.unused:
                     raise
@@ -148,12 +147,12 @@ class PlanTarget(Section):
                 remedy = f"give columns ra and dec, or coordinates, besides {shown(', '.join(self.unused), 200)}"
                 raise InputError(f"{fault}; {remedy}", key="coordinates") from error
         else:
-            found = Target.of(self.coordinates, name=self.name)
+            target = Target.of(self.coordinates, name=self.name)
             with contextlib.suppress(InputError):
-                found = replace(Target.of(self.name), name=self.name, ra_deg=found.ra_deg, dec_deg=found.dec_deg,
-                                source="given")  # fmt: skip
-        given = {name: getattr(self, name) for name in ("spectral_type", "magnitude", "distance_pc")}
-        return replace(found, **{name: value for name, value in given.items() if value not in (None, "")})
+                position: dict[str, Any] = {"ra_deg": target.ra_deg, "dec_deg": target.dec_deg, "source": "given"}
+                target = replace(Target.of(self.name), name=self.name, **position)
+        values = {name: getattr(self, name) for name in ("spectral_type", "magnitude", "distance_pc")}
+        return replace(target, **{name: value for name, value in values.items() if value not in (None, "")})
 
     def distribution(self, spectral_type: str) -> Rates:
         """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""
@@ -272,17 +271,17 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     keys = [key for key in PlanTarget.model_fields if key != "unused"]
     columns = {key: rows.first((key, *TARGET_COLUMNS.get(key, ()))) for key in (*keys, "ra", "dec", "parallax")}
     if columns["alpha"] is not None and columns["ra"] == columns["alpha"]:
-        # A right ascension next to a declination, otherwise the exponent of a distribution.
+        # Next to a declination it is a right ascension, otherwise the exponent of a distribution.
         columns["alpha" if columns["dec"] is not None else "ra"] = None
     if columns["name"] is None:
         raise InputError(f"{named} needs a column called name, but has {shown(', '.join(rows.names), 200)}", key="name")
-    path = next((held for key in PATH_KEYS if (held := columns[key]) and folder is None), None)
-    if path is not None:
-        raise InputError(f"{named} has the column {shortened(path)}, but must not name files", key=path)
+    for key in PATH_KEYS if folder is None else ():
+        if column := columns[key]:
+            raise InputError(f"{named} has the column {shortened(column)}, but must not name files", key=column)
     for key in ("distance_pc", "mass_msun", "age_myr"):
-        held = columns[key]
-        if held is not None and names.key_of(held) in ("distance", "dist", "mass", "age") and not rows.unit(held):
-            # A distance in an unknown unit is none.
+        column = columns[key]
+        if column and names.key_of(column) in ("distance", "dist", "mass", "age") and not rows.unit(column):
+            # Without its unit, a distance, mass or age is unknown.
             columns[key] = None
     if not 1 <= rows.n <= MAX_TARGETS:
         raise InputError(f"{named} must hold 1 to {MAX_TARGETS} targets, but holds {rows.n}", key="name")
@@ -302,7 +301,7 @@ def _target(
         if column is None or not text or (key == "coordinates" and names.is_missing_position(text)):
             continue
         unit = first(field, Unit)
-        # A text that is no number is refused with the key's own sentence.
+        # The field itself refuses text that is not a number, in its own words.
         is_number = (unit or first(field, Range)) and not isinstance(number_or_text(text), str)
         target[key] = rows.number(column, row, unit.name if unit else "") if is_number else text
     _check_band(rows, columns["magnitude"], row)
@@ -315,11 +314,11 @@ def _target(
     for key in PATH_KEYS:
         if folder is not None and isinstance(target.get(key), str):
             target[key] = folder / target[key]
-    alone = [key for key in ("mass_msun", "age_myr") if key in target]
-    if len(alone) == 1 and (held := columns[alone[0]]) is not None and names.key_of(held) != alone[0]:
+    of_rates = [key for key in ("mass_msun", "age_myr") if key in target]
+    if len(of_rates) == 1 and (column := columns[of_rates[0]]) and names.key_of(column) != of_rates[0]:
         # Catalogues have the mass of most stars and the age of few.
-        del target[alone[0]]
-        unused += (held,)
+        del target[of_rates[0]]
+        unused += (column,)
     if unused:
         target["unused"] = unused
     built(PlanTarget, target, named)
@@ -327,7 +326,7 @@ def _target(
 
 
 def _check_band(rows: Rows, column: str | None, row: int) -> None:
-    """Raise InputError if a magnitude of no stated band in its name has another than V in brackets or in a column."""
+    """Raise InputError if brackets or another column state a band other than V for a magnitude of no named band."""
     if column is None or not rows.text(column, row):
         return
     if names.key_of(names.divided_unit(column)[0]) not in ("mag", "magnitude"):
@@ -340,27 +339,28 @@ def _check_band(rows: Rows, column: str | None, row: int) -> None:
 def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: dict[str, Any]) -> str | None:
     """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there.
 
-    Raises InputError for one of the two, for sexagesimal ones that differ, and for a star without any that is not in
+    Raises InputError if only one of the two is given, if sexagesimal ones differ, and if a star without any is not in
     the embedded list.
     """
     from mauvecl.host.stars.library import by_key, name_key
 
     ra, dec = columns["ra"], columns["dec"]
-    given = [name for name in (ra, dec) if rows.text(name, row)]
-    if len(given) == 1 or (given and "coordinates" in target):
+    n_angles = sum(bool(rows.text(name, row)) for name in (ra, dec))
+    if n_angles == 1 or (n_angles and "coordinates" in target):
         raise InputError(f"{rows.named}: row {row + 1} needs either coordinates, or both ra and dec", key="coordinates")
-    if ra is not None and dec is not None and given:
+    if ra is not None and dec is not None and n_angles:
         east, north = (rows.degrees(name, row, right_ascension=name == ra) for name in (ra, dec))
-        again = rows.first(names.SEXAGESIMAL)
-        other = None if again in (None, ra) else rows.degrees(again, row, right_ascension=True)
-        if other is not None and east is not None and abs((other - east + 180) % 360 - 180) > 0.1:
-            fault = f"row {row + 1} has {ra} = {rows.text(ra, row)} and {again} = {rows.text(again, row)}, which differ"
+        second = rows.first(names.SEXAGESIMAL)
+        other_east = None if second in (None, ra) else rows.degrees(second, row, right_ascension=True)
+        if other_east is not None and east is not None and abs((other_east - east + 180) % 360 - 180) > 0.1:
+            cells = f"{ra} = {rows.text(ra, row)} and {second} = {rows.text(second, row)}"
+            fault = f"row {row + 1} has {cells}, which differ"
             raise rows.error(f"{fault}; give numbers in degrees, or only one of these columns", ra)
         return f"{east!r} {north!r}"
     if "coordinates" not in target and name_key(name := target.get("name", "")) not in by_key():
         for column in filter(None, (ra, columns["coordinates"])):
             text = str(rows.table[column][row])
-            # The cell says that a coordinate, or a pair of them, is not a number, instead of being empty.
+            # The cell is not empty, but says that a coordinate or a pair of them is not a number.
             if text.strip().lower() == "nan" or names.is_missing_position(text):
                 fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
                 remedy = "give its coordinates, or a name of the list"

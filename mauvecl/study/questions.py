@@ -12,23 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from pydantic import Field, model_validator
 
 from mauvecl.host.stars.library import ALIASES
-from mauvecl.schema import section
+from mauvecl.schema import fields, section
 from mauvecl.schema.errors import InputError, shown
-from mauvecl.schema.fields import (
-    Accepted,
-    DetectorTemperature,
-    Flag,
-    Help,
-    Magnitude,
-    Positive,
-    Probability,
-    Quantity,
-    Range,
-    Slider,
-    Unit,
-    Wavelength,
-    first,
-)
+from mauvecl.schema.fields import Accepted, Flag, Help, Quantity, Range, Slider, Unit, first
 from mauvecl.schema.section import Section, read_axis, setting
 from mauvecl.study.observation import Observation, SkyLight
 from mauvecl.study.star import Flare, Star, unit_of_file
@@ -43,10 +29,10 @@ if TYPE_CHECKING:
 
 #: Quantities that vary, by name, with the unit and range of their fields.
 QUANTITIES = {
-    one.name: replace(one, path=path, unit=(first(field, Unit) or Unit("")).name, range=first(field, Range))
+    quantity.name: replace(quantity, path=path, unit=(first(field, Unit) or Unit("")).name, range=first(field, Range))
     for name, kind in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
     for path, field in section.fields_of(kind, (name,))
-    if (one := first(field, Quantity)) is not None
+    if (quantity := first(field, Quantity)) is not None
 }
 if TYPE_CHECKING:
     QuantityName = str
@@ -66,12 +52,12 @@ class CampaignQuestion(Section):
     step: Annotated[int, Range(1)] | None = setting(
         None, "Frames from one stack of the search to the next", flag="--campaign-step", usual="a stack"
     )
-    fap: Probability | None = setting(
+    fap: fields.Probability | None = setting(
         None,
         "Wanted probability of any false alarm in the search; shows what each test may have",
         flag="--campaign-fap",
     )
-    alarms: Positive | None = setting(
+    alarms: fields.Positive | None = setting(
         None, "Wanted number of false alarms in the search; shows what each test may have", flag="--campaign-alarms"
     )
 
@@ -82,8 +68,8 @@ class CampaignQuestion(Section):
 class SignalQuestion(Section):
     """S/N that an exposure must reach."""
 
-    snr: Positive | None = setting(None, "Wanted signal-to-noise ratio", flag="--snr")
-    wavelength_nm: Wavelength | None = setting(None, "Wavelength", flag="--at")
+    snr: fields.Positive | None = setting(None, "Wanted signal-to-noise ratio", flag="--snr")
+    wavelength_nm: fields.Wavelength | None = setting(None, "Wavelength", flag="--at")
     per: Literal["element", "pixel"] = setting(
         "element", "Bin of the S/N", flag="--per", choices="element (10.5 nm) or pixel"
     )
@@ -130,7 +116,7 @@ class LimitQuestion(Section):
         "probability; all else is as entered. The tab Limit and map simulates it.",
         first="amplitude",
     )
-    power: Probability = setting(
+    power: fields.Probability = setting(
         0.9,
         "Wanted detection probability",
         flag="--power",
@@ -146,8 +132,7 @@ def _wrong_value(quantity: Quantity, text: str) -> InputError:
     return InputError(f"a value of the axis {quantity.name!r} must be {accepted}, not {text}", key="values")
 
 
-Number = Annotated[float, Range()]
-NumberOrName = Annotated[float | str, Accepted("a number or a name")]
+NumberOrName = Annotated[fields.Number | str, Accepted("a number or a name")]
 
 
 class Axis(Section):
@@ -155,21 +140,21 @@ class Axis(Section):
 
     quantity: Annotated[QuantityName, Help("Quantity that varies")]
     values: tuple[NumberOrName, ...] | None = setting(None, "Values")
-    start: Number | None = setting(None, "First of evenly spaced values")
-    stop: Number | None = setting(None, "Last of evenly spaced values")
+    start: fields.Number | None = setting(None, "First of evenly spaced values")
+    stop: fields.Number | None = setting(None, "Last of evenly spaced values")
     steps: Annotated[int, Range(2, 1000)] | None = setting(None, "Number of evenly spaced values")
     log: bool = setting(False, "Whether values are evenly spaced in the logarithm")
 
     @model_validator(mode="before")
     @classmethod
-    def _without_units(cls, given: Any) -> Any:
+    def _without_units(cls, data: Any) -> Any:
         """Convert values with a unit, such as "10 min", to the unit of the quantity."""
-        quantity = QUANTITIES.get(str(given.get("quantity"))) if isinstance(given, dict) else None
+        quantity = QUANTITIES.get(str(data.get("quantity"))) if isinstance(data, dict) else None
         if quantity is None or quantity.range is None:
-            return given
-        keys = [key for key in ("values", "start", "stop") if key in given]
+            return data
+        keys = [key for key in ("values", "start", "stop") if key in data]
         try:
-            return given | {key: Unit(quantity.unit).plain(given[key]) for key in keys}
+            return data | {key: Unit(quantity.unit).plain(data[key]) for key in keys}
         except ValueError as error:
             raise _wrong_value(quantity, str(error)) from error
 
@@ -213,7 +198,7 @@ class MapQuestion(Section):
         "Vertical axis of the map; such as amplitude:0.01:1:16:log",
         flag=Flag("--y", kind=str, read=read_axis),
     )
-    contours: tuple[Probability, ...] = setting((0.1, 0.5, 0.9), "Detection probabilities of contours")
+    contours: tuple[fields.Probability, ...] = setting((0.1, 0.5, 0.9), "Detection probabilities of contours")
 
     def _check_values(self) -> None:
         if self.y.quantity == ("magnitude" if self.x is None else self.x.quantity):
@@ -236,7 +221,7 @@ class Sweep(Section):
         flag=Flag(
             "--as-list",
             kind=bool,
-            read=lambda wanted, _: "list" if wanted else None,
+            read=lambda is_set, _: "list" if is_set else None,
             help=Help("Vary the quantities of a sweep together instead of in every combination"),
         ),
     )
@@ -269,13 +254,6 @@ class Sweep(Section):
         return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]
 
 
-def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
-    """Return the default sweep of `gaussian`, over magnitudes and over exposures, or at a given exposure."""
-    axes = [Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0))] if magnitude else []
-    exposures = (5.0, 50.0, 600.0) if exposure_s is None else (exposure_s,)
-    return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
-
-
 def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
     """Raise InputError if a swept quantity has no effect on the stare."""
     fixed = {
@@ -299,9 +277,11 @@ class CalibrationObservation(Section):
     mapping: Path | None = setting(None, "Where time, flux and temperature are in that file (TOML)")
     library: str | None = setting(None, "Name of the standard star in the library")
     spectrum: Path | None = setting(None, "File with the spectrum of the standard star, such as CALSPEC's")
-    magnitude: Magnitude | None = setting(None, "Magnitude", usual="that of the spectrum")
+    magnitude: fields.Magnitude | None = setting(None, "Magnitude", usual="that of the spectrum")
     band: str = setting("V", "Band of the magnitude")
-    temperature_c: DetectorTemperature | None = setting(None, "Detector temperature, where the frames do not state it")
+    temperature_c: fields.DetectorTemperature | None = setting(
+        None, "Detector temperature, where the frames do not state it"
+    )
 
     def _check_values(self) -> None:
         section.check_one(self, "an observation", "spectrum", "library")
@@ -364,7 +344,7 @@ class CalibrateQuestion(Section):
 DEFAULT_CHANGES = ("Mg II", "Ca II", "H beta", "H alpha", "balmer jump", "200-320", "320-700", "colour")
 #: Name of the change that adds the light of `change.file`.
 SPECTRUM = "spectrum"
-Days = Annotated[Positive, Unit("d")]
+Days = Annotated[fields.Positive, Unit("d")]
 
 
 class ChangeQuestion(Section):
@@ -525,10 +505,10 @@ class MeasureQuestion(Section):
         (), "Line that the model 'lines' fits", flag=Flag("--fit-line", read=section.read_words), usual="the flare's"
     )
     fits: Annotated[int, Range(1, 1_000_000)] = setting(1000, "Simulated exposures of each flare", flag="--fits")
-    bands_nm: tuple[tuple[Wavelength, Wavelength], ...] = setting(
+    bands_nm: tuple[tuple[fields.Wavelength, fields.Wavelength], ...] = setting(
         ((200.0, 320.0), (200.0, 700.0)), "Wavelength ranges for which the flux is reported"
     )
-    skipped_nm: tuple[tuple[Wavelength, Wavelength], ...] = setting(
+    skipped_nm: tuple[tuple[fields.Wavelength, fields.Wavelength], ...] = setting(
         (),
         "Wavelengths that fits leave out, from:to; as in 322:368",
         flag=Flag(
@@ -538,9 +518,8 @@ class MeasureQuestion(Section):
         ),
         label="Leave out wavelengths",
         hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",
-        unit="nm",
     )
-    snr_per_bin: Positive | None = setting(
+    snr_per_bin: fields.Positive | None = setting(
         None,
         "S/N of bins of frames in which the flares of the study's stare are measured against time",
         flag="--snr-per-bin",
@@ -574,11 +553,11 @@ class MeasureQuestion(Section):
                     raise InputError.of(f"measure.{key}", (low, high), "ascending wavelengths", unit="nm")
 
 
-def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[FittedModel, bool, tuple[str, ...]]]:
+def fitted_models(question: MeasureQuestion, flare: Flare) -> list[tuple[FittedModel, bool, tuple[str, ...]]]:
     """Return the name of each fitted model, whether it has a Balmer continuum, and its lines."""
     light = flare.spectrum
-    lines = asked.lines or tuple(dict.fromkeys((*light.lines, *light.line_fluxes)))
-    models = list(asked.models)
+    lines = question.lines or tuple(dict.fromkeys((*light.lines, *light.line_fluxes)))
+    models = list(question.models)
     if not models:
         models = ["blackbody"]
         if light.second_area is not None:

@@ -35,17 +35,17 @@ STAR_KEYS = (
 )  # fmt: skip
 
 
-def unit_of_file(of: Literal["wavelength", "flux"], what: str, whose: str, label: str, group: str) -> Any:
-    """Return the key of a unit of spectra next to a star's; `what` begins its flag, and `whose` ends its help."""
-    many, such, units = UNITS[of]
+def unit_of_file(of: Literal["wavelength", "flux"], prefix: str, whose: str, label: str, group: str) -> Any:
+    """Return the field of a unit of spectra next to a star's; `prefix` begins its flag, `whose` ends its help."""
+    noun, examples, units = UNITS[of]
     return setting(
         None,
-        f"Unit of the {many} of {whose}",
-        flag=f"--{what}-{of}-unit",
-        label=f"{label}: unit of {many}",
-        hint=f"Such as {such}. Nothing: what the file says.",
+        f"Unit of the {noun} of {whose}",
+        flag=f"--{prefix}-{of}-unit",
+        label=f"{label}: unit of {noun}",
+        hint=f"Such as {examples}. Nothing: what the file says.",
         group=group,
-        name=f"{what}_{of}_unit",
+        name=f"{prefix}_{of}_unit",
         suggestions=units,
     )
 
@@ -168,14 +168,14 @@ class Star(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _as_listed(cls, given: Any) -> Any:
+    def _as_listed(cls, data: Any) -> Any:
         """Add the V magnitude and the distance of a star of the embedded list, unless others are given."""
-        if not isinstance(given, dict) or not isinstance(given.get("library"), str):
-            return given
-        listed = listed_values(given["library"])
-        if given.get("band", "V") != "V" or given.get("magnitude_system", "catalogue") != "catalogue":
+        if not isinstance(data, dict) or not isinstance(data.get("library"), str):
+            return data
+        listed = listed_values(data["library"])
+        if data.get("band", "V") != "V" or data.get("magnitude_system", "catalogue") != "catalogue":
             listed.pop("magnitude", None)
-        return given | {key: value for key, value in listed.items() if given.get(key) is None}
+        return data | {key: value for key, value in listed.items() if data.get(key) is None}
 
     def _check_values(self) -> None:
         check_one(self, "a star", "library", "file", needed=True)
@@ -189,7 +189,7 @@ class Star(Section):
             return changed
         listed = listed_values(str(value))
         if self.magnitude not in (None, listed_values(self.library or "").get("magnitude")):
-            # A given magnitude is that of every star.
+            # A magnitude that is not from the list was set by the user, for every star.
             listed.pop("magnitude", None)
         return changed.model_copy(update=dict.fromkeys(STAR_KEYS) | listed)
 
@@ -331,12 +331,12 @@ class FlareLight(Section):
     )
 
     def _check_values(self) -> None:
-        what = "the spectrum of a flare"
+        subject = "the spectrum of a flare"
         for key in ("second_temperature_k", "second_area", "balmer_jump"):
-            check_one(self, what, "file", key)
-        check_needs(self, what, FLARE_FILE_KEYS, "file")
-        check_all(self, what, "second_temperature_k", "second_area")
-        check_one(self, what, "balmer_jump", "second_area")
+            check_one(self, subject, "file", key)
+        check_needs(self, subject, FLARE_FILE_KEYS, "file")
+        check_all(self, subject, "second_temperature_k", "second_area")
+        check_one(self, subject, "balmer_jump", "second_area")
         if self.file is None and self != FlareLight.model_construct():
             self.at_temperature(10_000.0)
 
@@ -354,10 +354,9 @@ class FlareLight(Section):
             light = spectra.BalmerFlare(temperature_k, self.balmer_jump, self.electron_temperature_k)
         if not (self.lines or self.line_fluxes):
             return light
-        scaled = (
-            {name: self.line_scale * value for name, value in each.items()} for each in (self.lines, self.line_fluxes)
-        )
-        return spectra.FlareWithLines(light, *scaled)
+        lines = {name: self.line_scale * fraction for name, fraction in self.lines.items()}
+        fluxes = {name: self.line_scale * flux for name, flux in self.line_fluxes.items()}
+        return spectra.FlareWithLines(light, lines, fluxes)
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value of one key; raises InputError if the key has no effect."""
@@ -394,7 +393,6 @@ class Flare(Section):
             ),
             Flag("--amplitude", "-a"),
         ),
-        label="Flare amplitude",
         hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
         "ultraviolet the rise is many times as large.",
         name="amplitude_percent",
@@ -448,14 +446,14 @@ class Flare(Section):
         """
         from mauvecl.flares.energies import EnergyScale
 
-        how: dict[str, Any] = {
+        flare: dict[str, Any] = {
             "band": self.band, "flare": self.light(temperature_k), "kind": kind, "geometry": self.geometry,
             "photosphere_k": self.photosphere_temperature_k,
         }  # fmt: skip
         if star.distance_pc is not None:
-            return EnergyScale.of_star(source, star.distance_pc, **how)
+            return EnergyScale.of_star(source, star.distance_pc, **flare)
         if star.radius_rsun is not None and star.effective_temperature_k is not None:
-            return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **how)
+            return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **flare)
         return None
 
     @property

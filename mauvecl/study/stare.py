@@ -139,18 +139,18 @@ class EventChoice(Section):
             fault = "events.cooling needs a flare that has a temperature, but its spectrum is from a file"
             raise InputError(fault, key="events.cooling")
         kelvin = flare.temperature_k if self.temperature_k is None else self.temperature_k
-        how: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             "peak_s": self.peak_s,
             "half_width_s": stare.half_width_s if self.half_width_s is None else self.half_width_s,
             "temperature": kelvin if cooling is None else Cooling(kelvin, cooling.end_k, cooling.fold_s),
             "shape": shape,
         }
         if self.peak is not None:
-            return Event.of_peak(self.peak, **how)
+            return Event.of_peak(self.peak, **arguments)
         if self.equivalent_duration_s is not None:
-            return Event.of_equivalent_duration(self.equivalent_duration_s, **how)
-        usual = flare.amplitudes[0] if self.energy_erg is None else 1.0
-        return Event(amplitude=usual if self.amplitude is None else self.amplitude, **how)
+            return Event.of_equivalent_duration(self.equivalent_duration_s, **arguments)
+        amplitude = flare.amplitudes[0] if self.energy_erg is None else 1.0
+        return Event(amplitude=amplitude if self.amplitude is None else self.amplitude, **arguments)
 
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
@@ -306,7 +306,7 @@ def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Cours
 
 
 def stare_of(
-    q: StareQuestion,
+    question: StareQuestion,
     instrument: Instrument,
     processes: Processes,
     *,
@@ -318,53 +318,53 @@ def stare_of(
     from mauvecl.flares.stare import Stare
 
     priors = [_stare_prior(name, getattr(processes, name), instrument) for name, _ in processes.modulations]
-    spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
-    for course, changed, sd, _ in priors:
-        # Independent normal amplitudes of one change add up to one.
-        spreads[course][changed] = math.hypot(spreads[course].get(changed, 0.0), sd)
-    spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
+    spreads: dict[Course, dict[Changing, float]] = {course: dict(getattr(question, course)) for course in COURSES}
+    for course, changing, sd, _ in priors:
+        # Independent normal amplitudes of the same change add in quadrature.
+        spreads[course][changing] = math.hypot(spreads[course].get(changing, 0.0), sd)
+    spreads = {course: {name: sds[name] for name in CHANGING if name in sds} for course, sds in spreads.items()}
     if usual:
-        spreads = {how: documented | spreads[how] for how, documented in DEFAULT_SPREADS.items()}
+        spreads = {course: documented | spreads[course] for course, documented in DEFAULT_SPREADS.items()}
 
     names = (*KNOWN_CHANGES, "pointing", "orbit_s")
-    changes: dict[str, Any] = {name: getattr(q, name) for name in names} | spreads
+    changes: dict[str, Any] = {name: getattr(question, name) for name in names} | spreads
     changes["frame_s"] = instrument.frame_s
-    if q.along_orbit:
-        stare = _along_orbit(q, orbit, plan, changes)
+    if question.along_orbit:
+        stare = _along_orbit(question, orbit, plan, changes)
     else:
-        n_orbits = math.ceil(q.duration_s / q.orbit_s) if q.orbit_gap_s else 0
-        ends = [(n + 1) * q.orbit_s for n in range(n_orbits)]
-        gaps = [*q.gaps, *((end - q.orbit_gap_s, end) for end in ends)]
-        stare = Stare.of(q.duration_s, temperature_c=instrument.temperature_c, gaps=gaps, **changes)
-    for _, changed, _, mean in priors:
-        name = "temperature_c" if changed == "temperature" else changed
+        n_orbits = math.ceil(question.duration_s / question.orbit_s) if question.orbit_gap_s else 0
+        ends = [(n + 1) * question.orbit_s for n in range(n_orbits)]
+        gaps = [*question.gaps, *((end - question.orbit_gap_s, end) for end in ends)]
+        stare = Stare.of(question.duration_s, temperature_c=instrument.temperature_c, gaps=gaps, **changes)
+    for _, changing, _, mean in priors:
+        name = "temperature_c" if changing == "temperature" else changing
         value: Any = getattr(stare, name)
-        stare = replace(stare, **{name: value + mean if changed == "temperature" else value * mean})
+        stare = replace(stare, **{name: value + mean if changing == "temperature" else value * mean})
     return stare
 
 
-def _along_orbit(q: StareQuestion, orbit: OrbitQuestion, plan: PlanQuestion, changes: dict[str, Any]) -> Stare:
+def _along_orbit(question: StareQuestion, orbit: OrbitQuestion, plan: PlanQuestion, changes: dict[str, Any]) -> Stare:
     """Return the stare at the target of the study's ``orbit``, with gaps and temperatures along the orbit."""
     from mauvecl.flares.stare import stare_along
     from mauvecl.study.plan import targets_of
 
-    if q.gaps or q.orbit_gap_s or q.thermal is not None:
+    if question.gaps or question.orbit_gap_s or question.thermal is not None:
         fault = "stare.along_orbit needs neither gaps nor a thermal curve, since both follow from the orbit"
         raise InputError(fault, key="stare.along_orbit")
-    targets = targets_of(orbit, plan)
+    targets, duration_s = targets_of(orbit, plan), question.duration_s
     if len(targets) != 1:
         fault = f"stare.along_orbit needs a single target in orbit.targets, but has {len(targets)}"
         raise InputError(fault, key="stare.along_orbit")
-    return stare_along(orbit.orbit(), targets[0], orbit.start, q.duration_s, limits=orbit.limits, **changes).stare
+    return stare_along(orbit.orbit(), targets[0], orbit.start, duration_s, limits=orbit.limits, **changes).stare
 
 
-def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
+def orbit_lines(question: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
     from mauvecl.host.orbit.orbit import TimeGrid
 
-    if not stare.along_orbit:
+    if not question.along_orbit:
         return []
-    times = TimeGrid(orbit.start, stare.duration_s / DAY_S, frame_s)
+    times = TimeGrid(orbit.start, question.duration_s / DAY_S, frame_s)
     assumed = "Limits, temperatures and windows of a stare along the orbit are assumptions"
     return [*orbit.orbit().messages(times), f"{assumed}; stray light is not modelled."]
 

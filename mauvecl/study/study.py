@@ -9,11 +9,11 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from functools import cache
-from itertools import chain
+from functools import cache, reduce
+from operator import getitem
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field
 
@@ -23,9 +23,9 @@ from mauvecl.host.orbit import Limits
 from mauvecl.host.stars.library import resolve
 from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, NUISANCES, Processes
-from mauvecl.schema.calls import validated
+from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, found, number
+from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, metadata_of
 from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
 from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -52,24 +52,24 @@ def read_version(data: dict[str, Any], where: str) -> dict[str, Any]:
     A file without a version is of version 1, in which by default everything but the noise was known and the instrument
     "mauve" had the conventions of the paper.
     """
-    of_defaults = ("observation", "nuisances", "run", "plan")
-    if "version" in data or not all(isinstance(data.get(key, {}), dict) for key in of_defaults):
+    sections = ("observation", "nuisances", "run", "plan")
+    if "version" in data or not all(isinstance(data.get(section, {}), dict) for section in sections):
         return data
-    observation, nuisances, run, plan = ({**data.get(key, {})} for key in of_defaults)
-    named = observation.get("instrument", "mauve")
-    if isinstance(named, str):
-        observation["instrument"] = FORMERLY_MAUVE if named == "mauve" else FORMER_NAMES.get(named, named)
+    observation, nuisances, run, plan = ({**data.get(section, {})} for section in sections)
+    instrument = observation.get("instrument", "mauve")
+    if isinstance(instrument, str):
+        observation["instrument"] = ({"mauve": FORMERLY_MAUVE} | FORMER_NAMES).get(instrument, instrument)
     nuisances.setdefault("usual", False)
     run.setdefault("statistics", [*DEFAULT_STATISTICS])
     if "plan" in data:
         plan.setdefault("completeness", "injections")
-    known = "the usual unknowns drawn" if nuisances["usual"] else "everything but the noise known"
+    unknowns = "the usual unknowns drawn" if nuisances["usual"] else "everything but the noise known"
     warnings.warn(
         f"{where} has no version and is read as in version 1, with the instrument now called "
-        f"{observation['instrument']} and {known}; `version = {VERSION}` asks with today's defaults.",
+        f"{observation['instrument']} and {unknowns}; `version = {VERSION}` asks with today's defaults.",
         stacklevel=2,
     )
-    return data | {"version": VERSION} | dict(zip(of_defaults, (observation, nuisances, run, plan), strict=True))
+    return data | {"version": VERSION} | dict(zip(sections, (observation, nuisances, run, plan), strict=True))
 
 
 def with_paths(value: Any, change: Callable[[Path], Any]) -> Any:
@@ -99,7 +99,7 @@ def tables_in(data: Any) -> Iterator[dict[str, Any]]:
 def locate_files(data: dict[str, Any], table: Path) -> None:
     """Locate the files that the study of an answer's table gives by name and digest, in place.
 
-    Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
+    Search the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
     """
     study = table.parent / "study.toml"
     for section in tables_in(data):
@@ -110,15 +110,15 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
             texts = (text for keys in tables for text in keys.values() if isinstance(text, str))
             named = (table.parent / text for text in texts if Path(text).name == name)
             places = [table.parent / name, table.parent.parent / name, Path(name), *named]
-            there = (place for place in places if files.without_columns(place)[0].is_file())
-            found = next((place for place in there if _digest(place) == digest), None)
-            if found is None:
+            existing = (place for place in places if files.without_columns(place)[0].is_file())
+            file = next((place for place in existing if _digest(place) == digest), None)
+            if file is None:
                 raise InputError(
                     f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is "
                     "missing or has changed; it must lie next to the table",
                     key=key,
                 )
-            section[key] = str(found.resolve())
+            section[key] = str(file.resolve())
 
 
 def _digest(path: Path) -> str:
@@ -128,14 +128,14 @@ def _digest(path: Path) -> str:
 def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
     """Set a nested key in place; `text` is the setting, for messages."""
     *parents, last = path
-    for part in parents:
+    for key in parents:
         if isinstance(data, list | tuple):
-            if part not in (numbers := [str(i) for i in range(len(data))]):
-                fault = f"the entry must be 0 to {len(numbers) - 1}, not {shortened(part)}"
+            if key not in (numbers := [str(i) for i in range(len(data))]):
+                fault = f"the entry must be 0 to {len(numbers) - 1}, not {shortened(key)}"
                 raise InputError(f"setting = {shortened(text)}: {fault}", key="setting")
-            data = data[int(part)]
+            data = data[int(key)]
         elif isinstance(data, dict):
-            data = data.setdefault(part, {})
+            data = data.setdefault(key, {})
     if not isinstance(data, dict):
         fault = f"{shortened('.'.join(parents))} must be a section with keys, but is a value"
         raise InputError(f"setting = {shortened(text)}: {fault}", key="setting")
@@ -146,8 +146,8 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
 VERSION: Literal[2] = 2
 #: Sections that a study's text leaves out if they have their default values.
 OMITTED = (
-    "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data", "calibrate",
-    "change",
+    "signal", "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data",
+    "calibrate", "change",
 )  # fmt: skip
 #: Largest number of realisations to which too few are raised.
 MOST_RAISED = 1_000_000
@@ -197,10 +197,10 @@ class Study(Section):
     change: questions.ChangeQuestion = questions.ChangeQuestion()
 
     def _check_values(self) -> None:
-        own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
-        if own and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
+        stars = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
+        if stars and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
             raise InputError(
-                f"only one of flare.photosphere_temperature_k and star.{own[0]}.effective_temperature_k may be given",
+                f"only one of flare.photosphere_temperature_k and star.{stars[0]}.effective_temperature_k may be given",
                 key="flare.photosphere_temperature_k",
             )
 
@@ -240,13 +240,10 @@ class Study(Section):
         >>> Study.of(star="M4V", magnitude=11, amplitude=0.05, exposure=2 * u.min)
         <Study of M4V V = 11; flares of 5 %; 120 s on mauve>
         """
-        count, where = Counter(entry.name for entry in keys_of()), "Study.of()"
-        # A name of several keys belongs to none of them.
-        named = {entry.name: entry for entry in keys_of() if count[entry.name] == 1}
-        given = values_of(keywords, named, where)
-        study = cls().paper() if given["paper"] else cls()
-        changes = changes_of(given, named, study.nuisances)
-        return study.with_changes(changes, stars_of(study.star, given, named, own=False), where)
+        count, where = Counter(keyword.name for keyword in keys_of()), "Study.of()"
+        # A name that several keys share is ambiguous.
+        accepted = {keyword.name: keyword for keyword in keys_of() if count[keyword.name] == 1}
+        return with_keywords(cls(), values_of(keywords, accepted, where), accepted, where, is_default=True)
 
     def ideal(self) -> Self:
         """Return a copy without the usual unknowns."""
@@ -269,14 +266,11 @@ class Study(Section):
         """Return a copy with other values, by sections such as "orbit.limits"; None leaves a value unchanged."""
         data = self.model_dump()
         for section, values in changes.items():
-            given = {key: value for key, value in values.items() if value is not None}
-            if section == "sky" and given:
+            changed = {key: value for key, value in values.items() if value is not None}
+            if section == "sky" and changed:
                 # A new sky replaces all keys of the old one.
                 data[section] = {}
-            place = data
-            for part in section.split("."):
-                place = place[part]
-            place.update(given)
+            reduce(getitem, section.split("."), data).update(changed)
         if stars is not None:
             data["star"] = stars
         return self.build(data, where)
@@ -285,13 +279,13 @@ class Study(Section):
         """Return a copy with keys set from text, such as ``run.fap=0.01`` or ``star.0.magnitude=6``."""
         data = self.model_dump(exclude_none=True)
         for text in settings:
-            path, equals, value = (part.strip() for part in text.partition("="))
+            path, equals, value = map(str.strip, text.partition("="))
             if not (path and equals):
                 raise InputError.of("setting", text, "key=value, such as run.fap=0.01")
-            named, parsed = f"value {shortened(value)}", dict[str, Any]()
-            files.check_keys(value, named)
-            # A bare word is text, as is one of several lines, which would define several keys.
-            with files.parsing(named, "give a TOML value"), contextlib.suppress(tomllib.TOMLDecodeError):
+            label, parsed = f"value {shortened(value)}", dict[str, Any]()
+            files.check_keys(value, label)
+            # A bare word is text, and so are several lines, which would define several keys.
+            with files.parsing(label, "give a TOML value"), contextlib.suppress(tomllib.TOMLDecodeError):
                 parsed = tomllib.loads(f"value = {value}")
             set_key(data, path.split("."), parsed["value"] if len(parsed) == 1 else value, text)
         return self.build(data, where)
@@ -305,19 +299,20 @@ class Study(Section):
         run = self.run
         if not 0 < run.fap < 1 or countable(run.fap, run.realisations):
             return self, []
-        least, wanted = least_countable(run.fap), f"thresholds with a false-alarm probability of {run.fap:g}"
-        few = f"{run.realisations} realisations are too few to count {wanted}, so "
+        least = least_countable(run.fap)
+        thresholds = f"thresholds with a false-alarm probability of {run.fap:g}"
+        few = f"{run.realisations} realisations are too few to count {thresholds}, so "
         if raised and least <= MOST_RAISED:
             return self.with_settings([f"run.realisations={least}"]), [f"{few}{least} are drawn."]
         if not sampled:
             return self, []
-        said = Message(f"{few}importance sampling finds them (`tails='sampled'`).", "sampled")
-        return self.with_settings(["run.tails=sampled"]), [said]
+        message = Message(f"{few}importance sampling finds them (`tails='sampled'`).", "sampled")
+        return self.with_settings(["run.tails=sampled"]), [message]
 
-    def _stated(self) -> dict[str, Any]:
+    def _text_data(self) -> dict[str, Any]:
         """Return the data of the study's text, without sections that have their default values."""
         data: dict[str, Any] = self.model_dump(exclude_none=True)
-        unused = {"sweep": not self.sweep.axes, "unknowns": not self.unknowns.draws, "signal": self.signal.snr is None}
+        unused = {"sweep": not self.sweep.axes, "unknowns": not self.unknowns.draws}
         fields = type(self).model_fields
         for name in [*data]:
             if unused.get(name) or (name in OMITTED and getattr(self, name) == fields[name].default):
@@ -341,7 +336,7 @@ class Study(Section):
         """Return the study as TOML, without sections that have their default values."""
         import tomli_w
 
-        return tomli_w.dumps(with_paths(self._stated(), lambda file: str(file.resolve())))
+        return tomli_w.dumps(with_paths(self._text_data(), lambda file: str(file.resolve())))
 
     def __repr__(self) -> str:
         o, swept = self.observation, [axis.quantity for axis in self.sweep.axes]
@@ -360,7 +355,7 @@ class Study(Section):
         """Return the study as TOML for an answer's table, with files by name and digest instead of their paths."""
         import tomli_w
 
-        data = self._stated()
+        data = self._text_data()
         for section in tables_in(data):
             for key, value in [*section.items()]:
                 if isinstance(value, Path):
@@ -392,7 +387,8 @@ class Study(Section):
             raise InputError.of("quantity", quantity, f"one of {', '.join(QUANTITIES)}")
         swept = QUANTITIES[quantity]
         if swept.range is not None:
-            value = number(quantity.replace("_", " "), value, swept.unit, swept.range)
+            kind = Annotated[float, Unit(swept.unit), swept.range]
+            value = checked(kind, quantity.replace("_", " "), value)
         return self.with_value(swept.path, value)
 
     @property
@@ -424,12 +420,15 @@ def study_keys() -> Mapping[str, FieldInfo]:
 
 
 @cache
-def keys_of(wanted: tuple[str, ...] = ("",)) -> tuple[Keyword, ...]:
+def keys_of(sections: tuple[str, ...] = ("",)) -> tuple[Keyword, ...]:
     """Return the keywords of keys and whole sections in their order, by default of all."""
-    every = [Keyword(key, field, flag) for key, field in study_keys().items() for flag in found(field, Flag)]
-    each = [[entry for entry in every if f"{entry.path}.".startswith(f"{name}." if name else "")] for name in wanted]
-    assert all(each), wanted
-    return tuple(chain.from_iterable(each))
+    return tuple(
+        Keyword(key, field, flag)
+        for section in sections
+        for key, field in study_keys().items()
+        if not section or f"{key}.".startswith(f"{section}.")
+        for flag in metadata_of(field, Flag)
+    )
 
 
 class Keyword(NamedTuple):
@@ -455,123 +454,140 @@ class Keyword(NamedTuple):
         return get_origin(self.kind) is list
 
     @property
-    def each(self) -> Any:
+    def item_kind(self) -> Any:
         """Type of one of its values on the command line."""
         return get_args(self.kind)[0] if self.many else self.kind
 
-    def value(self, given: Any) -> Any:
+    def value(self, value: Any) -> Any:
         """Convert a value to that of the key, unless it has parts of its own, as in Python."""
-        parts = given if self.many else [given]
-        if self.flag.read is None or not all(isinstance(part, str | int | float | Path) for part in parts):
-            return given
-        return self.flag.read(given, self.name)
+        items = value if self.many else [value]
+        if self.flag.read is None or not all(isinstance(item, str | int | float | Path) for item in items):
+            return value
+        return self.flag.read(value, self.name)
 
 
-def values_of(given: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
+def plain_kind(annotation: Any) -> Any:
+    """Return the type of a keyword's value: a plain type, or a list for a field of several values."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return plain_kind(arguments[0])
+    if origin is tuple:
+        return list[plain_kind(arguments[0])]  # type: ignore[misc]
+    if origin in (Union, UnionType):
+        kinds = {plain_kind(kind) for kind in arguments if kind is not NoneType}
+        # A field for a number or a word takes text.
+        return kinds.pop() if len(kinds) == 1 else str
+    return str if origin is Literal else annotation
+
+
+def values_of(values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
     """Return the value of each keyword, None where it is not given, and of ``paper``.
 
     Raises InputError for a keyword of another name; ``ideal`` is another form of ``with_unknowns``, and ``paper`` needs
     an instrument.
     """
-    others = {"paper": "instrument", "ideal": "with_unknowns"}
-    known = [*keywords, *(name for name, needed in others.items() if needed in keywords)]
-    for name in given.keys() - known:
-        keys = [keyword for keyword, of in keywords.items() if of.path.rpartition(".")[2] == name]
-        close = keys or get_close_matches(name, known, n=3) or known
-        raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(close)}")
-    values = {name: given.get(name) for name in keywords}
-    for name, value in values.items():
+    forms = {"paper": "instrument", "ideal": "with_unknowns"}
+    accepted = [*keywords, *(name for name, needed in forms.items() if needed in keywords)]
+    for name in values.keys() - accepted:
+        same_key = [word for word, keyword in keywords.items() if keyword.path.rpartition(".")[2] == name]
+        near = same_key or get_close_matches(name, accepted, n=3) or accepted
+        raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(near)}")
+    by_name = {name: values.get(name) for name in keywords}
+    for name, value in by_name.items():
         if keywords[name].many and value is not None and not isinstance(value, Mapping):
             # Neither a sequence nor an array.
-            single = isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")
-            values[name] = [value] if single else list(value)
-    if given.get("ideal"):
-        values["with_unknowns"] = False
-    return values | {"paper": given.get("paper")}
+            is_single = isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")
+            by_name[name] = [value] if is_single else list(value)
+    if values.get("ideal"):
+        by_name["with_unknowns"] = False
+    return by_name | {"paper": values.get("paper")}
 
 
-def plain_kind(annotation: Any) -> Any:
-    """Return the type of a keyword's value: a plain type, or a list for a field of several values."""
-    origin, parts = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        return plain_kind(parts[0])
-    if origin is tuple:
-        return list[plain_kind(parts[0])]  # type: ignore[misc]
-    if origin in (Union, UnionType):
-        kinds = {plain_kind(part) for part in parts if part is not NoneType}
-        # A number or a word is text.
-        return kinds.pop() if len(kinds) == 1 else str
-    return str if origin is Literal else annotation
+StudyOf = TypeVar("StudyOf", bound=Study)
 
 
-def changes_of(
-    given: Mapping[str, Any], keywords: Mapping[str, Keyword], nuisances: NuisanceChoice
-) -> dict[str, dict[str, Any]]:
-    """Return the values that keywords set, by sections of the study; stars have their own function."""
+def with_keywords(
+    study: StudyOf, values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str, *, is_default: bool
+) -> StudyOf:
+    """Return a study changed by the values of keywords, as `values_of` returns them.
+
+    If the study `is_default`, keywords that describe a star must come with one that names it.
+    """
+    if values.get("paper"):
+        study = study.paper()
     changes: dict[str, dict[str, Any]] = {}
-    flags: dict[str, str] = {}
+    names: dict[str, str] = {}
     for name, keyword in keywords.items():
         section, _, key = keyword.path.rpartition(".")
-        if given[name] is None or section == "star" or name == "nuisance":
+        if values[name] is None or section == "star" or name == "nuisance":
             continue
-        other = flags.setdefault(keyword.path, name)
-        if other != name:
-            raise InputError(f"give either `{other}` or `{name}`: both set {keyword.path}", key=other)
-        changes.setdefault(section, {})[key] = keyword.value(given[name])
-    if spreads := given.get("nuisance"):
-        # Texts such as dark=0.1, or with the name of a file, stray.txt=free.
-        expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
-        if not isinstance(spreads, Mapping):
-            spreads = dict(read_assignment(text, "nuisance", expected) for text in spreads)
-        files = {
-            Path(name).stem: {"file": Path(name), "sd": sd} for name, sd in spreads.items() if name not in NUISANCES
-        }
-        own = {name: choice.model_dump(exclude_none=True) for name, choice in nuisances.own.items()} | files
-        named = {name: sd for name, sd in spreads.items() if name in NUISANCES}
-        changes.setdefault("nuisances", {}).update(named | ({"own": own} if own else {}))
-    return changes
+        first_name = names.setdefault(keyword.path, name)
+        if first_name != name:
+            raise InputError(f"give either `{first_name}` or `{name}`: both set {keyword.path}", key=first_name)
+        changes.setdefault(section, {})[key] = keyword.value(values[name])
+    if spreads := values.get("nuisance"):
+        changes.setdefault("nuisances", {}).update(_nuisances(spreads, study.nuisances))
+    stars = _stars(study.star, values, keywords, is_default=is_default) if "star" in keywords else None
+    return study.with_changes(changes, stars, where)
 
 
-def stars_of(
-    stars: Sequence[Star], given: Mapping[str, Any], keywords: Mapping[str, Keyword], *, own: bool
+def _nuisances(spreads: Any, nuisances: NuisanceChoice) -> dict[str, Any]:
+    """Return the keys of nuisances that are set by texts such as dark=0.1 or, for a file, stray.txt=free."""
+    expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
+    if not isinstance(spreads, Mapping):
+        spreads = dict(read_assignment(text, "nuisance", expected) for text in spreads)
+    of_files = {
+        Path(name).stem: {"file": Path(name), "sd": sd} for name, sd in spreads.items() if name not in NUISANCES
+    }
+    own = {name: nuisance.model_dump(exclude_none=True) for name, nuisance in nuisances.own.items()} | of_files
+    return {name: sd for name, sd in spreads.items() if name in NUISANCES} | ({"own": own} if own else {})
+
+
+def _stars(
+    stars: Sequence[Star], values: Mapping[str, Any], keywords: Mapping[str, Keyword], *, is_default: bool
 ) -> list[dict[str, Any]] | None:
-    """Return the data of the stars that keywords name or change, or None; `own`: the user's study has `stars`."""
-    if "star" not in given:
+    """Return the data of the stars that keywords name or change, or None without such keywords."""
+    described = [
+        name for name, keyword in keywords.items() if keyword.path.startswith("star.") and values[name] is not None
+    ]
+    names, magnitudes = values["star"], values["magnitude"]
+    changes = {
+        keywords[name].path.removeprefix("star."): values[name]
+        for name in described
+        if name not in ("star", "magnitude")
+    }
+    if not (names or magnitudes or changes):
         return None
-    names, magnitudes = given["star"], given["magnitude"]
-    described = [name for name, of in keywords.items() if of.path.startswith("star.") and given[name] is not None]
-    others = [name for name in described if name not in ("star", "magnitude")]
-    changed = {keywords[name].path.removeprefix("star."): given[name] for name in others}
-    of_files = [key for key in changed if key in FILE_KEYS]
-    if not (names or magnitudes or changed):
-        return None
-    if not (names or own):
-        # Those of the default study are not meant.
+    if is_default and not names:
         fault = f"`{described[0]}` needs a star, such as `star='M3V'`; `mauvecl library` lists them"
         raise InputError(fault, key="star")
-    if names:
-        # A name of an existing file is a file; other names are searched for in the library.
-        each = [star for name in names for star in ([name] if is_there(name) else map(str.strip, name.split(",")))]
-        data: list[dict[str, Any]] = []
-        for name in each:
-            # "K2.5V" and "power law -1.5" look like file names but are stars.
-            suffix = Path(name).suffix[1:]
-            is_file = is_there(name) or (bool(suffix) and not suffix.isupper() and resolve(name) is None)
-            data.append({"file" if is_file else "library": name})
-    else:
-        data = [entry.model_dump(exclude_none=True) for entry in stars]
+    data = _named_stars(names) if names else [star.model_dump(exclude_none=True) for star in stars]
     if magnitudes:
         if len(magnitudes) not in (1, len(data)):
-            of = "one star" if len(data) == 1 else f"{len(data)} stars"
-            fault = f"there are {len(magnitudes)} magnitudes for {of}; give one for all or one each"
+            count = "one star" if len(data) == 1 else f"{len(data)} stars"
+            fault = f"there are {len(magnitudes)} magnitudes for {count}; give one for all or one each"
             raise InputError(fault, key="magnitude")
-        for entry, value in zip(data, magnitudes * (len(data) if len(magnitudes) == 1 else 1), strict=True):
-            entry["magnitude"] = value
-    if of_files and not any("file" in entry for entry in data):
-        named = " and ".join(f"`{key}`" for key in of_files)
-        raise InputError(f"{named} needs a spectrum file among the stars: `star='my-star.txt'`", key=of_files[0])
-    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
-    return [entry | (changed if "file" in entry else same) for entry in data]
+        for star, magnitude in zip(data, magnitudes * (len(data) if len(magnitudes) == 1 else 1), strict=True):
+            star["magnitude"] = magnitude
+    of_files = [key for key in changes if key in FILE_KEYS]
+    if of_files and not any("file" in star for star in data):
+        needing = " and ".join(f"`{key}`" for key in of_files)
+        raise InputError(f"{needing} needs a spectrum file among the stars: `star='my-star.txt'`", key=of_files[0])
+    of_library = {key: value for key, value in changes.items() if key not in FILE_KEYS}
+    return [star | (changes if "file" in star else of_library) for star in data]
+
+
+def _named_stars(texts: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the data of stars from names of the library with commas between them, and names of files."""
+    # A name of an existing file is a file; other names are searched for in the library.
+    names = [name for text in texts for name in ([text] if is_there(text) else map(str.strip, text.split(",")))]
+    stars: list[dict[str, Any]] = []
+    for name in names:
+        # "K2.5V" and "power law -1.5" look like file names but are stars.
+        suffix = Path(name).suffix[1:]
+        is_file = is_there(name) or (bool(suffix) and not suffix.isupper() and resolve(name) is None)
+        stars.append({"file" if is_file else "library": name})
+    return stars
 
 
 def is_there(name: str) -> bool:

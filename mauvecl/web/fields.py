@@ -26,7 +26,7 @@ from mauvecl.schema.fields import (
     Widget,
     as_typed,
     first,
-    found,
+    metadata_of,
     range_of,
     with_unit,
 )
@@ -328,7 +328,7 @@ _OWN_FIELDS = {
 _KEYS = {
     widget.name or key.rpartition(".")[2]: _field(tuple(key.split(".")), field, widget)
     for key, field in study_keys().items()
-    for widget in found(field, Widget)
+    for widget in metadata_of(field, Widget)
 }
 #: Fields by name, as in links and in `Question`; the default is a flare at the edge of detection.
 FIELDS = dict(sorted((_OWN_FIELDS | _KEYS).items(), key=lambda item: item[1].place))

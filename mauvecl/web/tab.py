@@ -23,7 +23,7 @@ from mauvecl.answers.files import write_table
 from mauvecl.answers.verbs import VERBS, Progress
 from mauvecl.schema.columns import View
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, found
+from mauvecl.schema.fields import Flag, metadata_of
 from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
 from mauvecl.study.star import Star
 from mauvecl.study.study import Study, keys_of, set_key, with_paths
@@ -223,7 +223,7 @@ def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[
     for key, own_field in type(new).model_fields.items():
         name, values = f"{path}{key}", (getattr(new, key), getattr(old, key))
         # A new sky replaces all keys of the old one, and so does a section with a flag of its own.
-        whole = name == "sky" or bool(found(own_field, Flag))
+        whole = name == "sky" or bool(metadata_of(own_field, Flag))
         if isinstance(values[0], BaseModel) and isinstance(values[1], BaseModel) and not whole:
             yield from differing(*values, f"{name}.")
         elif values[0] is not None and (values[0] != values[1] or name in STATED):

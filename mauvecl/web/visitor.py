@@ -31,7 +31,7 @@ from mauvecl.host import VERSION
 from mauvecl.observations.frame_files import ColumnNames
 from mauvecl.runs.checkpoint import Stopped
 from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.schema.errors import InputError, reworded, shortened
+from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import SIMULATIONS, TABS, State, card, known, reads_of
@@ -303,7 +303,7 @@ class Visitor(WebSocketHandler):
             try:
                 given = tab.given(question) if tab.needs in question.uploads else {}
             except InputError as error:
-                raise reworded(error, str(error), tab.needs) from error
+                raise InputError(str(error), key=tab.needs or error.key) from error
             RESULTS.keep(self, "given", key, given)
         return given
 

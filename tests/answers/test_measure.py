@@ -227,3 +227,11 @@ def test_gaussian_answers_for_what_is_stated(magnitude: float | None, exposure: 
     assert set(table["star"]) == {f"G2V V = {v:g}" for v in magnitudes}
     assert ("magnitude" in table.colnames) == (magnitude is None)
     assert sorted(set(table["exposure"].value.tolist())) == ([5, 50, 600] if exposure is None else [exposure])
+
+
+def test_gaussian_asks_a_study_as_it_is(engine: Engine) -> None:
+    """Sweep nothing that a study does not: only the verb's own question has a default sweep."""
+    few = ("run.realisations=10_000", "run.fap=0.01")
+    one, two = (gaussian(study, engine).cells for study in (drawn_study(*few), Study().with_settings(few)))
+    assert (one["star"].tolist(), len(two)) == (["M3V V = 7"], 2)
+    assert not {"magnitude", "exposure"} & {*one.colnames, *two.colnames}

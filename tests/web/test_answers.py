@@ -18,7 +18,7 @@ from study_keys import ends, outside
 
 from tests.web.visits import Server, Talk, column, link
 
-NUMBER = r"(-?[\d.]+(?:e[+-]\d+)?)"
+NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 M_DWARF = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2", "exposure_s": "50"}
 DATA = Path(__file__).parents[1] / "data" / "web"
