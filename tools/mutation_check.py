@@ -440,7 +440,10 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "starts of frames taken for their ends": (
         "test_files_are_read_as_they_say[times keywords of scale and place fits9]",
-        ("made.shifted((0.5 - dates.at) * made.exposure_s)", "made.shifted((dates.at - 0.5) * made.exposure_s)"),
+        (
+            "frames.shifted((0.5 - system.at) * frames.exposure_s)",
+            "frames.shifted((system.at - 0.5) * frames.exposure_s)",
+        ),
     ),
     "days taken for seconds": (
         "test_files_are_read_as_they_say[extensions names that need no mapping fits1]",

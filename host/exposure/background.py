@@ -430,14 +430,14 @@ def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Floa
         return _from_positions(table, ra, dec, own, target), ()
     name = table.first(SEPARATIONS)
     if name is None:
-        fault, key = f"{table.named} has the columns {shown(', '.join(table.names), 300)}", "neighbours"
+        fault, key = f"{table.label} has the columns {shown(', '.join(table.names), 300)}", "neighbours"
         needed = "ra and dec"
         if ra is not None:
             fault, key = f"{fault} and no position of the star itself", "neighbours_of"
             needed = "star.neighbours_of: the star's own row by name, or its coordinates"
         raise InputError(f"{fault}, but needs separation (arcsec), or {needed}", key=key)
     if target is not None and own is None:
-        fault = f"{table.named} has no row named {shortened(target)}, and no positions"
+        fault = f"{table.label} has no row named {shortened(target)}, and no positions"
         raise InputError(f"{fault}; give the name of a row, which is then left out", key="neighbours_of")
     stated, key = getattr(table.table[name], "unit", None) is not None, names.key_of(name)
     if not stated and key == "_r":
@@ -451,7 +451,7 @@ def _separations(table: Rows, own: int | None, target: str | None) -> tuple[Floa
         return values, ()
     # ADQL's DISTANCE is in degrees.
     return values * 3600.0, (
-        f"Separations are the column {name} of {table.named}, read as degrees since it states no unit.",
+        f"Separations are the column {name} of {table.label}, read as degrees since it states no unit.",
     )
 
 
@@ -467,7 +467,7 @@ def _from_positions(table: Rows, ra: str, dec: str, own: int | None, target: str
         try:
             position = parse_position(target)
         except InputError as error:
-            fault = f"{table.named} has no row named {shortened(target)}, and it is not a position"
+            fault = f"{table.label} has no row named {shortened(target)}, and it is not a position"
             remedy = "give the name of the star's own row, or coordinates such as '290.68 +11.12'"
             raise InputError(f"{fault}; {remedy}", key="neighbours_of") from error
         place = float(position.ra.rad), float(position.dec.rad)
