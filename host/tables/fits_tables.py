@@ -323,7 +323,7 @@ class FitsTables(TableFile):
     """
 
     def __init__(
-        self, hdus: fits.HDUList, label: str, name: str | None = None, groups: tuple[tuple[str, ...], ...] = ()
+        self, hdus: fits.HDUList, label: str, name: str | None = None, groups: Sequence[Sequence[str]] = ()
     ) -> None:
         self.hdus = hdus
         self.tables = [k for k, hdu in enumerate(hdus) if hasattr(hdu, "columns") and not hdu.is_image]

@@ -97,7 +97,7 @@ ROUNDING = 1.0 / 12.0
 #: Iterations of the weights, which follow the fitted variances.
 ITERATIONS = 20
 #: Difference of chi-squared above which the unit of the dark counts is determined (5 %).
-TELLS = 3.84
+MIN_CHI2_DIFFERENCE = 3.84
 #: Smallest S/N of the gain with which it is reported.
 MIN_SNR = 5.0
 #: Relative error of a gain that is not measured: the rms deviation of the quoted 20 to 25 uV per electron from 20.
@@ -203,7 +203,7 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     fits = {"DN": _fit(light, dark, variance, dof), "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof)}
     better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
     assumed: tuple[str, ...] = ("unit of the dark counts",)
-    if abs(better) > TELLS:
+    if abs(better) > MIN_CHI2_DIFFERENCE:
         unit, assumed = "electrons" if better > 0 else "DN", ()
     (read, gain), covariance, chi2, model = fits[unit]
     errors = np.sqrt(np.diag(covariance))

@@ -30,7 +30,7 @@ from mauvecl.host.tables.table import (
 )
 from mauvecl.host.tables.units import is_dated, unit_and_medium, vacuum_wavelengths
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits
-from mauvecl.observations.mapping import KNOWN, FrameMapping, recognised, times_of
+from mauvecl.observations.mapping import COLUMN_NAMES, FrameMapping, recognised, times_of
 from mauvecl.observations.stored_frames import (
     FolderFile,
     Light,
@@ -52,8 +52,8 @@ GROUPS = ("band", "filter", "filt", "passband", "bandpass", "filtercode", "phot_
 FLAGS = {"flag", "flags", "rejected", "quality", "qual", "dq", "status", "event", "mask"}
 #: Units in which light is given as a deviation from its level, as TASOC does.
 PARTS_OF_LEVEL = {"%": 1e-2, "percent": 1e-2, "ppt": 1e-3, "ppm": 1e-6, "ppb": 1e-9}
-#: Standard errors by which a level is above zero.
-SURE = 5.0
+#: Smallest ratio of a level to its standard error from which it is above zero.
+MIN_LEVEL_SNR = 5.0
 
 
 @validated
@@ -203,7 +203,8 @@ def _opened(
 ) -> AbstractContextManager[TableFile]:
     """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
     # The chosen table has a column of each group of names.
-    groups = (KNOWN["time"], KNOWN["flux"]) if places is None else tuple((title,) for title in places.times)
+    usual = [COLUMN_NAMES["time"], COLUMN_NAMES["flux"]]
+    groups = usual if places is None else [(title,) for title in places.times]
 
     def of_fits(hdus: Any, label: str) -> TableFile:
         return stored_in_fits(FitsTables(hdus, label), name) or FitsTables(hdus, label, name, groups)
@@ -369,7 +370,7 @@ def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float |
     if share is not None and finite[finite.size // 10] < 0.0:
         remarks = [f"its light is a deviation from its level in {unit}, and is read as a multiple of the level"]
         return 1.0 + share * light, None if sd is None else share * sd, "", remarks
-    if level > SURE * float(finite.std()) / np.sqrt(finite.size):
+    if level > MIN_LEVEL_SNR * float(finite.std()) / np.sqrt(finite.size):
         return light, sd, unit, []
     remarks = [f"the mean of its light is {level:.3g}, not significantly above zero, as after a level or an image is "
             "subtracted: amplitudes and equivalent durations relative to it mean nothing"]  # fmt: skip

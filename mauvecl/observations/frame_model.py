@@ -27,7 +27,7 @@ LEAST_OF_OFFSET = 0.5
 MAX_OFFSET = 0.5
 #: Largest relative difference between exposure times.
 SAME_EXPOSURE = 0.01
-#: Level beyond every count, for pixels whose saturation was dealt with before.
+#: Level above all counts, for pixels whose saturation is excluded before.
 NO_CEILING_DN = 2**31 - 1
 
 
@@ -82,7 +82,7 @@ class FrameModel:
         if unit != "adu":
             return cls(quiet, flare, bins, per_dn / exposure, False)
         raw = cls(quiet, flare, bins, per_dn, True)
-        # Light is added to bias and dark current: where a pixel has far less than these, they were subtracted.
+        # Where a pixel has far less light than bias and dark current, these were subtracted.
         included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
         return raw if included.all() else replace(raw, raw=False)
 
@@ -160,14 +160,14 @@ def _matched(wavelengths: Float, instrument_nm: Float) -> NDArray[np.intp] | Non
     nearest = np.array([int(np.argmin(np.abs(instrument_nm - nm))) for nm in wavelengths])
     step = float(np.median(np.diff(instrument_nm)))
     same = np.abs(instrument_nm[nearest] - wavelengths) < MAX_OFFSET * step
-    # Wavelengths of pixels are those of elements only where pixels are as wide.
+    # Pixels and elements correspond only if they have the same width.
     alike = wavelengths.size < 2 or abs(float(np.median(np.diff(wavelengths))) / step - 1.0) < MAX_OFFSET
     return nearest if same.all() and alike and np.unique(nearest).size == nearest.size else None
 
 
 #: Numbers of frames before and after a change whose means are compared.
 WIDTHS = (2, 4, 8, 16, 32, 64)
-#: Expected number of changes that noise feigns in a light curve.
+#: Expected number of false changes in a light curve, due to noise.
 CHANCE = 0.001
 #: Fall of chi-squared by which one cause must fit better than another: 3 standard deviations for one parameter.
 CLEARLY = 9.0
@@ -230,7 +230,7 @@ def light_changes(
     return sorted(changes, key=lambda change: change.frame)
 
 
-#: Expected number of values of normal noise in all frames that are mistaken for cosmic rays.
+#: Expected number of values in all frames that are mistaken for cosmic rays in normal noise.
 CHANCE_RAYS = 0.01
 #: Flares that explain the light of many pixels at once, K; their residual in one pixel of one frame is a cosmic ray.
 RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
@@ -287,7 +287,7 @@ def _replace_rays(
 ) -> NDArray[np.int64]:
     """Replace bad values in some frames of `flux`, in place, and return their number in each of these frames."""
     excess = flux[at] - light
-    # Measured robustly, so that a wrong statement makes no rays.
+    # A robust measurement, so that errors that are stated too small make no rays.
     scatter = PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0)
     sd = np.maximum(noise, scatter)
     spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
@@ -299,7 +299,7 @@ def _replace_rays(
         fit = (excess[rows] / sd) @ basis.T @ basis * sd
         residual = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
         residual[bad[rows]] = 0.0
-        # The farthest alone: a large one moves the fit away from the others.
+        # Only the largest residual is replaced, since it moves the fit away from the other pixels.
         worst = residual.argmax(axis=1)
         far = residual[np.arange(rows.size), worst] > limit
         bad[rows[far], worst[far]] = True

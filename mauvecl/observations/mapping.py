@@ -107,7 +107,7 @@ class FrameMapping(Record):
 
 #: Names of columns that need no mapping, in order of preference, in any case: those of mauvecl, of the pipelines of
 #: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor, TASOC and gPhoton.
-KNOWN = {
+COLUMN_NAMES = {
     "time": ("time",),
     "flux": ("flux_bgsub", "flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux",
              "fcor", "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux",
@@ -118,8 +118,8 @@ KNOWN = {
 }  # fmt: skip
 #: Names of times where no column is called time and none is named after its dates, such as BJD.
 OTHER_TIMES = ("t", "date", "datetime", "timestamp", "date-obs", "date_obs", "utc", "ut")
-#: Part of a frame that times refer to.
-PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
+#: Places in a frame that times refer to, as a part of its exposure.
+PLACES_IN_FRAME = {"start": 0.0, "middle": 0.5, "end": 1.0}
 #: Dates of observed light, MJD, from 1845 to 2269.
 DATES_MJD = (-5000.0, 150_000.0)
 #: Columns of files that state no unit of their times, these times, and words for them: Gaia DR3's epoch photometry, BJD
@@ -142,7 +142,7 @@ def recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
     # FITS files also have images, and columns of other extensions, which do not count.
     names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
-    columns: dict[str, Any] = {key: first_of(usual, names, file.label) for key, usual in KNOWN.items()}
+    columns: dict[str, Any] = {key: first_of(usual, names, file.label) for key, usual in COLUMN_NAMES.items()}
     if columns["time"] is None:
         times = {name: time for name in names if (time := units.time_in_name(name)) is not None}
         dated = [name for name, time in times.items() if time.epoch_mjd is not None]
@@ -216,7 +216,7 @@ def times_of(
     first = first if np.isfinite(first) else 0.0
     # Days since a date far in the past lose digits as seconds: subtract before the unit is changed.
     seconds, first_d = np.asarray(((middles - first) * unit).to_value(u.s)), float((first * unit).to_value(u.s)) / DAY_S
-    at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", header.at)
+    at = 0.5 if len(edges) == 2 else PLACES_IN_FRAME.get(mapping.time_at or "", header.at)
     if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
         span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))
         remarks.append(f"the times of {label} have no date, although their unit, name or header says so: {span}")

@@ -149,7 +149,7 @@ def survey_spectra(
     for _ in range(ROUNDS):
         series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
         lit, level = np.maximum(series.light, 0.0), float(np.median(flux[used & ~events]))
-        # Frames without light, such as dark frames, have no photon noise to weight by.
+        # Frames without light, such as dark frames, have no photon noise that could weight the gains.
         photon = float(np.average(cleaned.model.gain, weights=lit if lit.any() else None))
         # The noise of the sums follows that of the whole light in time.
         survey = SeriesSurvey.of(frames, flux, error**2, used, level, photon, shape, weighted=(templates, sums))

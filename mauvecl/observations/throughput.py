@@ -28,7 +28,7 @@ from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.detector import CalibrationFrames, DarkFit, GoodnessOfFit, PhotonTransfer
 from mauvecl.schema.errors import InputError
 
-#: Knots of the errors of a star's spectrum, and their relative size if one star alone cannot tell: an assumption.
+#: Knots of the errors of a star's spectrum, and their assumed relative size if only one star is observed.
 ERROR_KNOTS, ONE_STAR_ERROR = 12, 0.10
 #: Probability of chi-squared below which errors of the stars' spectra are fitted.
 REJECTED = 0.01
@@ -36,7 +36,7 @@ REJECTED = 0.01
 WIDTHS = (1.0, 0.9, 1.1)
 #: Steps of wavelength, nm, and of the relative width for derivatives.
 STEP_NM, STEP_WIDTH = 0.2, 0.05
-#: Largest fitted shift and stretch, nm, and relative change of the line's width, beyond which nothing is linear.
+#: Largest fitted shift and stretch, nm, and relative change of the line's width, up to which the problem is linear.
 LIMITS = np.array([5.0, 5.0, 0.3, 0.3])
 #: Largest number of iterations, and the change of log throughput at which they end.
 ITERATIONS, SETTLED = 50, 1e-5
