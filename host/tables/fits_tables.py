@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.tables import table
 from mauvecl.host.tables.files import check_content, limit_bytes, reading
-from mauvecl.host.tables.names import matched, text_at
+from mauvecl.host.tables.names import match_name, text_at
 from mauvecl.host.tables.table import TableFile, Values, number_in
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
@@ -79,7 +79,7 @@ def check_sizes(file: IO[bytes]) -> None:
 def open_fits(file: IO[bytes], label: str = "", *, check: bool = True) -> fits.HDUList:
     """Open a FITS file after a check of its sizes and checksums; its data are read on access.
 
-    To `check` the checksums the whole file is read. `what` is the file, for messages.
+    To `check` the checksums, the whole file is read. Messages name the file by its label.
     """
     from astropy.io import fits
 
@@ -422,7 +422,7 @@ class FitsTables(TableFile):
     def column(self, number: int, name: str) -> Values | None:
         """Return a column of the table in an extension, or None."""
         hdu = self.hdus[number]
-        title = matched(name, map(str, hdu.columns.names), self.label)
+        title = match_name(name, map(str, hdu.columns.names), self.label)
         if title is None:
             return None
         column = hdu.columns[title]

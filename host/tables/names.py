@@ -101,7 +101,7 @@ def key_of(name: str) -> str:
     return re.sub(r"[\s_]+", "_", name.strip().strip("\"'").casefold())
 
 
-def matched(name: str, names: Iterable[str], label: str = "") -> str | None:
+def match_name(name: str, names: Iterable[str], label: str = "") -> str | None:
     """Return the name that a text means, in any case, or None; raise InputError if several differ in case only."""
     fitting = [title for title in names if title.strip().casefold() == name.strip().casefold()]
     if name in fitting:

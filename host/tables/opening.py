@@ -16,7 +16,7 @@ import numpy as np
 
 from mauvecl.host.tables import files
 from mauvecl.host.tables.fits_tables import WHOLE, FitsTables, open_fits
-from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.names import match_name
 from mauvecl.host.tables.table import REMARKS, MemoryTable, TableFile, Values
 from mauvecl.host.tables.text_tables import Layout, rows_of_text, text_table
 from mauvecl.schema.errors import InputError, shortened
@@ -66,7 +66,7 @@ class LargeTable(TableFile):
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
-        title = matched(name, self.names, self.label)
+        title = match_name(name, self.names, self.label)
         if title is None:
             return None
         # A copy, since a view of a column would keep all columns of the piece in memory.
@@ -184,9 +184,9 @@ def open_table(
 ) -> Iterator[TableFile]:
     """Open the table in a file: text, ECSV, FITS or VOTable, packed by gzip, bzip2 or xz or not.
 
-    For messages, `what` and `kind` are the file and its kind. A FITS file that can be read whole has its checksums
+    For messages, `label` and `kind` are the file and its kind. A FITS file that can be read whole has its checksums
     verified (`check`). A `large` file, which can be read in pieces, may exceed MAUVECL_LARGEST_FILE_MIB. Functions of
-    the open file and of `what` make tables of FITS (`of_fits`, by default of the first table) and HDF5 (`of_hdf5`).
+    the open file and of `label` make tables of FITS (`of_fits`, by default of the first table) and HDF5 (`of_hdf5`).
     """
     commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
     with open_content(path, label, kind, large=large) as (form, content):
@@ -197,7 +197,7 @@ def open_table(
             with open_fits(content, label, check=check) as hdus:
                 with files.reading(label, WHOLE):
                     table = of_fits(hdus, label)
-                yield _filled(table)
+                yield _check_rows(table)
         elif form == "HDF5" and of_hdf5 is not None:
             with of_hdf5(content, label) as stored:
                 yield stored
@@ -207,9 +207,9 @@ def open_table(
         elif form == "VOTable":
             if (first := next(votables(content.read(), label), None)) is None:
                 raise InputError(f"{label} has no table, but needs one", key="file")
-            yield _filled(first)
+            yield _check_rows(first)
         else:
-            yield _filled(MemoryTable(text_table(text_in(form, content.read(), label), label, commas), label))
+            yield _check_rows(MemoryTable(text_table(text_in(form, content.read(), label), label, commas), label))
 
 
 #: Forms of files that are not read, by their first bytes.
@@ -282,7 +282,7 @@ def _parameters(parameters: Iterable[Any]) -> dict[str, Any]:
     return {str(parameter.name or parameter.ID): parameter.value for parameter in parameters}
 
 
-def _filled(file: TableFile) -> TableFile:
+def _check_rows(file: TableFile) -> TableFile:
     """Return a file; raise InputError if it has no rows."""
     if not file.names:
         fault = f"{file.label} has no table and no image"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.tables.names import ANGLES, angle, angle_unit, divided_unit, first_of, is_missing, key_of, matched
+from mauvecl.host.tables.names import ANGLES, angle, angle_unit, divided_unit, first_of, is_missing, key_of, match_name
 from mauvecl.host.tables.units import time_unit, unit_of
 from mauvecl.schema.errors import InputError, printable, shortened
 
@@ -186,7 +186,7 @@ def _plain(text: Any) -> str:
     return (text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)).strip()
 
 
-def converted(values: Values, mapped_unit: str | None, unit: str, key: str) -> Values:
+def convert(values: Values, mapped_unit: str | None, unit: str, key: str) -> Values:
     """Return values in a unit; that of a mapping, under `key`, takes precedence over that of the file."""
     import astropy.units as u
 
@@ -303,7 +303,7 @@ class MemoryTable(TableFile):
         """Return a column."""
         from astropy.time import Time, TimeDelta
 
-        title = matched(name, self.names, self.label)
+        title = match_name(name, self.names, self.label)
         if title is None:
             return None
         column = self.table[title]

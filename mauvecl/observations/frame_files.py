@@ -23,7 +23,7 @@ from mauvecl.host.tables.table import (
     MemoryTable,
     TableFile,
     Values,
-    converted,
+    convert,
     marks_in,
     unit_in,
     without_indefinite,
@@ -37,9 +37,9 @@ from mauvecl.observations.stored_frames import (
     PixelStatistics,
     StoredFile,
     open_stored,
+    read_light,
     stored_in_fits,
     weighted_sums,
-    whole_or_reduced,
 )
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
@@ -85,7 +85,7 @@ def read_frames(
         Whether spectra of `mauvecl realise` keep bias and dark current, which are subtracted otherwise. Others are as
         their file has them.
     """
-    with _frame_file(path, mapping, check=not ignore_checksum, raw=raw) as (file, places, stem):
+    with _open_frames(path, mapping, check=not ignore_checksum, raw=raw) as (file, places, stem):
         if quality_bits is not None:
             places = places.model_copy(update={"quality_bits": quality_bits})
         return _frames_in(file, _quantities(file, places), places, stem)
@@ -149,13 +149,13 @@ def reduce_frames(
         Weights of the pixels, in the order of the file; by default the sum over all pixels.
     mapping : FrameMapping or path, optional
     """
-    with _frame_file(path, mapping) as (file, places, stem):
+    with _open_frames(path, mapping) as (file, places, stem):
         quantities = _quantities(file, places)
-        _, flux, error, _ = _light(quantities, places)
+        _, flux, error, _ = _linear_light(quantities, places)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.label)
-        quality = _masked(quantities.get("quality"), QualityBits.of(file.header, places.quality_bits, file.label))
-        lights, pixels = weighted_sums(flux, error, quality, weights)
+        bits = QualityBits.of(file.header, places.quality_bits, file.label)
+        lights, pixels = weighted_sums(flux, error, _excluding_bits(quantities.get("quality"), bits), weights)
         return ReducedFrames(tuple(_frames_in(file, quantities, places, stem, light) for light in lights), pixels)
 
 
@@ -169,12 +169,12 @@ class ColumnNames:
     def read(cls, path: str | Path) -> ColumnNames:
         """Read the names of a table in a file."""
         place, words = without_columns(path)
-        with parsing(f"file {place.name!r}", FORMATS), _opened(place, words[0] if words else None) as file:
+        with parsing(f"file {place.name!r}", FORMATS), _open_file(place, words[0] if words else None) as file:
             return cls(tuple(file.names))
 
 
 @contextmanager
-def _frame_file(
+def _open_frames(
     path: str | Path, mapping: FrameMapping | str | Path | None, check: bool = True, raw: bool = False
 ) -> Iterator[tuple[TableFile, FrameMapping, str]]:
     """Open a file, folder or store; yield it with the places of its quantities and its name without extension."""
@@ -185,20 +185,20 @@ def _frame_file(
         label = f"folder {place.name!r}"
         opened: AbstractContextManager[TableFile]
         if not place.is_dir():
-            opened = _opened(place, name, places, check, large=True)
+            opened = _open_file(place, name, places, check, large=True)
         elif (place / "zarr.json").is_file():
             opened = open_stored(place, label, name)
         elif places is None:
             fault = f"{label} is not a store of spectra; give a mapping that says where its quantities are"
             raise InputError(fault, key="mapping")
         else:
-            open_file = partial(_opened, name=name, check=check)
+            open_file = partial(_open_file, name=name, check=check)
             opened = nullcontext(FolderFile(place, places, label, open_file))
         with opened as file:
             yield file, places or (file.mapping(raw) if isinstance(file, StoredFile) else recognised(file)), place.stem
 
 
-def _opened(
+def _open_file(
     path: Path, name: str | None, places: FrameMapping | None = None, check: bool = True, large: bool = False
 ) -> AbstractContextManager[TableFile]:
     """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
@@ -227,12 +227,12 @@ def _quantities(file: TableFile, mapping: FrameMapping) -> Quantities:
         quantities["wavelength"], rows = nm, quantities["flux"].n_rows
         if nm.shape == quantities["flux"].shape == quantities["time"].shape and not isinstance(file, FolderFile):
             check_content(32 * rows, f"{file.label} has {rows} rows of pixels, which need 32 bytes each and at most")
-            quantities = _of_frames(_with_flags(quantities), file.label)
+            quantities = _with_row_per_frame(_with_numeric_flags(quantities), file.label)
     _check_rows(file, quantities)
-    return _with_flags(quantities)
+    return _with_numeric_flags(quantities)
 
 
-def _of_frames(quantities: Quantities, label: str) -> Quantities:
+def _with_row_per_frame(quantities: Quantities, label: str) -> Quantities:
     """Return the quantities of a long table with a row for each frame; errors and flags for each pixel."""
     frames, frame = np.unique(_keys(quantities["time"]), return_inverse=True)
     pixels, pixel = np.unique(quantities["wavelength"].numbers(), return_inverse=True)
@@ -266,7 +266,7 @@ def _keys(values: Values) -> NDArray[Any]:
     return np.asarray(values.numbers() if texts is None or not any(map(is_dated, texts)) else texts)
 
 
-def _with_flags(quantities: Quantities) -> Quantities:
+def _with_numeric_flags(quantities: Quantities) -> Quantities:
     """Return flags of frames as numbers, also those of words and those that lightkurve 2 writes into CSV."""
     quality = quantities.get("quality")
     # Flags of pixels are left as they are.
@@ -289,7 +289,7 @@ def _with_flags(quantities: Quantities) -> Quantities:
 
 def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
     if mapping.wavelength_file is not None:
-        with _opened(Path(mapping.wavelength_file), None) as table:
+        with _open_file(Path(mapping.wavelength_file), None) as table:
             if mapping.wavelength is None and len(table.names) != 1:
                 fault = f"{table.label}: no column of wavelengths is named"
                 raise InputError(f"{fault}; give one of {', '.join(table.names)}", key="wavelength")
@@ -350,16 +350,16 @@ def _conditions(
     except (KeyError, ValueError):
         nominal_s = 0.0
     if "exposure" in quantities:
-        exposure = converted(quantities["exposure"], mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+        exposure = convert(quantities["exposure"], mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
     elif 0.0 < (seconds := mapping.exposure_s or nominal_s) < np.inf:
         exposure = np.full(n, seconds)
     if "temperature" in quantities:
-        celsius = converted(quantities["temperature"], mapping.temperature_unit, "deg_C", "temperature_unit")
+        celsius = convert(quantities["temperature"], mapping.temperature_unit, "deg_C", "temperature_unit")
         temperature = celsius.numbers().reshape(n)
     return {"exposure_s": exposure, "temperature_c": temperature}
 
 
-def _of_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float | None, str, list[str]]:
+def _relative_to_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float | None, str, list[str]]:
     """Return light and errors, as multiples of the level if they are deviations from it in parts, and remarks."""
     finite = np.sort(light[np.isfinite(light)])
     if not finite.size:
@@ -422,8 +422,8 @@ def _read_light(
     file: TableFile, quantities: Quantities, mapping: FrameMapping, bits: QualityBits, reduced: Light | None
 ) -> tuple[Float, Float | None, Float | None, str, tuple[str, ...]]:
     """Return light, errors, flags, the unit of the light, and remarks."""
-    unit, flux, error, remarks = _light(quantities, mapping)
-    light, sd, flags, more = reduced or whole_or_reduced(flux, error, _masked(quantities.get("quality"), bits))
+    unit, flux, error, remarks = _linear_light(quantities, mapping)
+    light, sd, flags, more = reduced or read_light(flux, error, _excluding_bits(quantities.get("quality"), bits))
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     light, sd = without_indefinite(light), None if sd is None else without_indefinite(sd)
@@ -433,7 +433,7 @@ def _read_light(
     if "quality" not in quantities and unused:
         notes = [*notes, f"no flags are used; a mapping with quality names one of {', '.join(unused)}"]
     if len(light.shape) == 1:
-        light, sd, unit, on_level = _of_level(light, sd, unit)
+        light, sd, unit, on_level = _relative_to_level(light, sd, unit)
         notes = [*notes, *on_level]
     remarks += (*more, *(f"{file.label}: {text}" for text in (*file.remarks, *notes)))
     if sd is not None and not np.isfinite(sd).any():
@@ -445,14 +445,14 @@ def _read_light(
     return light, sd, flags, unit, remarks
 
 
-def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
+def _excluding_bits(quality: Values | None, bits: QualityBits) -> Values | None:
     """Return quality flags without the bits that do not exclude a frame or a pixel."""
     if quality is None or bits.mask == ALL_BITS:
         return quality
     return quality.mapped(lambda flags: np.where(np.isfinite(flags), bits.mask & flags.astype(np.int64), flags), "")
 
 
-def _light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
+def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
     """Return the unit of the light, light and errors in it, and remarks."""
     flux, error = quantities["flux"], quantities.get("error")
     remarks: tuple[str, ...] = ()
@@ -490,7 +490,7 @@ def _vacuum_nm(wavelength: Values, mapping: FrameMapping, file: TableFile) -> Fl
     """Return the wavelengths of the pixels in vacuum, which must be the same in every frame."""
     unit, medium = unit_and_medium(mapping.wavelength_unit or "")
     stated_unit, stated_medium = unit_and_medium(wavelength.unit)
-    nm = converted(replace(wavelength, unit=stated_unit or ""), unit, "nm", "wavelength_unit")
+    nm = convert(replace(wavelength, unit=stated_unit or ""), unit, "nm", "wavelength_unit")
     pixels = nm.rows(slice(0, 1))[0] if len(nm.shape) == 2 else nm.numbers().ravel()
     for piece in nm.pieces if len(nm.shape) == 2 else []:
         if not np.allclose(nm.rows(piece), pixels, rtol=1e-9, atol=0.0):

@@ -14,7 +14,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.host.tables import units
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
-from mauvecl.host.tables.table import TableFile, Values, converted, unit_in
+from mauvecl.host.tables.table import TableFile, Values, convert, unit_in
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import DAY_S, Accepted, Exposure
 from mauvecl.schema.section import Record
@@ -237,7 +237,7 @@ def _time_unit(
     system = units.time_unit(text) if text else named
     if system is None and (text := text or header.unit) and (system := units.time_unit(text)) is None:
         # Checks the unit; times keep theirs, so that long times lose no digits.
-        converted(replace(time[0], unit=text), None, "s", "time_unit")
+        convert(replace(time[0], unit=text), None, "s", "time_unit")
         system = units.TimeSystem(str(unit_in(text)))
     remarks = list[str]()
     if system is None:
@@ -247,7 +247,7 @@ def _time_unit(
         else:
             finite = values[np.isfinite(values)]
             if not (mission and finite.size and 0 < float(np.median(finite)) < 20_000):
-                converted(time[0], None, "s", "time_unit")
+                convert(time[0], None, "s", "time_unit")
             name = units.MISSIONS[mission or "TESS"].upper()
             system, text = units.time_unit(name) or units.TimeSystem("d"), f"{name}, days, as in files of {mission}"
         remarks = [f"ASSUMED: the times of {file.label} are {text}; it states no unit"]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.host.arrays import Float
 from mauvecl.host.tables.files import check_folder, limit_bytes, parsing
 from mauvecl.host.tables.fits_tables import FitsTables
-from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.names import match_name
 from mauvecl.host.tables.opening import read_table
 from mauvecl.host.tables.table import MemoryTable, TableFile, Values
 from mauvecl.observations.frames import MAX_FRAMES, live_pixels
@@ -57,7 +57,7 @@ class FolderFile(TableFile):
         """Return a column of the table, a keyword of each header, or a column of each file."""
         if self.table is not None and (column := self.table.named(name)) is not None:
             return column
-        if (keyword := matched(name, self.header)) is not None:
+        if (keyword := match_name(name, self.header)) is not None:
             cells = [header.get(keyword) for header in self._headers]
             if None in cells:
                 fault = f"{self.label}: {self.paths[cells.index(None)].name} needs the keyword {keyword}"
@@ -196,7 +196,7 @@ def open_stored(place: Path | IO[bytes], label: str, name: str | None) -> Iterat
             scenes = [f"{star}/{scene}" for star in sorted(root) if star.startswith("star-")
                      for scene in sorted(root[star])
                      if scene == "quiescent" or (scene.startswith("flare-") and scene[6:].isdigit())]  # fmt: skip
-            path = _chosen(sorted(scenes, key=lambda path: "flare" in path), name, label)
+            path = _requested_scene(sorted(scenes, key=lambda path: "flare" in path), name, label)
             group = root[path.partition("/")[0]]
             # A header may claim any number.
             if (largest := max(int(group[key].size) for key in CALIBRATION)) > MAX_PIXELS:
@@ -214,7 +214,7 @@ def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
     if not str(hdus[0].header.get("ORIGIN", "")).startswith("mauvecl") or not scenes:
         return None
     names = {key.lower().replace("_", "/"): key for key in scenes}
-    path = _chosen(list(names), name, file.label)
+    path = _requested_scene(list(names), name, file.label)
     hdu = scenes[names[path]]
     header = hdu.header
     with parsing(file.label, WHOLE):
@@ -231,7 +231,7 @@ def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
         return StoredFile(file.label, path, hdu.section, pixels, attributes, frames)
 
 
-def _chosen(scenes: list[str], name: str | None, label: str) -> str:
+def _requested_scene(scenes: list[str], name: str | None, label: str) -> str:
     """Return the requested scene, or the only one."""
     if not scenes:
         raise InputError(f"{label} holds no spectra; {WHOLE}", key="file")
@@ -275,7 +275,7 @@ def weighted_sums(
     live, remarks = live_pixels(finite, n, flux.label)
     columns = factors[:, live].T
     sums = np.concatenate([flux.rows(piece)[:, live] @ columns for piece in flux.pieces])
-    flags = _flags(quality)
+    flags = _flags_of_frames(quality)
     errors: Any = [None] * len(factors)
     if error is not None:
         errors = np.concatenate([np.sqrt(error.rows(piece)[:, live] ** 2 @ columns**2) for piece in error.pieces]).T
@@ -295,7 +295,7 @@ def _without_flagged_pixels(flux: Values, quality: Values | None) -> Values:
     return replace(flux, read=read)
 
 
-def _flags(quality: Values | None) -> Float | None:
+def _flags_of_frames(quality: Values | None) -> Float | None:
     """Return one flag for each frame in which every pixel has one; None without flags of pixels."""
     if quality is None or len(quality.shape) == 1:
         return None
@@ -331,13 +331,13 @@ def _statistics(
         return PixelStatistics(count, mean, scatter, None if error is None else np.sqrt(squared_errors / count)), finite
 
 
-def whole_or_reduced(flux: Values, error: Values | None, quality: Values | None) -> Light:
+def read_light(flux: Values, error: Values | None, quality: Values | None) -> Light:
     """Read light whole if it fits into memory, else reduced to its sum over wavelength."""
     n_bytes = 8 * int(np.prod(flux.shape)) * (1 if error is None else 2)
     limit = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     if len(flux.shape) == 1 or n_bytes <= limit:
         light = _without_flagged_pixels(flux, quality).numbers()
-        return light, None if error is None else error.numbers(), _flags(quality), ()
+        return light, None if error is None else error.numbers(), _flags_of_frames(quality), ()
     remark = (
         f"{flux.label} has {n_bytes / 2**20:.0f} MiB of spectra, more than {limit >> 20} MiB: they were summed over "
         "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit"
