@@ -47,6 +47,7 @@ class LargeTable(TableFile):
                 rows[name] = self._cells(table.find(name), self.row[name].kind == "f")
             rows.tofile(self.file)
             self.n_rows += len(rows)
+        self.latest: tuple[slice | None, Any] = None, None
 
     def _cells(self, column: Values, are_numbers: bool) -> Any:
         """Return the next rows of a column as numbers or short texts."""
@@ -61,8 +62,11 @@ class LargeTable(TableFile):
         return texts
 
     def _rows(self, piece: slice) -> Any:
-        self.file.seek(piece.start * self.row.itemsize)
-        return np.fromfile(self.file, self.row, max(0, piece.stop - piece.start))
+        # Columns are read one after the other, and each reads all columns of its rows.
+        if piece != self.latest[0]:
+            self.file.seek(piece.start * self.row.itemsize)
+            self.latest = piece, np.fromfile(self.file, self.row, max(0, piece.stop - piece.start))
+        return self.latest[1]
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
@@ -72,17 +76,6 @@ class LargeTable(TableFile):
         # A copy, since a view of a column would keep all columns of the piece in memory.
         return Values(name, (self.n_rows,), lambda piece: self._rows(piece)[title].copy(),
                       self.table.find(name).unit, self.label, self.row.itemsize)  # fmt: skip
-
-    def _side_by_side(self, pattern: str) -> Values | None:
-        columns, names = super()._side_by_side(pattern), self.matching(pattern)
-        if columns is None or any(self.row[name].kind != "f" for name in names):
-            return columns
-
-        def read(piece: slice) -> Any:
-            rows = self._rows(piece)
-            return np.column_stack([rows[name] for name in names])
-
-        return replace(columns, read=read, row_bytes=self.row.itemsize)
 
 
 def _numbers(values: Values) -> bool:

@@ -329,8 +329,6 @@ def live_pixels(finite: NDArray[np.int64], n_frames: int, name: str) -> tuple[ND
     return live, (f"{words} not finite in most frames of {name} and left out",) if number else ()
 
 
-#: Speed of light, km/s (exact).
-LIGHT_KM_S = 299_792.458
 #: Times that are converted at once.
 PIECE = 50_000
 
@@ -350,6 +348,7 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
         Orbit of the satellite, for ``TOPOCENTER``.
     """
     import astropy.units as u
+    from astropy.constants import c
     from astropy.time import Time
 
     name = frames.name
@@ -376,10 +375,10 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
     if place is not None:
         days = float(np.abs(when.utc.jd - place.elements.epoch_jd).max())
         if place.resolved_at(days) == "mean":
-            error_ms = 1e3 * place.elements.axis_km / LIGHT_KM_S
+            error_ms = (place.elements.axis_km * u.km / c).to_value(u.ms)
             remark += f", good to {error_ms:.0f} ms: the place in the orbit is not known"
         else:
-            error_ms = 1e3 * place.along_track_km(days) / LIGHT_KM_S
+            error_ms = (place.along_track_km(days) * u.km / c).to_value(u.ms)
             remark += f", good to {error_ms:.2g} ms along the track of {place.elements.source}"
     return replace(
         frames, time_s=seconds, reference_mjd=float(first.mjd), scale="tdb", position="BARYCENTER",
