@@ -126,31 +126,31 @@ def open_regular(path: Path, kind: str) -> io.BufferedReader:
 def read_bytes(path: Path, kind: str) -> bytes:
     """Read a regular file of limited size, without unpacking it."""
     with open_regular(path, kind) as file:
-        _check_size(os.fstat(file.fileno()).st_size, path, kind)
+        _check_n_bytes(os.fstat(file.fileno()).st_size, path, kind)
         try:
             content = file.read(limit_bytes("MAUVECL_LARGEST_FILE_MIB") + 1)
         except OSError as error:
             shown = shortened(str(path))
             raise InputError(f"{kind} {shown} must be readable, but is not ({error.strerror})", key="file") from error
     # The file may have grown since its size was read, or the system states no size, as below /proc.
-    _check_size(len(content), path, kind)
+    _check_n_bytes(len(content), path, kind)
     return content
 
 
 def check_size(path: Path, kind: str, most: int | None = None) -> int:
     """Return the size of a regular file; raise InputError above `most` bytes (by default MAUVECL_LARGEST_FILE_MIB)."""
     with open_regular(path, kind) as file:
-        return _check_size(os.fstat(file.fileno()).st_size, path, kind, most)
+        return _check_n_bytes(os.fstat(file.fileno()).st_size, path, kind, most)
 
 
-def _check_size(size: int, path: Path, kind: str, most: int | None = None) -> int:
+def _check_n_bytes(n_bytes: int, path: Path, kind: str, most: int | None = None) -> int:
     """Return the size of a file in bytes; raise InputError as `check_size` if it is too large."""
     limit = "MAUVECL_LARGEST_FILE_MIB"
     largest = limit_bytes(limit) if most is None else most
-    if size > largest:
+    if n_bytes > largest:
         fault = f"{kind} {shortened(str(path))} must have at most {largest >> 20} MiB"
         raise InputError(fault if most else f"{fault}; {limit} sets the limit", key="file" if most else limit)
-    return size
+    return n_bytes
 
 
 def check_folder(path: Path, kind: str) -> None:
