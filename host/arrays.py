@@ -46,31 +46,31 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        given = threading.local()
+        thread = threading.local()
 
         @lru_cache(maxsize=maxsize)
         def computed(digest: bytes) -> R:
-            arguments, named = given.call
-            value = function(*arguments, **named)
+            arguments, keywords = thread.call
+            value = function(*arguments, **keywords)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
             return value
 
         @wraps(function)
-        def wrapper(*arguments: P.args, **named: P.kwargs) -> R:
+        def wrapper(*arguments: P.args, **keywords: P.kwargs) -> R:
             hashed = hashlib.sha256()
-            for value in (*arguments, *chain.from_iterable(sorted(named.items()))):
+            for value in (*arguments, *chain.from_iterable(sorted(keywords.items()))):
                 if isinstance(value, np.ndarray):
                     hashed.update(f"{value.dtype.str}{value.shape}".encode())
                     hashed.update(np.ascontiguousarray(value).data)
                 else:
                     hashed.update(repr(value).encode())
-            given.call = arguments, named
+            thread.call = arguments, keywords
             try:
                 return computed(hashed.digest())
             finally:
                 # The arguments may be large, and are not needed any more.
-                given.call = None
+                thread.call = None
 
         return wrapper
 
@@ -88,51 +88,51 @@ class ContentEquality:
                 setattr(cls, name, vars(ContentEquality)[name])
 
     def __eq__(self, other: object) -> bool:
-        return NotImplemented if type(other) is not type(self) else equal_content(_parts(self), _parts(other))
+        return NotImplemented if type(other) is not type(self) else equal_content(_attributes(self), _attributes(other))
 
     def __hash__(self) -> int:
-        plain = (value for value in _parts(self).values() if isinstance(value, str | int | float))
+        plain = (value for value in _attributes(self).values() if isinstance(value, str | int | float))
         return hash((type(self).__name__, *plain))
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._line()}>"
 
     def _line(self) -> str:
-        return ", ".join(str(value) for value in _parts(self).values() if isinstance(value, str | int | float))
+        return ", ".join(str(value) for value in _attributes(self).values() if isinstance(value, str | int | float))
 
 
-def equal_content(one: Any, other: Any) -> bool:
+def equal_content(first: Any, second: Any) -> bool:
     """Return whether two objects have equal content, comparing arrays by bytes and plain objects by attributes."""
-    if one is other:
+    if first is second:
         return True
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        one, other = np.asarray(one), np.asarray(other)
-        if one.dtype == object:
-            return equal_content(one.tolist(), other.tolist())
-        return bool(one.shape == other.shape and one.dtype == other.dtype and one.tobytes() == other.tobytes())
-    if type(one) is not type(other):
-        return bool(one == other)
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(equal_content(value, other[key]) for key, value in one.items())
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(equal_content, one, other))
-    if hasattr(one, "colnames"):
+    if isinstance(first, np.ndarray) or isinstance(second, np.ndarray):
+        first, second = np.asarray(first), np.asarray(second)
+        if first.dtype == object:
+            return equal_content(first.tolist(), second.tolist())
+        return bool(first.shape == second.shape and first.dtype == second.dtype and first.tobytes() == second.tobytes())
+    if type(first) is not type(second):
+        return bool(first == second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(equal_content(value, second[key]) for key, value in first.items())
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(equal_content, first, second))
+    if hasattr(first, "colnames"):
         # An astropy table: compare columns, units and metadata.
-        units = [[str(getattr(table[name], "unit", "")) for name in table.colnames] for table in (one, other)]
-        columns = [{name: np.asarray(table[name]) for name in table.colnames} for table in (one, other)]
-        return units[0] == units[1] and equal_content(*columns) and equal_content(dict(one.meta), dict(other.meta))
-    if isinstance(one, float):
-        return one == other or (one != one and other != other)
-    if not any("__eq__" in vars(kind) for kind in type(one).__mro__[:-1]):
-        return equal_content(_parts(one), _parts(other))
-    return bool(one == other)
+        units = [[str(getattr(table[name], "unit", "")) for name in table.colnames] for table in (first, second)]
+        columns = [{name: np.asarray(table[name]) for name in table.colnames} for table in (first, second)]
+        return units[0] == units[1] and equal_content(*columns) and equal_content(dict(first.meta), dict(second.meta))
+    if isinstance(first, float):
+        return first == second or (first != first and second != second)
+    if not any("__eq__" in vars(kind) for kind in type(first).__mro__[:-1]):
+        return equal_content(_attributes(first), _attributes(second))
+    return bool(first == second)
 
 
-def _parts(thing: Any) -> dict[str, Any]:
+def _attributes(value: Any) -> dict[str, Any]:
     """Return the compared fields of a dataclass, or all attributes of another object."""
-    if is_dataclass(thing):
-        return {each.name: getattr(thing, each.name) for each in fields(thing) if each.compare}
-    return dict(vars(thing))
+    if is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
+    return dict(vars(value))
 
 
 Item = TypeVar("Item")

@@ -115,7 +115,8 @@ def test_made_up_pixels_have_their_scatter_about_one() -> None:
 
 def test_frames_are_shifted_to_later_times() -> None:
     frames = mauvecl.Frames.of(5.0 * np.arange(30), np.ones(30))
-    np.testing.assert_array_equal(frames.shifted(np.full(30, 60.0)).time_s, frames.time_s + 60.0)
+    for later in (frames.shifted(np.full(30, 60.0)), frames.shifted(60 * u.s)):
+        np.testing.assert_array_equal(later.time_s, frames.time_s + 60.0)
 
 
 def test_periodogram_has_the_range_of_its_periods_by_default() -> None:

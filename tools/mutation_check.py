@@ -443,7 +443,10 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "starts of frames taken for their ends": (
         "test_files_are_read_as_they_say[times keywords of scale and place fits9]",
-        ("made.shifted((0.5 - dates.at) * made.exposure_s)", "made.shifted((dates.at - 0.5) * made.exposure_s)"),
+        (
+            "frames.shifted((0.5 - system.at) * frames.exposure_s)",
+            "frames.shifted((system.at - 0.5) * frames.exposure_s)",
+        ),
     ),
     "days taken for seconds": (
         "test_files_are_read_as_they_say[extensions names that need no mapping fits1]",
@@ -451,11 +454,11 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "light that reaches the barycentre earlier": (
         "test_barycentric_times_of_the_geocentre_are_those_of_erfa[2026-09-16T03:00:00]",
-        ("(when.tdb - first).to_value(u.s) + late", "(when.tdb - first).to_value(u.s) - late"),
+        ("(when.tdb - first).to_value(u.s) + delay", "(when.tdb - first).to_value(u.s) - delay"),
     ),
     "wavelengths shorter in vacuum": (
         "test_files_are_read_as_they_say[media keyword AIRORVAC air txt]",
-        ("vacuum[there] = air_nm[there] * index", "vacuum[there] = air_nm[there] / index"),
+        ("vacuum[in_air] = air_nm[in_air] * index", "vacuum[in_air] = air_nm[in_air] / index"),
     ),
     "air in a unit overlooked": (
         "test_files_are_read_as_they_say[media unit Angstrom air 10 fits]",
@@ -520,7 +523,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "the light of a second for that of a frame": (
         "test_fit_recovers_values_and_throughput",
-        ("self.transfer.noise.gain * electrons * one.exposure_s", "self.transfer.noise.gain * electrons"),
+        ("self.transfer.noise.gain * electrons * frames.exposure_s", "self.transfer.noise.gain * electrons"),
     ),
     "a colour relative to a known star": (
         "test_tables_of_default_questions_are_unchanged[analyse-spectra]",
@@ -529,8 +532,8 @@ MUTATIONS: dict[str, Mutation] = {
     "light lost taken for light gained": (
         "test_loss_and_return_are_found_at_their_frames_with_their_size",
         (
-            "((total[k + width] - 2 * total[k] + total[k - width]) / width)[whole]",
-            "(-(total[k + width] - 2 * total[k] + total[k - width]) / width)[whole]",
+            "((total[k + width] - 2 * total[k] + total[k - width]) / width)[gapless]",
+            "(-(total[k + width] - 2 * total[k] + total[k - width]) / width)[gapless]",
         ),
     ),
     # Answers.

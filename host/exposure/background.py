@@ -428,14 +428,14 @@ def _separations(table: Rows, target_row: int | None, target: str | None) -> tup
         return _from_positions(table, ra, dec, target_row, target), ()
     name = table.first(SEPARATIONS)
     if name is None:
-        fault, key = f"{table.named} has the columns {shown(', '.join(table.names), 300)}", "neighbours"
+        fault, key = f"{table.label} has the columns {shown(', '.join(table.names), 300)}", "neighbours"
         needed = "ra and dec"
         if ra is not None:
             fault, key = f"{fault} and no position of the star itself", "neighbours_of"
             needed = "star.neighbours_of: the star's own row by name, or its coordinates"
         raise InputError(f"{fault}, but needs separation (arcsec), or {needed}", key=key)
     if target is not None and target_row is None:
-        fault = f"{table.named} has no row named {shortened(target)}, and no positions"
+        fault = f"{table.label} has no row named {shortened(target)}, and no positions"
         raise InputError(f"{fault}; give the name of a row, which is then left out", key="neighbours_of")
     has_unit, key = getattr(table.table[name], "unit", None) is not None, names.key_of(name)
     if not has_unit and key == "_r":
@@ -449,7 +449,7 @@ def _separations(table: Rows, target_row: int | None, target: str | None) -> tup
         return values, ()
     # ADQL's DISTANCE is in degrees.
     return values * 3600.0, (
-        f"Separations are the column {name} of {table.named}, read as degrees since it states no unit.",
+        f"Separations are the column {name} of {table.label}, read as degrees since it states no unit.",
     )
 
 
@@ -465,7 +465,7 @@ def _from_positions(table: Rows, ra: str, dec: str, target_row: int | None, targ
         try:
             position = parse_position(target)
         except InputError as error:
-            fault = f"{table.named} has no row named {shortened(target)}, and it is not a position"
+            fault = f"{table.label} has no row named {shortened(target)}, and it is not a position"
             remedy = "give the name of the star's own row, or coordinates such as '290.68 +11.12'"
             raise InputError(f"{fault}; {remedy}", key="neighbours_of") from error
         place = float(position.ra.rad), float(position.dec.rad)

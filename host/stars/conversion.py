@@ -148,7 +148,7 @@ def _numbers(cells: Any, name: str) -> Float:
     """Return cells as numbers; NaN for missing measurements."""
     if np.asanyarray(cells).dtype.kind == "b":
         raise InputError(f"{name} must contain real numbers, not true and false", key=name)
-    return without_indefinite(Values.of(name, cells, what="its table").numbers())
+    return without_indefinite(Values.of(name, cells, label="its table").numbers())
 
 
 def _no_such(word: str, names: Sequence[str]) -> InputError:

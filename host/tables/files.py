@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import NDArray
 
-#: Prefix of files that are being written, and what to do on a full or read-only disk.
+#: Prefix of files that are being written, and advice for a full or read-only disk.
 UNFINISHED, NO_ROOM = ".unfinished-", "use a writable disk with room; what was written before is kept"
 
 
 @contextlib.contextmanager
-def writing(what: str, remedy: str, *, key: str) -> Iterator[None]:
-    """Convert failures of the operating system in the block to an InputError that `what` cannot be written."""
+def writing(label: str, remedy: str, *, key: str) -> Iterator[None]:
+    """Convert failures of the operating system in the block to an InputError: what `label` names cannot be written."""
     try:
         yield
     except OSError as error:
-        raise InputError(f"{what} cannot be written ({error.strerror or error}); {remedy}", key=key) from error
+        raise InputError(f"{label} cannot be written ({error.strerror or error}); {remedy}", key=key) from error
 
 
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
@@ -53,9 +53,9 @@ def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) ->
         path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished.open("wb", buffering=0) as file:
             for part in parts:
-                left = memoryview(part).cast("B")
-                while left:
-                    left = left[file.write(left) :]
+                unwritten = memoryview(part).cast("B")
+                while unwritten:
+                    unwritten = unwritten[file.write(unwritten) :]
             os.fsync(file.fileno())
         unfinished.replace(path)
     except BaseException:
@@ -74,8 +74,8 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
-    return [_finite(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: _finite(item) for key, item in value.items()}
+    return [_finite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 #: Default limits of file size and unpacked size, MiB; environment variables of these names override them.
@@ -92,77 +92,84 @@ def limit_bytes(variable: str) -> int:
     return int(text) << 20
 
 
+def check_content(n_bytes: int, sentence: str) -> None:
+    """Raise InputError if content is larger than MAUVECL_LARGEST_CONTENT_MIB; the limit completes its sentence."""
+    limit = "MAUVECL_LARGEST_CONTENT_MIB"
+    if n_bytes > (most := limit_bytes(limit)):
+        raise InputError(f"{sentence} {most >> 20} MiB; {limit} sets the limit", key=limit)
+
+
 #: Largest number of characters of a line of text, and of bytes of a store's JSON.
 LONGEST_LINE, MOST_JSON = 2**17, 16 << 20
 
 
-def open_regular(path: Path, what: str) -> io.BufferedReader:
-    """Open a regular file for reading; `what` is its kind, for messages: "spectrum file", "study"."""
+def open_regular(path: Path, kind: str) -> io.BufferedReader:
+    """Open a regular file for reading; messages name its kind, such as "spectrum file" or "study"."""
     shown = shortened(str(path))
     try:
         # Non-blocking, because a pipe without a writer would never open.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
-        raise InputError(f"{what} {shown} does not exist; give the path of a file", key="file") from error
+        raise InputError(f"{kind} {shown} does not exist; give the path of a file", key="file") from error
     except (OSError, ValueError) as error:
-        # Null bytes, and characters that file names cannot contain, are errors of value.
-        fault = f"{what} {shown} cannot be opened ({getattr(error, 'strerror', error)})"
+        # Null bytes, and characters that file names cannot contain, raise ValueError.
+        fault = f"{kind} {shown} cannot be opened ({getattr(error, 'strerror', error)})"
         raise InputError(f"{fault}; give the path of a file", key="file") from error
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        other = ", not a folder" if stat.S_ISDIR(mode) else ""
-        raise InputError(f"{what} {shown} must be a regular file{other}", key="file")
+        folder = ", not a folder" if stat.S_ISDIR(mode) else ""
+        raise InputError(f"{kind} {shown} must be a regular file{folder}", key="file")
     return open(descriptor, "rb")
 
 
-def read_bytes(path: Path, what: str) -> bytes:
+def read_bytes(path: Path, kind: str) -> bytes:
     """Read a regular file of limited size, without unpacking it."""
-    with open_regular(path, what) as file:
-        _limited(os.fstat(file.fileno()).st_size, path, what)
+    with open_regular(path, kind) as file:
+        _check_n_bytes(os.fstat(file.fileno()).st_size, path, kind)
         try:
             content = file.read(limit_bytes("MAUVECL_LARGEST_FILE_MIB") + 1)
         except OSError as error:
             shown = shortened(str(path))
-            raise InputError(f"{what} {shown} must be readable, but is not ({error.strerror})", key="file") from error
-    # It may have grown since its size was read, or the system gives it none, as below /proc.
-    _limited(len(content), path, what)
+            raise InputError(f"{kind} {shown} must be readable, but is not ({error.strerror})", key="file") from error
+    # The file may have grown since its size was read, or the system states no size, as below /proc.
+    _check_n_bytes(len(content), path, kind)
     return content
 
 
-def check_size(path: Path, what: str, most: int | None = None) -> int:
+def check_size(path: Path, kind: str, most: int | None = None) -> int:
     """Return the size of a regular file; raise InputError above `most` bytes (by default MAUVECL_LARGEST_FILE_MIB)."""
-    with open_regular(path, what) as file:
-        return _limited(os.fstat(file.fileno()).st_size, path, what, most)
+    with open_regular(path, kind) as file:
+        return _check_n_bytes(os.fstat(file.fileno()).st_size, path, kind, most)
 
 
-def _limited(size: int, path: Path, what: str, most: int | None = None) -> int:
+def _check_n_bytes(n_bytes: int, path: Path, kind: str, most: int | None = None) -> int:
     """Return the size of a file in bytes; raise InputError as `check_size` if it is too large."""
     limit = "MAUVECL_LARGEST_FILE_MIB"
     largest = limit_bytes(limit) if most is None else most
-    if size > largest:
-        fault = f"{what} {shortened(str(path))} must have at most {largest >> 20} MiB"
+    if n_bytes > largest:
+        fault = f"{kind} {shortened(str(path))} must have at most {largest >> 20} MiB"
         raise InputError(fault if most else f"{fault}; {limit} sets the limit", key="file" if most else limit)
-    return size
+    return n_bytes
 
 
-def check_folder(path: Path, what: str) -> None:
-    """Raise InputError for what another library should not read: devices, large files, JSON above `MOST_JSON`."""
+def check_folder(path: Path, kind: str) -> None:
+    """Raise InputError for files that another library should not read: devices, large ones, JSON above `MOST_JSON`."""
     for folder, _, names in os.walk(path):
         for name in names:
             file = Path(folder) / name
-            check_size(file, what, MOST_JSON if name.endswith(".json") else None)
+            check_size(file, kind, MOST_JSON if name.endswith(".json") else None)
 
 
-def lines_in(file: IO[str], what: str) -> Iterator[str]:
-    """Yield the lines of a text in UTF-8, with their ends; of a line of more than `LONGEST_LINE` no more is read."""
+def lines_in(file: IO[str], label: str) -> Iterator[str]:
+    """Yield the lines of a text in UTF-8, with their ends; reading stops at a line longer than `LONGEST_LINE`."""
     try:
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 2), ""), 1):
             if len(line.rstrip("\r\n")) > LONGEST_LINE:
-                raise InputError(f"{what} must have at most {LONGEST_LINE} characters in line {number}", key="file")
+                raise InputError(f"{label} must have at most {LONGEST_LINE} characters in line {number}", key="file")
             yield line
     except UnicodeDecodeError as error:
-        raise InputError(f"{what} must be text in UTF-8", key="file") from error
+        raise InputError(f"{label} must be text in UTF-8", key="file") from error
 
 
 #: Names of compressions and functions that open their files, by the first bytes of these.
@@ -171,23 +178,20 @@ PACKED: dict[bytes, tuple[str, Callable[[Any], Any]]] = {
 }  # fmt: skip
 
 
-def unpacked(content: bytes, what: str) -> bytes:
+def unpacked(content: bytes, label: str) -> bytes:
     """Unpack content of gzip, bzip2 or xz, in pieces to detect decompression bombs; return other content unchanged."""
-    form, opened = next((how for mark, how in PACKED.items() if content.startswith(mark)), ("", None))
-    if opened is None:
+    form, opener = next((packing for mark, packing in PACKED.items() if content.startswith(mark)), ("", None))
+    if opener is None:
         return content
-    limit = "MAUVECL_LARGEST_CONTENT_MIB"
-    most, found = limit_bytes(limit), bytearray()
+    plain = bytearray()
     try:
-        with opened(io.BytesIO(content)) as file:
+        with opener(io.BytesIO(content)) as file:
             while piece := file.read(PIECE):
-                found += piece
-                if len(found) > most:
-                    fault = f"{what} must unpack to at most {most >> 20} MiB; {limit} sets the limit"
-                    raise InputError(fault, key=limit)
+                plain += piece
+                check_content(len(plain), f"{label} must unpack to at most")
     except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
-        raise InputError(f"{what} is damaged {form}; give a whole file", key="file") from error
-    return bytes(found)
+        raise InputError(f"{label} is damaged {form}; give a whole file", key="file") from error
+    return bytes(plain)
 
 
 #: Range of absolute values of numbers from users, apart from 0; products of several stay within double precision.
@@ -207,7 +211,7 @@ MOST_PARTS = 512
 
 
 @contextlib.contextmanager
-def parsing(what: str, remedy: str) -> Iterator[None]:
+def parsing(label: str, remedy: str) -> Iterator[None]:
     """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
 
     Parsers raise many kinds of exceptions on damaged content: their own, those of Python (RecursionError,
@@ -218,40 +222,40 @@ def parsing(what: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except RecursionError as error:
-        raise InputError(f"{what} must be nested less deeply", key="file") from error
+        raise InputError(f"{label} must be nested less deeply", key="file") from error
     except MemoryError as error:
-        raise InputError(f"{what} needs more memory than is available", key="file") from error
+        raise InputError(f"{label} needs more memory than is available", key="file") from error
     except Exception as error:
         # Other libraries' messages are for their programmers, but may state the place.
         place = PLACE.search(str(error))
-        raise InputError(f"{what} cannot be read{f' ({place[0]})' if place else ''}; {remedy}", key="file") from error
+        raise InputError(f"{label} cannot be read{f' ({place[0]})' if place else ''}; {remedy}", key="file") from error
 
 
 @contextlib.contextmanager
-def reading(what: str, remedy: str) -> Iterator[None]:
-    """Convert any exception of a reader of astropy to InputError, and silence its warnings of what it can read."""
-    with parsing(what, remedy), warnings.catch_warnings():
+def reading(label: str, remedy: str) -> Iterator[None]:
+    """Convert any exception of a reader of astropy to InputError, and silence its warnings."""
+    with parsing(label, remedy), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
-def read_text(path: Path, what: str) -> str:
+def read_text(path: Path, kind: str) -> str:
     """Read a regular file of limited size as UTF-8 text, with or without a byte-order mark."""
-    return as_text(read_bytes(path, what), f"{what} {shortened(str(path))}")
+    return as_text(read_bytes(path, kind), f"{kind} {shortened(str(path))}")
 
 
-def as_text(content: bytes, what: str) -> str:
+def as_text(content: bytes, label: str) -> str:
     """Decode text in UTF-8 or UTF-16, with or without the byte-order mark of editors on Windows."""
     try:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError as error:
         if b"\0" in content[:4096]:
-            raise InputError(f"{what} must be text, but holds null bytes", key="file") from error
+            raise InputError(f"{label} must be text, but holds null bytes", key="file") from error
         line, odd = content[: error.start].count(b"\n") + 1, content[error.start]
-        fault = f"{what} must be text in UTF-8, but its byte 0x{odd:02x} in line {line} is not: save it as UTF-8"
+        fault = f"{label} must be text in UTF-8, but its byte 0x{odd:02x} in line {line} is not: save it as UTF-8"
         raise InputError(fault, key="file") from error
     if "\0" in text:
-        raise InputError(f"{what} must be text, but holds null bytes", key="file")
+        raise InputError(f"{label} must be text, but holds null bytes", key="file")
     return text
 
 
@@ -260,27 +264,27 @@ def is_file(path: Path) -> bool:
     return os.path.exists(path) and not os.path.isdir(path)
 
 
-def toml(text: str, what: str) -> dict[str, Any]:
+def toml(text: str, label: str) -> dict[str, Any]:
     """Parse TOML; raise InputError if it is invalid, or as `check_keys` and `possible`."""
-    check_keys(text, what)
-    with parsing(what, "give TOML"):
+    check_keys(text, label)
+    with parsing(label, "give TOML"):
         try:
             tree = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{what} must be valid TOML: {printable(str(error), 160)}", key="file") from error
-    possible(tree, what)
+            raise InputError(f"{label} must be valid TOML: {printable(str(error), 160)}", key="file") from error
+    possible(tree, label)
     return tree
 
 
-def check_keys(text: str, what: str) -> None:
+def check_keys(text: str, label: str) -> None:
     """Raise InputError for TOML with a key of too many parts."""
     parts = 1 + max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
     if parts > MOST_PARTS:
         # The memory of Python's parser grows with the square of this number.
-        raise InputError(f"{what} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
+        raise InputError(f"{label} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
 
 
-def possible(data: Any, what: str, key: str = "", depth: int = 0) -> None:
+def possible(data: Any, label: str, key: str = "", depth: int = 0) -> None:
     """Raise InputError for values that are impossible in any study or instrument; `key` is that of nested data."""
     is_energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
     fault = _fault(data, LARGEST_ERG if is_energy else LARGEST)
@@ -288,19 +292,19 @@ def possible(data: Any, what: str, key: str = "", depth: int = 0) -> None:
         fault = f"must be nested at most {DEEPEST} deep"
     if fault:
         named = printable(key, 80)
-        raise InputError(f"{what}: {named or 'the value'} {fault}", key=named or None)
+        raise InputError(f"{label}: {named or 'the value'} {fault}", key=named or None)
     if isinstance(data, Mapping):
         for name, item in data.items():
             if isinstance(name, str) and (bad := _fault(name)):
-                raise InputError(f"{what}: a key {bad}", key=printable(name, 80))
-            possible(item, what, f"{key}.{name}" if key else str(name), depth + 1)
+                raise InputError(f"{label}: a key {bad}", key=printable(name, 80))
+            possible(item, label, f"{key}.{name}" if key else str(name), depth + 1)
     elif isinstance(data, list | tuple):
         for i, item in enumerate(data):
-            possible(item, what, f"{key}.{i}", depth + 1)
+            possible(item, label, f"{key}.{i}", depth + 1)
 
 
 def _fault(value: Any, largest: float = LARGEST) -> str | None:
-    """Return what is wrong with a value, as the end of a sentence on it, or None if the value is possible."""
+    """Return the fault of a value, as the end of a sentence about it, or None if the value is possible."""
     if isinstance(value, bool):
         return None
     if isinstance(value, int):
@@ -325,7 +329,7 @@ def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
     match = re.fullmatch(r"(?s)(.+?)\[([^\[\]]*)\]", text)
     if match is None or os.path.isfile(text):
         return Path(text), ()
-    return Path(match[1]), tuple(one.strip() for one in match[2].split(",") if one.strip())
+    return Path(match[1]), tuple(word.strip() for word in match[2].split(",") if word.strip())
 
 
 #: Largest number of values of a header with expanded aliases; a few KiB of aliases can expand to 1e9 values.
@@ -336,23 +340,23 @@ MOST_HEADER = 256 * 2**10
 _QUOTED, _OPEN = re.compile(r'(?:^|(?<=[,;|\t ]))"(?:[^"]|"")*"(?=[,;|\t ]|$)'), re.compile(r'(?:^|[,;|\t ])"')
 
 
-def read_ecsv(path: str | Path, what: str, remedy: str = "give an ECSV table") -> Table:
+def read_ecsv(path: str | Path, kind: str, remedy: str = "give an ECSV table") -> Table:
     """Read an ECSV file; errors of its form end with the remedy."""
-    return parse_ecsv(*text_and_name(path, what), remedy)
+    return parse_ecsv(*text_and_name(path, kind), remedy)
 
 
-def parse_ecsv(text: str, what: str, remedy: str = "give an ECSV table") -> Table:
-    """Parse ECSV text, as `read_ecsv`; `what` says where it is from."""
+def parse_ecsv(text: str, label: str, remedy: str = "give an ECSV table") -> Table:
+    """Parse ECSV text, as `read_ecsv`; messages name it by its label."""
     from astropy.table import Table
 
     from mauvecl.host.tables.units import with_mission_formats
 
     lines = text.splitlines()
-    check_header(lines, what)
-    check_cells([line for line in lines if not line.startswith("#")], what)
-    # Those of lightkurve have times in the days of the missions.
+    check_header(lines, label)
+    check_cells([line for line in lines if not line.startswith("#")], label)
+    # Tables of lightkurve have times in the days of the missions.
     with_mission_formats()
-    with reading(what, remedy):
+    with reading(label, remedy):
         # Passed as lines, because astropy takes a text of one line for a file name.
         return Table.read([*lines, ""], format="ascii.ecsv")
 
@@ -369,70 +373,68 @@ class Numbers:
         return self.columns[name]
 
 
-def text_and_name(path: str | Path, what: str) -> tuple[str, str]:
+def text_and_name(path: str | Path, kind: str) -> tuple[str, str]:
     """Read the text of a file, and return it with the file's name for messages."""
-    named = f"{what} {shortened(str(path))}"
-    return as_text(unpacked(read_bytes(Path(path), what), named), named), named
+    label = f"{kind} {shortened(str(path))}"
+    return as_text(unpacked(read_bytes(Path(path), kind), label), label), label
 
 
-def parse_numbers(text: str, what: str) -> Numbers:
+def parse_numbers(text: str, label: str) -> Numbers:
     """Parse an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
     import numpy as np
     import yaml  # comes with astropy
 
     lines = text.splitlines()
-    check_header(lines, what)
+    check_header(lines, label)
     header, rows = [line[2:] for line in lines if line[:1] == "#"], [line for line in lines if line[:1] != "#"]
     # Numbers that single blanks separate need no import of astropy's tables.
     with contextlib.suppress(yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError):
-        said = yaml.load("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        types = {one["name"]: one["datatype"] for one in said["datatype"] if "subtype" not in one}
-        is_numeric = len(types) == len(said["datatype"]) and all(k[:3] in ("flo", "int", "uin") for k in types.values())
-        if is_numeric and "delimiter" not in said and rows[0].split(" ") == [*types]:
+        keys = yaml.load("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        fields = keys["datatype"]
+        types = {field["name"]: field["datatype"] for field in fields if "subtype" not in field}
+        is_numeric = len(types) == len(fields) and all(kind[:3] in ("flo", "int", "uin") for kind in types.values())
+        if is_numeric and "delimiter" not in keys and rows[0].split(" ") == [*types]:
             values = np.array([row.split(" ") for row in rows[1:] if row], np.float64).reshape(-1, len(types))
-            units = {one["name"]: str(one.get("unit", "")) for one in said["datatype"]}
-            return Numbers(dict(zip(types, values.T.copy(), strict=True)), units, dict(said.get("meta") or {}))
-    table = parse_ecsv(text, what)
+            units = {field["name"]: str(field.get("unit", "")) for field in fields}
+            return Numbers(dict(zip(types, values.T.copy(), strict=True)), units, dict(keys.get("meta") or {}))
+    table = parse_ecsv(text, label)
     for name in table.colnames:
         if table[name].dtype.kind not in "iuf" or np.ma.is_masked(table[name]) or table[name].ndim != 1:
-            raise InputError(f"{what}: {name} must hold numbers only, but has missing or other values", key=name)
+            raise InputError(f"{label}: {name} must hold numbers only, but has missing or other values", key=name)
     columns = {name: np.asarray(table[name], np.float64) for name in table.colnames}
     return Numbers(columns, {name: str(table[name].unit or "") for name in table.colnames}, dict(table.meta))
 
 
-def check_header(lines: list[str], what: str) -> None:
+def check_header(lines: list[str], label: str) -> None:
     """Raise InputError if a header is longer than `MOST_HEADER` or its aliases expand to more than `MOST_VALUES`."""
     import yaml  # comes with astropy
 
     header = [line[2:] for line in lines if line.startswith("# ")]
     size = sum(map(len, header))
     if size > MOST_HEADER:
-        raise InputError(f"{what} must have a header of at most {MOST_HEADER} characters, not {size}", key="file")
+        raise InputError(f"{label} must have a header of at most {MOST_HEADER} characters, not {size}", key="file")
     if not any("*" in line for line in header):
         return
-    with parsing(what, "give an ECSV table"):
+    with parsing(label, "give an ECSV table"):
         root = yaml.compose("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     # An alias repeats a node, also one that contains itself.
     count, waiting = 0, [root]
     while waiting:
         inner = getattr(waiting.pop(), "value", None)
-        for one in inner if isinstance(inner, list) else ():
-            waiting += one if isinstance(one, tuple) else (one,)
+        for item in inner if isinstance(inner, list) else ():
+            waiting += item if isinstance(item, tuple) else (item,)
         count += 1
         if count + len(waiting) >= MOST_VALUES:
-            raise InputError(f"{what} must have a header that expands to fewer than {MOST_VALUES} values", key="file")
+            raise InputError(f"{label} must have a header that expands to fewer than {MOST_VALUES} values", key="file")
 
 
-def check_cells(lines: list[str], what: str) -> None:
-    """Raise InputError for cells that extend over lines, and for one wide line of many, whose width all would take."""
-    limit = "MAUVECL_LARGEST_CONTENT_MIB"
-    most = limit_bytes(limit)
+def check_cells(lines: list[str], label: str) -> None:
+    """Raise InputError for cells that extend over lines, and for a wide line of many, whose width all would take."""
     widest = max(map(len, lines), default=0)
-    if widest * len(lines) > most:
-        fault = f"{what} has a line of {widest} characters among {len(lines)}, which must have at most {most >> 20} MiB"
-        raise InputError(f"{fault} together if each were as long; {limit} sets the limit", key=limit)
+    shape = f"{len(lines)} lines, of which the longest has {widest} characters"
+    check_content(widest * len(lines), f"{label} has {shape}; if all were as long, they must have at most")
     if widest > LONGEST_LINE:
-        raise InputError(f"{what} has a line of {widest} characters, but may have at most {LONGEST_LINE}", key="file")
+        raise InputError(f"{label} has a line of {widest} characters, but may have at most {LONGEST_LINE}", key="file")
     odd = next((n for n, line in enumerate(lines, 1) if '"' in line and _OPEN.search(_QUOTED.sub("", line))), None)
     if odd is not None:
-        raise InputError(f"{what} must have one line per row, but has a cell that extends beyond row {odd}", key="file")
+        raise InputError(f"{label} must have one line per row, but a cell extends beyond row {odd}", key="file")

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.tables import table
-from mauvecl.host.tables.files import limit_bytes, reading
-from mauvecl.host.tables.names import matched, text_at
+from mauvecl.host.tables.files import check_content, limit_bytes, reading
+from mauvecl.host.tables.names import match_name, text_at
 from mauvecl.host.tables.table import TableFile, Values, number_in
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
@@ -76,28 +76,28 @@ def check_sizes(file: IO[bytes]) -> None:
     raise InputError(f"it must have at most {MAX_EXTENSIONS} extensions", key="file")
 
 
-def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HDUList:
+def open_fits(file: IO[bytes], label: str = "", *, check: bool = True) -> fits.HDUList:
     """Open a FITS file after a check of its sizes and checksums; its data are read on access.
 
-    To `check` the checksums the whole file is read. `what` is the file, for messages.
+    To `check` the checksums, the whole file is read. Messages name the file by its label.
     """
     from astropy.io import fits
 
-    whole: dict[str, Any] = {"mode": "readonly", "memmap": False, "lazy_load_hdus": False}
+    options: dict[str, Any] = {"mode": "readonly", "memmap": False, "lazy_load_hdus": False}
     try:
         with reading("it", WHOLE):
             check_sizes(file)
             file.seek(0)
-            hdus = fits.open(file, **whole, disable_image_compression=True)
+            hdus = fits.open(file, **options, disable_image_compression=True)
             check_extensions(hdus)
             if check:
                 check_sums(hdus, file)
             if packed := [hdu for hdu in hdus if text_at(hdu.header, "ZIMAGE") == "True"]:
                 check_images(packed)
                 file.seek(0)
-                hdus = fits.open(file, **whole)
+                hdus = fits.open(file, **options)
     except InputError as error:
-        raise (error.within(what) if what else error) from error
+        raise (error.within(label) if label else error) from error
     return hdus
 
 
@@ -130,7 +130,6 @@ def check_extensions(hdus: Any) -> None:
 
 def check_images(packed: Sequence[Any]) -> None:
     """Raise InputError for images in compressed tiles (standard 4.0, section 10.1) that are large or damaged."""
-    most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     for hdu in packed:
         header = hdu.header
         axes = [int(header[f"ZNAXIS{k + 1}"]) for k in range(int(header["ZNAXIS"]))]
@@ -139,9 +138,7 @@ def check_images(packed: Sequence[Any]) -> None:
         if min(*axes, *tiles) < 1:
             fault = f"it has a compressed image of {axes} pixels in tiles of {tiles}; {WHOLE}"
             raise InputError(fault, key="file")
-        if size > most:
-            fault = f"its compressed image must unpack to at most {most >> 20} MiB"
-            raise InputError(f"{fault}; MAUVECL_LARGEST_CONTENT_MIB sets the limit", key="file")
+        check_content(size, "its compressed image must unpack to at most")
 
 
 def _bytes_at(file: IO[bytes], start: int, stop: int) -> bytes:
@@ -156,16 +153,16 @@ def check_sums(hdus: Any, file: IO[bytes]) -> None:
     astropy's check leaves the data out where there is no DATASUM.
     """
     for number, hdu in enumerate(hdus):
-        stated = {key: text_at(hdu.header, key) for key in ("DATASUM", "CHECKSUM")}
-        if not any(stated.values()):
+        keywords = {key: text_at(hdu.header, key) for key in ("DATASUM", "CHECKSUM")}
+        if not any(keywords.values()):
             continue
         place = hdu.fileinfo()
         header, data = place["hdrLoc"], place["datLoc"]
         data_sum, key = _sum(file, data, data + place["datSpan"]), ""
-        if stated["DATASUM"].isdigit() and (int(stated["DATASUM"]) - data_sum) % 0xFFFFFFFF:
+        if keywords["DATASUM"].isdigit() and (int(keywords["DATASUM"]) - data_sum) % 0xFFFFFFFF:
             key = "DATASUM"
         # A blank value is that of a sum which is not defined; one of zeros is that before the sum was computed.
-        elif len(stated["CHECKSUM"]) == 16 and set(stated["CHECKSUM"]) != {"0"}:
+        elif len(keywords["CHECKSUM"]) == 16 and set(keywords["CHECKSUM"]) != {"0"}:
             key = "CHECKSUM" if (data_sum + _sum(file, header, data)) % 0xFFFFFFFF else ""
         if key:
             fault = f"it differs from its {key} in extension {number}: it is damaged or was edited"
@@ -177,8 +174,8 @@ def _sum(file: IO[bytes], start: int, stop: int) -> int:
     """Return the sum of the 32-bit words of a part of a file, whose carries appendix J of the standard adds to it."""
     total = 0
     for place in range(start, stop, PIECE):
-        part = _bytes_at(file, place, min(place + PIECE, stop))
-        total += int(np.frombuffer(part + b"\0" * (-len(part) % 4), ">u4").sum(dtype=np.uint64))
+        words = _bytes_at(file, place, min(place + PIECE, stop))
+        total += int(np.frombuffer(words + b"\0" * (-len(words) % 4), ">u4").sum(dtype=np.uint64))
     return total
 
 
@@ -188,9 +185,9 @@ WAVE_UNITS, FLUX_UNITS = ("CUNIT1", "XUNITS", "WAVEUNIT"), ("BUNIT", "YUNITS", "
 
 def unit_at(keys: Sequence[str], *headers: Any) -> str:
     """Return the unit that the first of some keywords states; empty if none does."""
-    stated = next((text for key in keys for header in headers if (text := text_at(header, key))), "")
+    unit = next((text for key in keys for header in headers if (text := text_at(header, key))), "")
     # APOGEE: Flux (10^-17 erg/s/cm^2/Ang).
-    return re.sub(r"(?i)^flux(?: density)?\s*\((.*)\)$", r"\1", stated)
+    return re.sub(r"(?i)^flux(?: density)?\s*\((.*)\)$", r"\1", unit)
 
 
 def column_values(data: Any, column: Any) -> Any:
@@ -227,8 +224,8 @@ _AXIS_NAMES = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}
 def _number_at(headers: Sequence[Any], *keys: str) -> float | None:
     """Return the first number that headers have under one of some keys."""
     for key in keys:
-        for one in headers:
-            value = one.get(key)
+        for header in headers:
+            value = header.get(key)
             if isinstance(value, int | float) and not isinstance(value, bool):
                 return float(value)
     return None
@@ -321,23 +318,23 @@ def _time_scale(header: Any, number: int) -> str:
 class FitsTables(TableFile):
     """An open FITS file.
 
-    The columns of the extension `hdu`, a name or number, are searched first; by default those of the first table with a
-    column of each of the `wanted` groups of names, or else of the first table.
+    The columns of an extension, by its name or number, are searched first; by default those of the first table with a
+    column of each of the `groups` of names, or else of the first table.
     """
 
     def __init__(
-        self, hdus: fits.HDUList, what: str, hdu: str | None = None, wanted: tuple[tuple[str, ...], ...] = ()
+        self, hdus: fits.HDUList, label: str, name: str | None = None, groups: Sequence[Sequence[str]] = ()
     ) -> None:
         self.hdus = hdus
-        self.tables = [k for k, one in enumerate(hdus) if hasattr(one, "columns") and not one.is_image]
-        self.images = [k for k, one in enumerate(hdus) if getattr(one, "is_image", False) and one.header.get("NAXIS")]
-        titles = {k: [str(name) for name in hdus[k].columns.names] for k in self.tables}
-        lower = {k: {title.lower() for title in held} for k, held in titles.items()}
-        fitting = [k for k in self.tables if all(lower[k] & {name.lower() for name in names} for names in wanted)]
-        at = None if hdu is None else self._number(hdu)
-        if hdu is not None and at is None:
-            held = ", ".join(self._label(k) for k in range(len(hdus)))
-            raise InputError.of("hdu", hdu, f"one of {held}", where=what)
+        self.tables = [k for k, hdu in enumerate(hdus) if hasattr(hdu, "columns") and not hdu.is_image]
+        self.images = [k for k, hdu in enumerate(hdus) if hdu.is_image and hdu.header.get("NAXIS")]
+        titles = {k: [str(title) for title in hdus[k].columns.names] for k in self.tables}
+        lower = {k: {title.lower() for title in titles[k]} for k in self.tables}
+        fitting = [k for k in self.tables if all(lower[k] & {title.lower() for title in group} for group in groups)]
+        at = None if name is None else self._number(name)
+        if name is not None and at is None:
+            extensions = ", ".join(map(self._label, range(len(hdus))))
+            raise InputError.of("hdu", name, f"one of {extensions}", where=label)
         self.chosen = at if at in self.tables else next(iter(fitting or self.tables), None)
         header: dict[str, Any] = {}
         for number in (0, at, self.chosen):
@@ -347,41 +344,42 @@ class FitsTables(TableFile):
             if (scale := _time_scale(header, k)) and str(header.get(f"TFORM{k}", "")) == "2D":
                 header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
                            "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
-        others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen for name in titles[k]]
-        super().__init__(what, header, [*columns, *map(self._label, self.images), *others], columns=columns)
+        elsewhere = [f"{self._label(k)}/{title}" for k in self.tables if k != self.chosen for title in titles[k]]
+        super().__init__(label, header, [*columns, *map(self._label, self.images), *elsewhere], columns=columns)
 
     def named(self, name: str) -> Values | None:
         """Return a column of the chosen table, an image, ``EXTENSION/COLUMN``, or a column of one other table."""
-        if self.chosen is not None and (found := self.column(self.chosen, name)) is not None:
-            return found
+        if self.chosen is not None and (values := self.column(self.chosen, name)) is not None:
+            return values
         at = self._number(name)
         if at in self.images:
             return self.image(at)
         extension, _, column = name.partition("/")
         if column and (number := self._number(extension)) in self.tables:
             return self.column(number, column)
-        others = [found for k in self.tables if (found := self.column(k, name)) is not None]
-        if len(others) > 1:
-            raise InputError(f"{self.what} has {len(others)} columns called {name!r}; give EXTENSION/COLUMN", key=name)
-        return others[0] if others else None
+        columns = [values for k in self.tables if (values := self.column(k, name)) is not None]
+        if len(columns) > 1:
+            fault = f"{self.label} has {len(columns)} columns called {name!r}"
+            raise InputError(f"{fault}; give EXTENSION/COLUMN", key=name)
+        return columns[0] if columns else None
 
     def axis(self, name: str, dimension: int) -> Values:
         """Return the coordinates along an axis of an image, dimension 1 being that of pixels."""
         at = self._number(name)
         if at not in self.images:
-            raise InputError.of("flux", name, "an image, whose header has the coordinates", where=self.what)
+            raise InputError.of("flux", name, "an image, whose header has the coordinates", where=self.label)
         if dimension == 1:
             try:
                 return self.wavelengths(at)[0]
             except InputError as error:
-                raise error.within(self.what) from error
+                raise error.within(self.label) from error
         header = self.hdus[at].header
         first, step, reference = (_number_at([header], f"{key}2") for key in ("CRVAL", "CDELT", "CRPIX"))
         if first is None or step is None or reference is None:
-            fault = f"{self.what}: the image {name!r} needs the times of its rows: CRVAL2, CDELT2 and CRPIX2"
+            fault = f"{self.label}: the image {name!r} needs the times of its rows: CRVAL2, CDELT2 and CRPIX2"
             raise InputError(fault, key="time")
         times = first + step * (np.arange(1, int(header["NAXIS2"]) + 1) - reference)
-        return Values.of(name, times, header.get("CUNIT2"), self.what)
+        return Values.of(name, times, header.get("CUNIT2"), self.label)
 
     def wavelengths(self, number: int) -> tuple[Values, tuple[str, ...]]:
         """Return the wavelengths of the pixels of an image, whose name may say their medium, and notes."""
@@ -391,21 +389,21 @@ class FitsTables(TableFile):
             return multispec_axis(header), ()
         if kind.endswith("-TAB"):
             # The axis refers to the column of a table (FITS standard 4.0, section 8.3).
-            found = self.named(f"{text_at(header, 'PS1_0')}/{text_at(header, 'PS1_1')}")
-            if found is None:
+            axis = self.named(f"{text_at(header, 'PS1_0')}/{text_at(header, 'PS1_1')}")
+            if axis is None:
                 fault = "it lacks the table of its wavelengths: it needs the column that PS1_0 and PS1_1 name"
                 raise InputError(fault, key="wavelength")
-            kind, values, unit = kind[:4], found.numbers().ravel(), found.unit or header.get("CUNIT1")
+            kind, values, unit = kind[:4], axis.numbers().ravel(), axis.unit or header.get("CUNIT1")
         else:
             values, unit, kind, notes = axis_of(header, self.hdus[0].header)
-        return Values.of(_AXIS_NAMES.get(kind, "wavelength"), values, unit, self.what), notes
+        return Values.of(_AXIS_NAMES.get(kind, "wavelength"), values, unit, self.label), notes
 
     def _label(self, number: int) -> str:
         return str(self.hdus[number].name) or str(number)
 
     def _number(self, name: str) -> int | None:
         """Return the number of an extension by its name or number."""
-        labels = [str(one.name).upper() for one in self.hdus]
+        labels = [str(hdu.name).upper() for hdu in self.hdus]
         if name.upper() in labels and name:
             return labels.index(name.upper())
         return int(name) if name.isascii() and name.isdigit() and int(name[:6]) < len(self.hdus) else None
@@ -415,19 +413,19 @@ class FitsTables(TableFile):
         hdu = self.hdus[number]
         shape = tuple(hdu.shape)
 
-        def read(start: int, stop: int) -> Any:
-            with reading(self.what, WHOLE):
-                return hdu.section[start:stop]
+        def read(piece: slice) -> Any:
+            with reading(self.label, WHOLE):
+                return hdu.section[piece]
 
-        return Values(self._label(number), shape, read, text_at(hdu.header, "BUNIT"), self.what)
+        return Values(self._label(number), shape, read, text_at(hdu.header, "BUNIT"), self.label)
 
     def column(self, number: int, name: str) -> Values | None:
         """Return a column of the table in an extension, or None."""
         hdu = self.hdus[number]
-        title = matched(name, map(str, hdu.columns.names), self.what)
+        title = match_name(name, map(str, hdu.columns.names), self.label)
         if title is None:
             return None
-        found = hdu.columns[title]
+        column = hdu.columns[title]
         n_rows = int(hdu.header["NAXIS2"])
         heap = int(hdu.header.get("PCOUNT", 0))
         size = int(hdu.header["NAXIS1"]) * n_rows + heap
@@ -435,31 +433,32 @@ class FitsTables(TableFile):
         is_whole = heap > 0 or hdu.header.get("XTENSION") == "TABLE"
         small = size <= table.PIECE_BYTES or is_whole
         if is_whole and size > limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
-            fault = f"{self.what}: the table {self._label(number)} has text or columns of variable length"
+            fault = f"{self.label}: the table {self._label(number)} has text or columns of variable length"
             raise InputError(f"{fault} and {size >> 20} MiB; use columns of fixed length", key="hdu")
-        place = hdu.columns.names.index(found.name) + 1
+        place = hdu.columns.names.index(column.name) + 1
         pair = _time_scale(self.header, place)
 
-        def read(start: int, stop: int) -> Any:
-            with reading(self.what, WHOLE):
-                values = column_values(hdu.data[start:stop] if small else _piece(hdu, start, stop), found)
+        def read(piece: slice) -> Any:
+            with reading(self.label, WHOLE):
+                values = column_values(hdu.data[piece] if small else _rows(hdu, piece), column)
             if pair and values.ndim == 2 and number == self.chosen:
                 return (values[:, 0] - 2_400_000.5) + values[:, 1]
             return values
 
-        one = np.shape(read(0, min(1, n_rows)))
+        row_shape = np.shape(read(slice(0, min(1, n_rows))))
         width = 0 if small else 2 * int(hdu.header["NAXIS1"])
         ucd = text_at(hdu.header, f"TUCD{place}")
-        return Values(found.name, (n_rows, *one[1:]), read, str(found.unit or "").strip(), self.what, width, ucd)
+        unit = str(column.unit or "").strip()
+        return Values(column.name, (n_rows, *row_shape[1:]), read, unit, self.label, width, ucd)
 
 
-def _piece(hdu: Any, start: int, stop: int) -> Any:
+def _rows(hdu: Any, piece: slice) -> Any:
     """Read some rows of a table."""
     from astropy.io import fits
 
-    place, width = hdu.fileinfo(), int(hdu.header["NAXIS1"])
-    place["file"].seek(place["datLoc"] + start * width)
-    raw = place["file"].read((stop - start) * width)
+    place, width, n = hdu.fileinfo(), int(hdu.header["NAXIS1"]), piece.stop - piece.start
+    place["file"].seek(place["datLoc"] + piece.start * width)
+    raw = place["file"].read(n * width)
     header = hdu.header.copy()
-    header["NAXIS2"] = stop - start
+    header["NAXIS2"] = n
     return fits.BinTableHDU.fromstring(header.tostring().encode() + raw + b"\0" * (-len(raw) % BLOCK)).data

@@ -9,7 +9,7 @@ from typing import Any
 
 from mauvecl.schema.errors import InputError, shortened
 
-#: As archives and programs write them, in lower case; an empty cell has no value in any case.
+#: Words for missing values as archives and programs write them, in lower case; an empty cell has no value either.
 MISSING_WORDS = ("", "null", "none", "n/a", "na", "--", "---", "-", "...", "masked", "indef", "<na>")
 _NO_VALUE = {*MISSING_WORDS, "nan", "nat"}
 #: Errors of spreadsheets (``#N/A``, ``#DIV/0!``), of C (``1.#QNAN``), and numbers too long for Fortran (``*****``).
@@ -29,7 +29,7 @@ def is_missing_position(text: str) -> bool:
 
 
 def by_word(words: Mapping[str, str]) -> dict[str, str]:
-    """Return the meaning of each word, of lists of words by their meaning."""
+    """Return the meaning of each word from lists of words by their meaning."""
     return {word: meaning for meaning, text in words.items() for word in text.split()}
 
 
@@ -101,16 +101,14 @@ def key_of(name: str) -> str:
     return re.sub(r"[\s_]+", "_", name.strip().strip("\"'").casefold())
 
 
-def matched(name: str, names: Iterable[str], what: str = "") -> str | None:
-    """Return the one of some names that is meant, or None; raise InputError if several differ from it in case only."""
-    held = list(names)
-    if name in held:
+def match_name(name: str, names: Iterable[str], label: str = "") -> str | None:
+    """Return the name that a text means, in any case, or None; raise InputError if several differ in case only."""
+    fitting = [title for title in names if title.strip().casefold() == name.strip().casefold()]
+    if name in fitting:
         return name
-    fitting = [one for one in held if one.strip() == name.strip()] or [
-        one for one in held if one.strip().casefold() == name.strip().casefold()
-    ]
+    fitting = [title for title in fitting if title.strip() == name.strip()] or fitting
     if len(fitting) > 1:
-        place = f"{what}: " if what else ""
+        place = f"{label}: " if label else ""
         fault = f"{place}{len(fitting)} columns are called {shortened(name)} but for case ({', '.join(fitting)})"
         raise InputError(f"{fault}; give the exact name of one", key="column")
     return fitting[0] if fitting else None
@@ -125,30 +123,30 @@ def text_at(header: Any, key: str) -> str:
     return "" if value is None else str(value).strip()
 
 
-def first_of(wanted: Sequence[str], names: Iterable[str], what: str = "") -> str | None:
-    """Return the name that is the first of some wanted ones, in any spelling and with or without a unit in brackets."""
-    held = [(name, key_of(name), key_of(divided_unit(name)[0])) for name in names]
-    for one in wanted:
-        key = key_of(one)
+def first_of(candidates: Sequence[str], names: Iterable[str], label: str = "") -> str | None:
+    """Return the name of the first candidate among some names, in any spelling, with or without a unit in brackets."""
+    keys = [(name, key_of(name), key_of(divided_unit(name)[0])) for name in names]
+    for candidate in candidates:
+        key = key_of(candidate)
         fitting = (
-            [name for name, _, _ in held if name == one]
-            or [name for name, plain, _ in held if plain == key]
-            or [name for name, _, base in held if base == key]
+            [name for name, _, _ in keys if name == candidate]
+            or [name for name, plain, _ in keys if plain == key]
+            or [name for name, _, base in keys if base == key]
         )
         if len(fitting) > 1:
-            place = f"{what}: " if what else ""
-            fault = f"{place}several columns may be {one}: {', '.join(map(shortened, fitting))}"
-            raise InputError(f"{fault}; give one of them, or a mapping that names it", key=one)
+            place = f"{label}: " if label else ""
+            fault = f"{place}several columns may be {candidate}: {', '.join(map(shortened, fitting))}"
+            raise InputError(f"{fault}; give one of them, or a mapping that names it", key=candidate)
         if fitting:
             return fitting[0]
     return None
 
 
 def is_magnitude(name: str) -> bool:
-    """Return whether the name of a column is that of magnitudes."""
+    """Return whether a column has the name of magnitudes."""
     # Capitals divide words: VMag, instMag.
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    return any(_MAGNITUDE.search(one.lower()) is not None for one in (name, spaced))
+    return any(_MAGNITUDE.search(text.lower()) is not None for text in (name, spaced))
 
 
 #: Signs, quotes and blanks of typeset text, which are read as those of a keyboard.
@@ -171,11 +169,11 @@ def angle_unit(text: str) -> str | None:
     """Return the unit of an angle as astropy names it, or None for another unit."""
     import astropy.units as u
 
-    # Of old files of the Gaia archive.
+    # Old files of the Gaia archive write Angle[deg].
     text = re.sub(r"^Angle\[(.*)\]$", r"\1", text)
-    found = ANGLES.get(text.strip().strip("\"'" if len(text.strip()) > 1 else "").lower())
-    if found is not None:
-        return found
+    word = text.strip().strip("\"'" if len(text.strip()) > 1 else "").lower()
+    if word in ANGLES:
+        return ANGLES[word]
     try:
         unit = u.Unit(text)
     except (ValueError, TypeError):
@@ -191,15 +189,15 @@ def position(text: str) -> tuple[float, float]:
     """
     plain = " ".join(_LABEL.sub(" ", text.translate(_TYPESET)).strip().strip("()[]").split())
     if plain.count(",") + plain.count(";") == 1:
-        parts = re.split(r"\s*[,;]\s*", plain)
+        pair = re.split(r"\s*[,;]\s*", plain)
     elif match := re.fullmatch(r"([^-+\s][^-+]*(?:[eE][-+]\d[^-+]*)?)\s*((?<![eE])[-+].*)", plain):
-        parts = [match[1].strip(), match[2].strip()]
+        pair = [match[1].strip(), match[2].strip()]
     else:
         words = plain.split()
         half = len(words) // 2
-        parts = [" ".join(words[:half]), " ".join(words[half:])] if len(words) in (2, 6) else []
+        pair = [" ".join(words[:half]), " ".join(words[half:])] if len(words) in (2, 6) else []
     try:
-        ra, dec = (angle(part, right_ascension=k == 0, pair=len(parts[1 - k].split())) for k, part in enumerate(parts))
+        ra, dec = (angle(text, right_ascension=k == 0, pair=len(pair[1 - k].split())) for k, text in enumerate(pair))
     except InputError as error:
         raise error.within(f"target = {shortened(text)}, read as right ascension and declination") from error
     except ValueError:
@@ -208,7 +206,7 @@ def position(text: str) -> tuple[float, float]:
 
 
 def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) -> float:
-    """Return an angle in degrees; raises ValueError if the text is no angle, and InputError if it is out of range.
+    """Return an angle in degrees; raise ValueError if the text is not an angle, and InputError if it is out of range.
 
     Plain numbers are in a unit that astropy names, by default degrees. Numbers with colons are hours for a right
     ascension, as are three plain numbers next to a coordinate of three words, `pair`.
@@ -221,11 +219,11 @@ def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) ->
         # Hours or degrees and minutes without a mark between them, as in J0042-0300.
         raise ValueError(text)
     if match := re.fullmatch(rf"({_NUMBER})\s*([a-zA-Z°'\"]*)", plain):
-        stated = angle_unit(match[2]) if match[2] else unit or "deg"
-        if stated is None:
+        named_unit = angle_unit(match[2]) if match[2] else unit or "deg"
+        if named_unit is None:
             raise ValueError(text)
         # Astropy's angles take 50 us each.
-        value = float(match[1]) if stated == "deg" else _degrees(Angle(float(match[1]), stated))
+        value = float(match[1]) if named_unit == "deg" else _degrees(Angle(float(match[1]), named_unit))
     elif re.fullmatch(r"[+-]?\d+(?::\d+){0,1}:\d+(?:\.\d*)?", plain) or (
         re.fullmatch(r"[+-]?\d+ \d+ \d+(?:\.\d*)?", plain) and pair == 3
     ):

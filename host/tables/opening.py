@@ -6,7 +6,7 @@ import io
 import itertools
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 
 from mauvecl.host.tables import files
 from mauvecl.host.tables.fits_tables import WHOLE, FitsTables, open_fits
-from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.names import match_name
 from mauvecl.host.tables.table import REMARKS, MemoryTable, TableFile, Values
 from mauvecl.host.tables.text_tables import Layout, rows_of_text, text_table
 from mauvecl.schema.errors import InputError, shortened
@@ -33,13 +33,13 @@ CELL = 40
 class LargeTable(TableFile):
     """Rows of a text table in a temporary file, which disappears with this object."""
 
-    def __init__(self, pieces: Iterator[Any], what: str, file: IO[bytes]) -> None:
-        first = MemoryTable(next(pieces), what)
+    def __init__(self, pieces: Iterator[Any], label: str, file: IO[bytes]) -> None:
+        first = MemoryTable(next(pieces), label)
         # One row has the names and units.
-        self.table, self.n_rows, self.file = MemoryTable(first.table[:1], what), 0, file
-        super().__init__(what, first.header, first.names, first.remarks)
+        self.table, self.n_rows, self.file = MemoryTable(first.table[:1], label), 0, file
+        super().__init__(label, first.header, first.names, first.remarks)
         self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
-        tables = itertools.chain([first], (MemoryTable(piece, what) for piece in pieces))
+        tables = itertools.chain([first], (MemoryTable(piece, label) for piece in pieces))
         del first
         for table in tables:
             rows = np.zeros(len(table.table), self.row)
@@ -47,42 +47,35 @@ class LargeTable(TableFile):
                 rows[name] = self._cells(table.find(name), self.row[name].kind == "f")
             rows.tofile(self.file)
             self.n_rows += len(rows)
+        self.latest: tuple[slice | None, Any] = None, None
 
     def _cells(self, column: Values, are_numbers: bool) -> Any:
         """Return the next rows of a column as numbers or short texts."""
         if are_numbers:
             # Messages count rows from the start of the file.
-            held = replace(column, read=lambda start, stop: column.cells)
-            return held.rows(self.n_rows, self.n_rows + column.n_rows)
-        texts = column.texts() or [str(one) for one in column.numbers().tolist()]
+            shifted = replace(column, read=lambda _: column.cells)
+            return shifted.rows(slice(self.n_rows, self.n_rows + column.n_rows))
+        texts = column.texts() or [str(number) for number in column.numbers().tolist()]
         if any(len(text) > CELL for text in texts):
-            fault = f"{self.what}: {column.name!r} must hold numbers or dates"
+            fault = f"{self.label}: {column.name!r} must hold numbers or dates"
             raise InputError(f"{fault}, but a cell has more than {CELL} characters", key=column.name)
         return texts
 
-    def _rows(self, start: int, stop: int) -> Any:
-        self.file.seek(start * self.row.itemsize)
-        return np.fromfile(self.file, self.row, max(0, stop - start))
+    def _rows(self, piece: slice) -> Any:
+        # Columns are read one after the other, and each reads all columns of its rows.
+        if piece != self.latest[0]:
+            self.file.seek(piece.start * self.row.itemsize)
+            self.latest = piece, np.fromfile(self.file, self.row, max(0, piece.stop - piece.start))
+        return self.latest[1]
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
-        found = matched(name, self.names, self.what)
-        if found is None:
+        title = match_name(name, self.names, self.label)
+        if title is None:
             return None
-        # A copy, since a column of a piece would keep the whole piece.
-        return Values(name, (self.n_rows,), lambda start, stop: self._rows(start, stop)[found].copy(),
-                      self.table.find(name).unit, self.what, self.row.itemsize)  # fmt: skip
-
-    def _side_by_side(self, pattern: str) -> Values | None:
-        found, names = super()._side_by_side(pattern), self.matching(pattern)
-        if found is None or any(self.row[name].kind != "f" for name in names):
-            return found
-
-        def read(start: int, stop: int) -> Any:
-            rows = self._rows(start, stop)
-            return np.column_stack([rows[name] for name in names])
-
-        return replace(found, read=read, row_bytes=self.row.itemsize)
+        # A copy, since a view of a column would keep all columns of the piece in memory.
+        return Values(name, (self.n_rows,), lambda piece: self._rows(piece)[title].copy(),
+                      self.table.find(name).unit, self.label, self.row.itemsize)  # fmt: skip
 
 
 def _numbers(values: Values) -> bool:
@@ -94,50 +87,50 @@ def _numbers(values: Values) -> bool:
     return True
 
 
-def _pieces(text: IO[str], what: str, commas: bool) -> Iterator[Any]:
+def _pieces(text: IO[str], label: str, commas: bool) -> Iterator[Any]:
     """Yield tables of consecutive rows, of which the first has the keywords of comments above them."""
-    lines = files.lines_in(text, what)
+    lines = files.lines_in(text, label)
     # Each piece of ECSV begins with the header and the names.
     head: list[str] = []
-    kept, size = [next(lines, "")], 0
-    if kept[0].startswith("# %ECSV"):
-        head, kept = kept, []
+    waiting, size = [next(lines, "")], 0
+    if waiting[0].startswith("# %ECSV"):
+        head, waiting = waiting, []
         while head[-1].startswith("#") or (head[-1] and not head[-1].strip()):
             size += len(head[-1])
-            _check_head(size, what)
+            _check_head(size, label)
             head.append(next(lines, ""))
         size = 0
     layout: Layout | None = None
     first = 0
     for line in itertools.chain(lines, [""]):
-        kept.append(line)
+        waiting.append(line)
         size += len(line)
         if line and size < PIECE:
             continue
         if head:
-            piece = text_table("".join(head + kept), what, commas)
+            piece = text_table("".join(head + waiting), label, commas)
         else:
-            piece, found = rows_of_text("".join(kept), what, commas, layout, first)
+            piece, layout_of_piece = rows_of_text("".join(waiting), label, commas, layout, first)
             if not len(piece) and not first:
-                _check_head(size, what)
+                _check_head(size, label)
                 continue
-            layout = found
-        kept, size = [], 0
+            layout = layout_of_piece
+        waiting, size = [], 0
         if len(piece):
             first += len(piece)
             yield piece
     if not first:
-        raise InputError(f"{what} has no rows, but needs one for each frame", key="frames")
+        raise InputError(f"{label} has no rows, but needs one for each frame", key="frames")
 
 
-def _check_head(size: int, what: str) -> None:
+def _check_head(size: int, label: str) -> None:
     """Raise InputError for more than `MOST_HEADER` characters above the rows."""
     if size > files.MOST_HEADER:
-        fault = f"{what} must have at most {files.MOST_HEADER} characters of comments and empty lines before its rows"
+        fault = f"{label} must have at most {files.MOST_HEADER} characters of comments and empty lines before its rows"
         raise InputError(fault, key="file")
 
 
-#: What a file must be, for messages.
+#: Forms of files that are read, for messages.
 FORMATS = "must be text such as CSV, ECSV, FITS or VOTable"
 Form = Literal["FITS", "HDF5", "VOTable", "XML", "ECSV", "text"]
 
@@ -150,13 +143,13 @@ def form_of(start: bytes) -> Form:
         return "HDF5"
     text = start[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if text.startswith(b"<"):
-        known = re.match(rb"<(\?xml|!--|votable|vot:)", text, re.IGNORECASE) and b"VOTABLE" in text.upper()
-        return "VOTable" if known else "XML"
+        is_votable = re.match(rb"<(\?xml|!--|votable|vot:)", text, re.IGNORECASE) and b"VOTABLE" in text.upper()
+        return "VOTable" if is_votable else "XML"
     return "ECSV" if re.match(rb"#\s*%ECSV", text) else "text"
 
 
 @contextmanager
-def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> Iterator[tuple[Form, IO[bytes]]]:
+def open_content(path: Path, label: str, kind: str, *, large: bool = False) -> Iterator[tuple[Form, IO[bytes]]]:
     """Open a file within limits of size and unpack it, and recognise its form by its first bytes; see `open_table`."""
     if not large:
         files.check_size(path, kind)
@@ -167,14 +160,14 @@ def open_content(path: Path, what: str, kind: str, *, large: bool = False) -> It
         if form in ("FITS", "HDF5") or (large and form in ("text", "ECSV") and not start.startswith((*files.PACKED,))):
             yield form, raw
             return
-        content = files.unpacked(files.read_bytes(path, kind), what)
+        content = files.unpacked(files.read_bytes(path, kind), label)
         yield form_of(content[:4096]), io.BytesIO(content)
 
 
 @contextmanager
 def open_table(
     path: Path,
-    what: str,
+    label: str,
     kind: str = "file",
     *,
     check: bool = True,
@@ -184,32 +177,32 @@ def open_table(
 ) -> Iterator[TableFile]:
     """Open the table in a file: text, ECSV, FITS or VOTable, packed by gzip, bzip2 or xz or not.
 
-    For messages, `what` and `kind` are the file and its kind. A FITS file that can be read whole has its checksums
+    For messages, `label` and `kind` are the file and its kind. A FITS file that can be read whole has its checksums
     verified (`check`). A `large` file, which can be read in pieces, may exceed MAUVECL_LARGEST_FILE_MIB. Functions of
-    the open file and of `what` make tables of FITS (`of_fits`, by default of the first table) and HDF5 (`of_hdf5`).
+    the open file and of `label` make tables of FITS (`of_fits`, by default of the first table) and HDF5 (`of_hdf5`).
     """
     commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
-    with open_content(path, what, kind, large=large) as (form, content):
+    with open_content(path, label, kind, large=large) as (form, content):
         size = content.seek(0, io.SEEK_END)
         content.seek(0)
         if form == "FITS":
             check &= size <= files.limit_bytes("MAUVECL_LARGEST_FILE_MIB")
-            with open_fits(content, what, check=check) as hdus:
-                with files.reading(what, WHOLE):
-                    found = of_fits(hdus, what)
-                yield _filled(found)
+            with open_fits(content, label, check=check) as hdus:
+                with files.reading(label, WHOLE):
+                    table = of_fits(hdus, label)
+                yield _check_rows(table)
         elif form == "HDF5" and of_hdf5 is not None:
-            with of_hdf5(content, what) as stored:
+            with of_hdf5(content, label) as stored:
                 yield stored
         elif form in ("text", "ECSV") and size > LARGE:
             with io.TextIOWrapper(content, "utf-8-sig") as text, tempfile.TemporaryFile() as rows:
-                yield LargeTable(_pieces(text, what, commas), what, rows)
+                yield LargeTable(_pieces(text, label, commas), label, rows)
         elif form == "VOTable":
-            if (first := next(votables(content.read(), what), None)) is None:
-                raise InputError(f"{what} has no table, but needs one", key="file")
-            yield _filled(first)
+            if (first := next(votables(content.read(), label), None)) is None:
+                raise InputError(f"{label} has no table, but needs one", key="file")
+            yield _check_rows(first)
         else:
-            yield _filled(MemoryTable(text_table(text_in(form, content.read(), what), what, commas), what))
+            yield _check_rows(MemoryTable(text_table(text_in(form, content.read(), label), label, commas), label))
 
 
 #: Forms of files that are not read, by their first bytes.
@@ -226,73 +219,79 @@ FOREIGN = {
 }  # fmt: skip
 
 
-def text_in(form: Form, content: bytes, what: str) -> str:
+def text_in(form: Form, content: bytes, label: str) -> str:
     """Return the text of a file; raise InputError for forms that are not read, such as JSON, or a page in its place."""
     tar = "a TAR archive" if content[257:262] == b"ustar" else ""
     marks = b"".join(content[:512].split())
     if foreign := tar or next((kind for mark, kind in FOREIGN.items() if marks.startswith(mark)), ""):
-        raise InputError(f"{what} is {foreign}, but {FORMATS}", key="file")
+        raise InputError(f"{label} is {foreign}, but {FORMATS}", key="file")
     if form == "XML":
         start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
-        fault = f"{what} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
+        fault = f"{label} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
         raise InputError(f"{fault}, but {FORMATS}", key="file")
-    text = files.as_text(content, what)
+    text = files.as_text(content, label)
     if not text.strip():
-        raise InputError(f"{what} is empty, but {FORMATS}", key="file")
+        raise InputError(f"{label} is empty, but {FORMATS}", key="file")
     return text
 
 
-def votables(content: bytes, what: str) -> Iterator[MemoryTable]:
+def votables(content: bytes, label: str) -> Iterator[MemoryTable]:
     """Yield the tables of a VOTable; its parameters and systems (TIMESYS, COOSYS) become keywords as in FITS."""
     from astropy.io import votable
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError(f"{what} must be a VOTable without entities", key="file")
-    with files.reading(what, "give a whole VOTable"):
+        raise InputError(f"{label} must be a VOTable without entities", key="file")
+    with files.reading(label, "give a whole VOTable"):
         file = votable.parse(io.BytesIO(content), verify="ignore")
-    status = {info.value: info.content for part in file.resources for info in part.infos if info.name == "QUERY_STATUS"}
+    infos = (info for resource in file.resources for info in resource.infos)
+    status = {info.value: info.content for info in infos if info.name == "QUERY_STATUS"}
     if "ERROR" in status:
-        said = shortened(str(status["ERROR"] or "without a reason"))
-        fault = f"{what} is the answer to a query that failed: {said}"
+        reason = shortened(str(status["ERROR"] or "without a reason"))
+        fault = f"{label} is the answer to a query that failed: {reason}"
         raise InputError(f"{fault}; give that of one that succeeds", key="file")
-    shared = {str(one.name or one.ID): one.value for resource in file.resources for one in resource.params}
+    shared = _parameters(parameter for resource in file.resources for parameter in resource.params)
     for resource in file.resources:
-        for one in resource.time_systems:
+        for system in resource.time_systems:
             # A number of days, or the words JD-origin and MJD-origin.
-            origin = {"JD-origin": 0.0, "MJD-origin": 2_400_000.5}.get(str(one.timeorigin), one.timeorigin)
+            origin = {"JD-origin": 0.0, "MJD-origin": 2_400_000.5}.get(str(system.timeorigin), system.timeorigin)
             shared |= {} if origin is None else {"JDREF": float(origin)}
-            shared |= {"TIMESYS": str(one.timescale or ""), "TREFPOS": str(one.refposition or "")}
-        for place in resource.coordinate_systems:
-            shared["COOSYS"] = str(place.system or "")
+            shared |= {"TIMESYS": str(system.timescale or ""), "TREFPOS": str(system.refposition or "")}
+        for system in resource.coordinate_systems:
+            shared["COOSYS"] = str(system.system or "")
     for table in file.iter_tables():
-        with files.parsing(what, "give a whole VOTable"):
+        with files.parsing(label, "give a whole VOTable"):
             for field in table.fields:
                 field.name = field.name or field.ID
             read = table.to_table(use_names_over_ids=True)
             if "OVERFLOW" in status:
                 read.meta[REMARKS] = ("the query had more rows than the archive returns: the table is incomplete",)
-            found = MemoryTable(read, what)
-        found.header |= shared | {str(one.name or one.ID): one.value for one in table.params}
-        found.table.meta |= found.header
-        yield found
+            memory_table = MemoryTable(read, label)
+        memory_table.header |= shared | _parameters(table.params)
+        memory_table.table.meta |= memory_table.header
+        yield memory_table
 
 
-def _filled(file: TableFile) -> TableFile:
-    """Return a file; raise InputError if it has nothing with rows."""
+def _parameters(parameters: Iterable[Any]) -> dict[str, Any]:
+    return {str(parameter.name or parameter.ID): parameter.value for parameter in parameters}
+
+
+def _check_rows(file: TableFile) -> TableFile:
+    """Return a file; raise InputError if it has no rows."""
     if not file.names:
-        raise InputError(f"{file.what} has no table and no image; give a row for each frame, star or flare", key="file")
+        fault = f"{file.label} has no table and no image"
+        raise InputError(f"{fault}; give a row for each frame, star or flare", key="file")
     return file
 
 
-def read_table(path: str | Path, what: str) -> Table:
+def read_table(path: str | Path, kind: str) -> Table:
     """Read a small table into memory; see `open_table`."""
     from astropy.table import MaskedColumn, Table
 
     path = Path(path)
-    with open_table(path, f"{what} {shortened(str(path))}", what) as file:
+    with open_table(path, f"{kind} {shortened(str(path))}", kind) as file:
         if isinstance(file, MemoryTable):
             return file.table
-        found = [file.find(name) for name in file.columns]
+        columns = [file.find(name) for name in file.columns]
         # Undefined cells are masked.
-        return Table([MaskedColumn(np.ma.array(one.cells, copy=True), name, unit=one.unit or None)
-                      for name, one in zip(file.columns, found, strict=True)], meta=file.header)  # fmt: skip
+        return Table([MaskedColumn(np.ma.array(column.cells, copy=True), name, unit=column.unit or None)
+                      for name, column in zip(file.columns, columns, strict=True)], meta=file.header)  # fmt: skip

@@ -24,42 +24,42 @@ from mauvecl.schema.errors import InputError, shortened
 if TYPE_CHECKING:
     from astropy.table import Table
 
-# IPAC's headings begin with |, as do rows of numbers of others, and its keywords with a backslash.
+# IPAC's headings begin with |, as do rows of numbers in other tables; its keywords begin with a backslash.
 _COMMENT = re.compile(r"\s*(#|%|!|;|//|\\|\|)")
 _BARRED = re.compile(r"\s*\|\s*[-+]?\.?\d")
 _NUMBER = re.compile(r"[+-]?(?:\d[\d_]*[.,]?\d*|[.,]\d+)(?:[eEdD][+-]?\d+)?(?![\w.])")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eEdD][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?\d*\.\d+(?:[eEdD][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
-#: A line without cells, one of reStructuredText or of a frame, and Excel's statement of the mark.
+#: A line without cells: a rule, as of reStructuredText, or Excel's statement of the mark between cells.
 _RULE = re.compile(r"[\s,;|]*|\s*(?:={3,}(?:\s+|$))*|\s*(?=[-=:|]*\+)[-=+:|]+\s*|\"?sep=.\"?", re.IGNORECASE)
 #: Dates and times of day in cells of their own.
 _DAY, _CLOCK = re.compile(r"\d{4}-\d\d-\d\d"), re.compile(r"\d\d:\d\d(?::\d\d(?:\.\d*)?)?")
-#: Comments on times that are those of the start of frames.
+#: Comments that say that times are those of the start of frames.
 _AT_START = re.compile(r"\b(?:dates?|times?|H?JD)\b[^.]*\bat (?:the )?start of (?:the )?exposure", re.IGNORECASE)
 _QUOTED = re.compile(r'"[^"]*"')
 #: Words that occur in prose but not in names of columns.
 PROSE = re.compile(
     r"\b(?:and|at|is|are|the|for|with|vs|versus|from|by|on|was|were|this|that|has|have)\b", re.IGNORECASE
 )
-#: Marks between cells; the first of those that divide most lines alike counts.
+#: Marks between cells; of those that divide most lines alike, the first is used.
 MARKS = ("\t", ";", "|", ",")
 #: Number of lines that show how a text is divided.
 SAMPLE = 50
 
 
-def read_columns(what: str, kind: str, path: Path, unit: str = "") -> Float:
-    """Read times and values, of a `kind` for messages, from a file, shape (n, 2); see `columns`."""
-    return columns(f"{what} {shortened(path.name)}", read_text(path, what), f"times and {kind}", unit)
+def read_columns(kind: str, noun: str, path: Path, unit: str = "") -> Float:
+    """Read times and values from a file, shape (n, 2), see `columns`; `kind` and `noun` name both in messages."""
+    return columns(f"{kind} {shortened(path.name)}", read_text(path, kind), f"times and {noun}", unit)
 
 
-def columns(what: str, text: str, expected: str, unit: str = "") -> Float:
+def columns(label: str, text: str, expected: str, unit: str = "") -> Float:
     """Parse rows of two numbers in any form of text, shape (n, 2).
 
-    The first column of the result is in `unit`, as is that of the text unless its header states another one. `what` and
-    `expected` are the text and its two columns, for messages.
+    The first column of the result is in `unit`, as is that of the text unless its header states another one. `label`
+    and `expected` name the text and its two columns in messages.
     """
-    with parsing(what, f"give two columns of numbers: {expected}"):
+    with parsing(label, f"give two columns of numbers: {expected}"):
         try:
             lines = NumberLines(text, expected)
             if odd := next((len(cells) for cells in lines.cells if len(cells) != 2), 0):
@@ -67,7 +67,7 @@ def columns(what: str, text: str, expected: str, unit: str = "") -> Float:
             first, second = (lines.column(k, str(k + 1)).numbers() for k in range(2))
             return np.column_stack([_in_unit(first, lines.comments, unit) if unit else first, second])
         except InputError as error:
-            raise error.within(what) from error
+            raise error.within(label) from error
 
 
 #: A word that may be a unit, in the header of numbers: ``(nm)``, ``in Angstrom``, ``time_min``, ``unit: um``.
@@ -78,19 +78,19 @@ def _in_unit(values: Float, header: str, unit: str) -> Float:
     """Return times or wavelengths in a unit; raise InputError if a header states several."""
     import astropy.units as u
 
-    said = {}
+    words = {}
     for word in (match[1] or match[2] for match in _UNIT_WORD.finditer(header)):
         with contextlib.suppress(ValueError, TypeError):
-            known = unit_in(word) if unit == "s" else unit_of(word)
-            if known.is_equivalent(u.Unit(unit), u.spectral() if unit == "nm" else []):
-                said[known] = word
-    if len(said) > 1:
-        raise InputError(f"its header must state one unit, not {' and '.join(said.values())}", key="unit")
-    return np.asarray((values * next(iter(said), u.Unit(unit))).to_value(unit, u.spectral()))
+            parsed = unit_in(word) if unit == "s" else unit_of(word)
+            if parsed.is_equivalent(u.Unit(unit), u.spectral() if unit == "nm" else []):
+                words[parsed] = word
+    if len(words) > 1:
+        raise InputError(f"its header must state one unit, not {' and '.join(words.values())}", key="unit")
+    return np.asarray((values * next(iter(words), u.Unit(unit))).to_value(unit, u.spectral()))
 
 
 class NumberLines:
-    """Header and rows of a text, which should have the `expected` numbers; columns are parsed when they are read."""
+    """Header and rows of a text that should hold the `expected` numbers; columns are parsed when they are read."""
 
     def __init__(self, text: str, expected: str) -> None:
         self.expected = expected
@@ -128,13 +128,13 @@ class NumberLines:
         """Return a column of numbers."""
         return Values(name, (len(self.cells),), partial(self._numbers, place), unit)
 
-    def _numbers(self, place: int, start: int, stop: int) -> Any:
+    def _numbers(self, place: int, piece: slice) -> Any:
         values: list[float] = []
         try:
-            for cells in self.cells[start:stop]:
+            for cells in self.cells[piece]:
                 values.append(number_in(cells[place]))
         except (IndexError, ValueError) as error:
-            number, line = self.lines[start + len(values)]
+            number, line = self.lines[piece.start + len(values)]
             n = "one column" if len(cells) == 1 else f"{len(cells)} columns"
             fault = "is not numeric" if len(cells) > place else f"has {n}"
             fault = f"line {number}: {shortened(line, 60)} {fault}, but must hold {self.expected}"
@@ -186,7 +186,7 @@ class Layout:
 
 
 def rows_of_text(
-    text: str, what: str, commas: bool, layout: Layout | None = None, first: int = 0
+    text: str, label: str, commas: bool, layout: Layout | None = None, first: int = 0
 ) -> tuple[Table, Layout]:
     """Parse a text table whose cells stay texts, with the keywords of its comments, and return its layout as well.
 
@@ -204,7 +204,7 @@ def rows_of_text(
     if n_marked > 1:
         # Fortran's mark of comments, in the header of BRITE's light curves. Rows have numbers after a letter.
         lines[:n_marked] = [f"#{line[1:]}" for line in lines[:n_marked]]
-    check_cells([line for line in lines if line[0] != "#"], what)
+    check_cells([line for line in lines if line[0] != "#"], label)
     mark = layout.mark if layout else _mark([line for line in lines if line.lstrip()[0] != "#"], commas)
     # SIMBAD calls its first column #, as wide as its number of stars.
     marked = re.compile(rf"\s*{re.escape(mark)}" if mark in (";", "|") else r"(?!)")
@@ -214,7 +214,7 @@ def rows_of_text(
     cells = _with_dates(_split(data, mark))
     if layout is None:
         n_above = next((k for k, comment in enumerate(is_comment) if not comment), len(lines))
-        layout, cells = _divided(cells, [_remark(line) for line in lines[:n_above]], data, mark, what)
+        layout, cells = _divided(cells, [_remark(line) for line in lines[:n_above]], data, mark, label)
     elif layout.trailing:
         cells = [row[:-1] for row in cells]
     if layout.decimal:
@@ -222,10 +222,10 @@ def rows_of_text(
     n = len(layout.names)
     if odd := next(((number, len(row)) for number, row in enumerate(cells, first + 1) if len(row) != n), None):
         # The file may be cut short.
-        fault = f"{what} has {odd[1]} cells in row {odd[0]}, but must have {n} as in the first line"
+        fault = f"{label} has {odd[1]} cells in row {odd[0]}, but must have {n} as in the first line"
         raise InputError(fault, key="file")
     columns = zip(*cells, strict=True) if cells else ((),) * n
-    table = Table({name: np.array(one, str) for name, one in zip(layout.names, columns, strict=True)})
+    table = Table({name: np.array(column, str) for name, column in zip(layout.names, columns, strict=True)})
     table.meta |= {"comments": comments} | keywords_of(comments)
     if any(map(_AT_START.search, comments)):
         table.meta.setdefault("TIMEPIXR", 0.0)
@@ -237,7 +237,7 @@ def rows_of_text(
 
 
 def _divided(
-    cells: list[list[str]], above: list[str], lines: list[str], mark: str, what: str
+    cells: list[list[str]], above: list[str], lines: list[str], mark: str, label: str
 ) -> tuple[Layout, list[list[str]]]:
     """Find the names and units of columns, and return them with the rows."""
     if not cells:
@@ -257,7 +257,7 @@ def _divided(
     names, units = ([], []) if is_headed else _names_above(n, [*above, *lines[:at]], mark)
     if is_row and not names:
         if at:
-            fault = f"{what} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
+            fault = f"{label} has {n} cells in row 1, but must have {len(cells[at - 1])} as in the line above"
             raise InputError(fault, key="file")
         names = [f"col{k + 1}" for k in range(n)]
     elif not names:
@@ -280,9 +280,9 @@ def _divided(
         # Types of the columns of an RDB table.
         units = []
     plain = [in_brackets(unit.strip("\"'")) for unit in units]
-    stated = tuple(unit if is_stated(unit) else "" for unit in plain)
-    decimal = _has_decimal_commas(cells[at:], what)
-    return Layout(mark, decimal, tuple(_distinct(names)), stated, trailing), cells[at:]
+    stated_units = tuple(unit if is_stated(unit) else "" for unit in plain)
+    decimal = _has_decimal_commas(cells[at:], label)
+    return Layout(mark, decimal, tuple(_distinct(names)), stated_units, trailing), cells[at:]
 
 
 def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
@@ -297,12 +297,12 @@ def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[s
     return units, []
 
 
-def text_table(text: str, what: str, commas: bool) -> Table:
+def text_table(text: str, label: str, commas: bool) -> Table:
     """Parse a table from text: ECSV, those of IPAC and CDS, and rows that marks or blanks divide into texts."""
     from astropy.table import Table
 
     if re.match(r"\s*# %ECSV", text):
-        return parse_ecsv(text, what)
+        return parse_ecsv(text, label)
     lines = [line for line in text[:100_000].splitlines() if line.strip() and line[0] not in "\\#"]
     rows = [line for line in lines if not line.startswith("|")]
     if is_described(text):
@@ -311,15 +311,15 @@ def text_table(text: str, what: str, commas: bool) -> Table:
         # The headings of IPAC's tables have marks, their rows blanks.
         form = "ascii.ipac"
     else:
-        return rows_of_text(text, what, commas)[0]
-    check_cells(text.splitlines(), what)
-    with reading(what, "give a whole table"):
-        # Of an empty line astropy makes a row without values.
+        return rows_of_text(text, label, commas)[0]
+    check_cells(text.splitlines(), label)
+    with reading(label, "give a whole table"):
+        # astropy turns an empty line into a row without values.
         return Table.read([line for line in text.splitlines() if line.strip()], format=form)
 
 
 def is_described(text: str) -> bool:
-    """Return whether a text is a machine-readable table of the journals, or of CDS with its description."""
+    """Return whether a text is a machine-readable table of the journals, or a table of CDS with its description."""
     return re.search(r"(?m)^\s*Byte-by-byte Description", text[:100_000]) is not None
 
 
@@ -365,7 +365,7 @@ def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
 
 
 def _with_dates(cells: list[list[str]]) -> list[list[str]]:
-    """Return cells of which a date and the time of day next to it are one, under the name of the date."""
+    """Join dates with the times of day next to them, under the names of the dates."""
     last = cells[-1] if cells else []
     for at in range(len(last) - 1):
         if _DAY.fullmatch(last[at]) and _CLOCK.fullmatch(last[at + 1]):
@@ -376,14 +376,14 @@ def _with_dates(cells: list[list[str]]) -> list[list[str]]:
     return cells
 
 
-def _has_decimal_commas(rows: list[list[str]], what: str) -> bool:
+def _has_decimal_commas(rows: list[list[str]], label: str) -> bool:
     """Return whether numbers have decimal commas; raise InputError if these may divide thousands."""
     sample = [cell for row in rows[:SAMPLE] for cell in row]
     commas = [cell for cell in sample if _DECIMAL_COMMA.fullmatch(cell)]
     if not commas or any(_DECIMAL_POINT.fullmatch(cell) for cell in sample):
         return False
     if all(_THOUSANDS.fullmatch(cell) for cell in commas):
-        fault = f"{what} has numbers such as {commas[0]}, whose comma may be decimal or divide thousands"
+        fault = f"{label} has numbers such as {commas[0]}, whose comma may be decimal or divide thousands"
         raise InputError(f"{fault}; use decimal points", key="file")
     return True
 
@@ -398,7 +398,7 @@ def divided_names(line: str, n: int, mark: str = "") -> list[str]:
     if n < 2 or PROSE.search(line):
         return []
     line = re.sub(r"^\s*(?:units?(?:\s*[:=]|\s)|(?:columns?|names?)\s*[:=])\s*", "", line, flags=re.IGNORECASE)
-    divisions = [line.strip("|").split(one) for one in ((mark,) if mark else ",;|\t") if one in line]
+    divisions = [line.strip("|").split(divider) for divider in ((mark,) if mark else ",;|\t") if divider in line]
     if not mark:
         divisions += [bracketed(line), line.split(), re.split(r"\s{2,}", line.strip())]
     for division in divisions:
@@ -416,7 +416,7 @@ def bracketed(line: str) -> list[str]:
 
 
 def _distinct(names: list[str]) -> list[str]:
-    """Name columns without a name, and number names that occur twice, so that none is taken for the only one."""
+    """Name columns that have no name, and number names that occur twice."""
     names = [name or f"col{k + 1}" for k, name in enumerate(names)]
     while twice := [name for name, count in Counter(names).items() if count > 1]:
         names = [f"{name}_{names[: k + 1].count(name)}" if name in twice else name for k, name in enumerate(names)]
@@ -424,7 +424,7 @@ def _distinct(names: list[str]) -> list[str]:
 
 
 def _is_cell_of_row(cell: str) -> bool:
-    """Return whether a cell is a number, a date or missing, and no name."""
+    """Return whether a cell is a number, a date or missing, and thus not a name."""
     return is_dated(cell) or is_missing(cell) or _is_finite(cell)
 
 
@@ -452,20 +452,20 @@ _NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-
 
 def numbered_names(lines: Iterable[str], n: int) -> dict[int, str]:
     """Return the names that lines such as "column 2: flux" give to some of `n` columns, by place."""
-    found: dict[int, str] = {}
+    names: dict[int, str] = {}
     for line in lines:
         if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= n:
             unit = re.search(r"\s/\s.*(\[[^\[\]]+\])$", match[2])
             name = re.split(r"[,;:]|\s-\s|\s/\s", match[2])[0].strip()[:60]
-            found.setdefault(int(match[1]) - 1, f"{name} {unit[1]}" if unit else name)
-    return found
+            names.setdefault(int(match[1]) - 1, f"{name} {unit[1]}" if unit else name)
+    return names
 
 
 def keywords_of(lines: Sequence[str]) -> dict[str, str]:
     """Return the keywords in the comments of a text file, as in ``# DATE-OBS = 2026-03-01T12:00:00``."""
-    found = {}
+    keywords = {}
     for line in lines:
         match = re.match(r"\s*[#%!;]+\s*([A-Za-z][\w .-]{0,40}?)\s*[=:]\s*(.*?)\s*(?:\s/\s.*)?$", line)
         if match:
-            found[match[1]] = match[2].strip("\"'")
-    return found
+            keywords[match[1]] = match[2].strip("\"'")
+    return keywords

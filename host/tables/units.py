@@ -46,7 +46,7 @@ SCALE = re.compile(
 )
 #: Wavenumbers in the denominator: W m-2 / cm-1, erg / (s cm2 cm-1), mW m-2 (cm-1)-1, W cm / m2.
 _PER_WAVENUMBER = re.compile(r"/.*\bcm\s*(?:\^|\*\*)?\s*[({]?-1|\(cm\^?-1\)|\bc?m\^?-?2\s+cm$|\bcm\s*/\s*m\^?2$")
-#: Factors of which the first is 1e-16 to those who write it for 10^-16; the second may multiply or divide the numbers.
+#: Ambiguous factors: 10e-16 may stand for 10^-16, and a factor after the unit may multiply or divide the numbers.
 _AMBIGUOUS = re.compile(r"(10(?:\.0*)?)[eEdD]([+-]?\d+)|(?<=.)[*x]\s*10\s*(?:\^|\*\*)\s*\+?(\d+)")
 # Magnitudes with a defined zero point; nanomaggies are linear, 22.5 mag (AB) each (SDSS DR18, "magnitudes").
 _AB = re.compile(r"(?:m(?:ag)?s?[_ (]*)?ab[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.IGNORECASE)
@@ -67,7 +67,7 @@ def is_stated(text: object) -> bool:
 def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     """Parse a unit in any usual spelling.
 
-    Accepted are capitals, plurals, leading powers of ten, ``A`` for Angstrom, ``FLAM``, typographic superscripts,
+    It may have capitals, plurals, leading powers of ten, ``A`` for Angstrom, ``FLAM``, typographic superscripts,
     ``log(...)``, and AB and ST magnitudes. Raises InputError for an unknown unit, other magnitudes, and counts.
     """
     import astropy.units as u
@@ -106,8 +106,8 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
         raise unknown
     if match := _AMBIGUOUS.search(name):
         power = int(match[2] or match[3])
-        other = f"1e{power + 1}" if match[2] else f"1e{-power}"
-        fault = f"unit = {shortened(text.strip())}: its factor may be 1e{power} or {other}"
+        alternative = f"1e{power + 1}" if match[2] else f"1e{-power}"
+        fault = f"unit = {shortened(text.strip())}: its factor may be 1e{power} or {alternative}"
         usual = f"a unit such as '1e{-abs(power)} erg / (s cm2 Angstrom)': `flux_unit` names it"
         raise InputError(f"{fault}; give {usual}", key="unit")
     scale, name = _scale_and_name(name)
@@ -120,22 +120,22 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     # Exponents in brackets: s**(-1), cm^{-2}.
     name = re.sub(r"(?:\^|\*\*)\s*[({]\s*([+-]?\d+)\s*[)}]", r"**\1", name)
     respelled = re.sub(r"[A-Za-zÅåö]+", lambda word: _WORDS.get(word[0].lower(), word[0]), name)
-    known = u.get_current_unit_registry().registry
+    registry = u.get_current_unit_registry().registry
     for spelling in (respelled, name):
         # astropy takes 20 ms to fail, because it searches for similar names.
-        if not all(word in known for word in re.findall(r"[^\W\d_]+", spelling)):
+        if not all(word in registry for word in re.findall(r"[^\W\d_]+", spelling)):
             continue
         try:
             with warnings.catch_warnings():
                 # Several slashes are discouraged but common.
                 warnings.simplefilter("ignore")
-                found = u.CompositeUnit(scale, [u.Unit(spelling)], [1]) if scale != 1.0 else u.Unit(spelling)
+                parsed = u.CompositeUnit(scale, [u.Unit(spelling)], [1]) if scale != 1.0 else u.Unit(spelling)
         except (ValueError, TypeError, OverflowError, RecursionError):
             continue
-        if per_wavenumber and found.is_equivalent((u.W / u.m, u.photon / u.s / u.m)):
+        if per_wavenumber and parsed.is_equivalent((u.W / u.m, u.photon / u.s / u.m)):
             # Per frequency, which is the wavenumber times the speed of light; astropy reduces cm-2 / cm-1 to cm-1.
-            return found / u.CompositeUnit(299_792_458.0, [u.m, u.s], [1, -1])
-        return found
+            return parsed / u.CompositeUnit(299_792_458.0, [u.m, u.s], [1, -1])
+        return parsed
     raise unknown
 
 
@@ -177,6 +177,13 @@ _SINCE = re.compile(
 #: Missions whose light curves count days from an epoch of their own, also where a file does not say so.
 MISSIONS = {"KEPLER": "bkjd", "K2": "bkjd", "TESS": "btjd"}
 
+
+def mission_of(header: Mapping[str, Any]) -> str:
+    """Return the one of `MISSIONS` that a header names; empty if it names none."""
+    keywords = {str(header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
+    return next((mission for mission in MISSIONS if mission in keywords), "")
+
+
 #: Scales that astropy knows, by the names of FITS (standard 4.0, table 30) and usual ones.
 SCALES = {"utc": "utc", "ut": "utc", "gmt": "utc", "tai": "tai", "iat": "tai", "tt": "tt", "tdt": "tt", "et": "tt",
           "tdb": "tdb", "tcb": "tcb", "tcg": "tcg", "ut1": "ut1"}  # fmt: skip
@@ -191,97 +198,87 @@ OFFSETS = ("TIMEOFFS", "TIMEZERO")
 
 
 @dataclass(frozen=True)
-class TimeUnit:
-    """Unit of times, and what its text says of their zero."""
-
-    unit: str  # as astropy names it
-    epoch_mjd: float | None = None
-    scale: str = ""
-    position: str = ""
-
-
-@lru_cache(maxsize=256)
-def time_unit(text: str) -> TimeUnit | None:
-    """Return the unit of times in a text such as "days", "BJD - 2457000, days", "btjd" or "s since 2026-03-01"."""
-    word = re.sub(r"[−–]", "-", text.strip().strip("\"'")).lower()
-    # BJD - 2,457,000
-    word = re.sub(r"(?<=\d),(?=\d{3}(?:\D|$))", "", word)
-    if word in _TIME_WORDS:
-        return TimeUnit(_TIME_WORDS[word])
-    if match := _JULIAN.fullmatch(word):
-        name = match["name"]
-        is_mission = name in ("btjd", "tbjd", "bkjd", "kbjd")
-        scale = match["scale"] or match["end"] or ("tdb" if is_mission else "")
-        place = "BARYCENTER" if "b" in name else "HELIOCENTER" if name.startswith("h") else ""
-        return TimeUnit("d", _DAYS[name] + float(match["less"] or match["plus"] or 0.0), scale, place)
-    if (match := _SINCE.fullmatch(word)) and match["unit"] in _TIME_WORDS:
-        scale = match["scale"] or "utc"
-        epoch = mjd_of([match["date"].upper()], scale, "unit", "its unit")[0]
-        return TimeUnit(_TIME_WORDS[match["unit"]], float(epoch), scale)
-    return None
-
-
-def time_in_name(name: str) -> TimeUnit | None:
-    """Return the unit in the name of a column of times, as in ``BJD - 2454833``, ``time [d]`` or ``time_bjd``."""
-    base, unit = divided_unit(name)
-    is_long = len(name.strip()) > 2 or name.strip().lower() == "jd"
-    if (found := time_unit(name) if is_long else None) or (found := time_unit(unit) if unit else None):
-        return found
-    held = re.split(r"[\s_.]+", base.strip().lower())
-    # The scale follows the dates: time_utc_mjd.
-    words = sorted((word for word in held if word not in (*_TIME_OF, *_PLACES)), key=SCALES.__contains__)
-    found = time_unit(" ".join(words)) if words and len(words) < len(held) else None
-    place = next((_PLACES[word] for word in held if word in _PLACES), "")
-    return replace(found, position=place) if found is not None and place else found
-
-
-@dataclass(frozen=True)
 class TimeSystem:
-    """Time system of a FITS header."""
+    """Unit, zero, scale and place of times, as a FITS header or the text of a unit states them."""
 
-    epoch_mjd: float | None  # date of time zero
-    scale: str  # in lower case, as astropy names it where it knows it; empty if it is not stated
-    default_scale: str  # the standard's for a header that states a reference time but no scale
-    position: str  # TREFPOS; empty if unknown
-    unit: str  # TIMEUNIT; empty if it is not stated
-    at: float  # part of a frame that times refer to: 0 start, 0.5 middle, 1 end
-    offset: float  # to be added to times, in TIMEUNIT; see `OFFSETS`
-    direction_deg: tuple[float, float] | None  # of TREFDIR; None if it is not stated
+    unit: str = ""  # as astropy names it; of a header TIMEUNIT; empty if it is not stated
+    epoch_mjd: float | None = None  # date of time zero
+    scale: str = ""  # in lower case, as astropy names it where it knows it; empty if it is not stated
+    position: str = ""  # TREFPOS; empty if unknown
+    default_scale: str = ""  # the standard's for a header that states a reference time but no scale
+    at: float = 0.5  # part of a frame that times refer to: 0 start, 0.5 middle, 1 end
+    offset: float = 0.0  # to be added to times, in TIMEUNIT; see `OFFSETS`
+    direction_deg: tuple[float, float] | None = None  # of TREFDIR; None if it is not stated
 
     @classmethod
-    def of(cls, header: Mapping[str, Any], what: str) -> TimeSystem:
+    def of(cls, header: Mapping[str, Any], label: str) -> TimeSystem:
         """Read the time keywords of a header; raise InputError for one that violates the standard."""
         header = {str(key).upper(): value for key, value in header.items()}
-        at = _number(header, "TIMEPIXR", what)
+        at = _number(header, "TIMEPIXR", label)
         if at is not None and not 0.0 <= at <= 1.0:
-            raise InputError.of("TIMEPIXR", at, "between 0 and 1", where=what)
-        stated = scale_of(str(header.get("TIMESYS", "")).strip())
-        references = ((_split(header, name, what), zero) for name, zero in REFERENCES.items())
+            raise InputError.of("TIMEPIXR", at, "between 0 and 1", where=label)
+        scale = scale_of(str(header.get("TIMESYS", "")).strip())
+        references = ((_split(header, name, label), zero) for name, zero in REFERENCES.items())
         epoch = next((value + zero for value, zero in references if value is not None), None)
         if epoch is None and (date := str(header.get("DATEREF", "") or "").strip()):
-            epoch = float(mjd_of([date], stated if stated in SCALES.values() else "utc", "DATEREF", what)[0])
+            epoch = float(mjd_of([date], scale if scale in SCALES.values() else "utc", "DATEREF", label)[0])
         # The standard's default is UTC; a header without a reference time does not follow it.
-        default = "utc" if any(key.startswith(("MJDREF", "DATEREF")) for key in header) else ""
+        is_standard = not scale and any(key.startswith(("MJDREF", "DATEREF")) for key in header)
         position = str(header.get("TREFPOS", "") or header.get("TIMEREF", "")).strip()
-        offset = sum(_split(header, key, what) or 0.0 for key in OFFSETS)
+        offset = sum(_split(header, key, label) or 0.0 for key in OFFSETS)
         unit = str(header.get("TIMEUNIT", "") or "").strip()
         # TREFDIR names two keywords, of longitude and latitude.
         first, _, second = str(header.get("TREFDIR", "")).partition(",")
-        ra, dec = (_number(header, key.strip(), what) for key in (first, second))
-        return cls(epoch, stated, "" if stated else default, position_of(position), unit, 0.5 if at is None else at,
+        ra, dec = (_number(header, key.strip(), label) for key in (first, second))
+        return cls(unit, epoch, scale, position_of(position), "utc" if is_standard else "", 0.5 if at is None else at,
                    offset, None if ra is None or dec is None else (ra, dec))  # fmt: skip
 
-    def offset_in(self, unit: Any, what: str) -> float:
+    def offset_in(self, unit: Any, label: str) -> float:
         """Return the offset in the unit of the times; raise InputError if its own unit cannot be known."""
         import astropy.units as u
 
         if not self.offset:
             return 0.0
-        stated = time_unit(self.unit) if self.unit else None
-        if stated is None and not (unit == u.s and not self.unit):
-            fault = f"{what}: TIMEOFFS or TIMEZERO is {self.offset:g}, and TIMEUNIT = {self.unit!r}"
+        system = time_unit(self.unit) if self.unit else None
+        if system is None and not (unit == u.s and not self.unit):
+            fault = f"{label}: TIMEOFFS or TIMEZERO is {self.offset:g}, and TIMEUNIT = {self.unit!r}"
             raise InputError(f"{fault} must be its unit, such as TIMEUNIT = 's'", key="TIMEUNIT")
-        return float(u.Quantity(self.offset, "s" if stated is None else stated.unit).to_value(unit))
+        return float(u.Quantity(self.offset, "s" if system is None else system.unit).to_value(unit))
+
+
+@lru_cache(maxsize=256)
+def time_unit(text: str) -> TimeSystem | None:
+    """Return the unit of times in a text such as "days", "BJD - 2457000, days", "btjd" or "s since 2026-03-01"."""
+    word = re.sub(r"[−–]", "-", text.strip().strip("\"'")).lower()
+    # BJD - 2,457,000
+    word = re.sub(r"(?<=\d),(?=\d{3}(?:\D|$))", "", word)
+    if word in _TIME_WORDS:
+        return TimeSystem(_TIME_WORDS[word])
+    if match := _JULIAN.fullmatch(word):
+        name = match["name"]
+        is_mission = name in ("btjd", "tbjd", "bkjd", "kbjd")
+        scale = match["scale"] or match["end"] or ("tdb" if is_mission else "")
+        place = "BARYCENTER" if "b" in name else "HELIOCENTER" if name.startswith("h") else ""
+        return TimeSystem("d", _DAYS[name] + float(match["less"] or match["plus"] or 0.0), scale, place)
+    if (match := _SINCE.fullmatch(word)) and match["unit"] in _TIME_WORDS:
+        scale = match["scale"] or "utc"
+        epoch = mjd_of([match["date"].upper()], scale, "unit", "its unit")[0]
+        return TimeSystem(_TIME_WORDS[match["unit"]], float(epoch), scale)
+    return None
+
+
+def time_in_name(name: str) -> TimeSystem | None:
+    """Return the unit in the name of a column of times, as in ``BJD - 2454833``, ``time [d]`` or ``time_bjd``."""
+    base, unit = divided_unit(name)
+    is_long = len(name.strip()) > 2 or name.strip().lower() == "jd"
+    if (times := time_unit(name) if is_long else None) or (times := time_unit(unit) if unit else None):
+        return times
+    words = re.split(r"[\s_.]+", base.strip().lower())
+    # The scale follows the dates: time_utc_mjd.
+    dates = sorted((word for word in words if word not in (*_TIME_OF, *_PLACES)), key=SCALES.__contains__)
+    times = time_unit(" ".join(dates)) if dates and len(dates) < len(words) else None
+    place = next((_PLACES[word] for word in words if word in _PLACES), "")
+    return replace(times, position=place) if times is not None and place else times
 
 
 def scale_of(text: str) -> str:
@@ -296,7 +293,7 @@ def position_of(text: str) -> str:
     return POSITIONS.get(word, word)
 
 
-def _number(header: Mapping[str, Any], key: str, what: str) -> float | None:
+def _number(header: Mapping[str, Any], key: str, label: str) -> float | None:
     value = header.get(key)
     if value is None or value == "":
         return None
@@ -305,17 +302,17 @@ def _number(header: Mapping[str, Any], key: str, what: str) -> float | None:
     except (TypeError, ValueError):
         number = float("nan")
     if not np.isfinite(number) or isinstance(value, bool):
-        raise InputError.of(key, value, "a number", where=what)
+        raise InputError.of(key, value, "a number", where=label)
     return number
 
 
-def _split(header: Mapping[str, Any], name: str, what: str) -> float | None:
+def _split(header: Mapping[str, Any], name: str, label: str) -> float | None:
     """Return a number that may be divided into two keywords with I and F at their ends, which have precedence."""
     # Keywords have eight letters at most: TIMEZERO, TIMEZERI, TIMEZERF.
-    parts = [_number(header, name[:7] + part, what) for part in ("I", "F")]
-    if parts != [None, None]:
-        return sum(part or 0.0 for part in parts)
-    return _number(header, name, what)
+    halves = [_number(header, name[:7] + half, label) for half in ("I", "F")]
+    if halves != [None, None]:
+        return sum(half or 0.0 for half in halves)
+    return _number(header, name, label)
 
 
 @contextmanager
@@ -344,7 +341,7 @@ def is_dated(cell: str) -> bool:
 
 
 def with_mission_formats() -> None:
-    """Make astropy know the formats of time of lightkurve's tables: days from the epochs of Kepler and TESS."""
+    """Register the formats of time of lightkurve's tables with astropy: days from the epochs of Kepler and TESS."""
     from astropy.time import Time, TimeFromEpoch
 
     for name in ("bkjd", "btjd"):
@@ -356,11 +353,11 @@ def with_mission_formats() -> None:
             })  # fmt: skip
 
 
-def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
+def mjd_of(texts: Sequence[str], scale: str, name: str, label: str) -> Float:
     """Return ISO 8601 dates as modified Julian dates, NaN for empty ones; raise InputError for an invalid one."""
     from astropy.time import Time
 
-    found = np.full(len(texts), np.nan)
+    mjd = np.full(len(texts), np.nan)
     filled = [k for k, text in enumerate(texts) if not is_missing(text)]
     cleaned, hours = [], np.zeros(len(filled))
     for place, text in enumerate(texts[k] for k in filled):
@@ -380,10 +377,10 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
         if (days := parsed(cleaned)) is None:
             row = next((k for k, text in zip(filled, cleaned, strict=True) if parsed([text]) is None), 0)
             expected = "a number or a date such as 2026-03-01T12:00:00"
-            fault = f"{what}: {name!r} in row {row + 1} must be {expected}, not {shortened(texts[row], 40)}"
+            fault = f"{label}: {name!r} in row {row + 1} must be {expected}, not {shortened(texts[row], 40)}"
             raise InputError(fault, key=name)
-    found[filled] = days - hours / 24
-    return found
+    mjd[filled] = days - hours / 24
+    return mjd
 
 
 Medium = Literal["air", "vacuum"]
@@ -405,24 +402,24 @@ _SPOKEN: dict[Medium, re.Pattern[str]] = {
     "vacuum": re.compile(r"(?:\b|_)vac(?:uum)?(?:\b|_)|\bvacuum", re.IGNORECASE),
 }
 _CONVERTED = tuple(
-    (re.compile(rf"\b{one}\w*(?:\s+wavelengths?)?[\s_-]*(?:to|2|->|into)[\s_-]*{other}\w*", re.IGNORECASE), medium)
-    for one, other, medium in (("vac", "air", "air"), ("air", "vac", "vacuum"))
+    (re.compile(rf"\b{before}\w*(?:\s+wavelengths?)?[\s_-]*(?:to|2|->|into)[\s_-]*{after}\w*", re.IGNORECASE), medium)
+    for before, after, medium in (("vac", "air", "air"), ("air", "vac", "vacuum"))
 )
 
 
 def medium_of(headers: Sequence[Mapping[str, Any]]) -> Medium | None:
     """Return the medium of wavelengths that keywords of headers state, which must agree, or None."""
-    found: dict[str, Medium] = {}
+    media: dict[str, Medium] = {}
     for header in headers:
         for key in map(str, header):
             name = re.sub(r"[\s-]+", "_", key.strip().upper())
             if (medium := _medium_at(name, text_at(header, key).lower())) is not None:
-                found[name] = medium
-    if len(set(found.values())) > 1:
-        words = " and ".join(f"{key} says {medium}" for key, medium in sorted(found.items()))
+                media[name] = medium
+    if len(set(media.values())) > 1:
+        words = " and ".join(f"{key} says {medium}" for key, medium in sorted(media.items()))
         fault = f"its header contradicts itself: {words}; use `wavelength_unit='nm air'` to say which"
         raise InputError(fault, key="wavelength_unit")
-    return next(iter(found.values()), None)
+    return next(iter(media.values()), None)
 
 
 def _medium_at(name: str, text: str) -> Medium | None:
@@ -450,16 +447,16 @@ def unit_and_medium(unit: str) -> tuple[str | None, Medium | None]:
 
 
 def vacuum_wavelengths(
-    nm: Float, column: str, remarks: str, given: Medium | None, headers: Sequence[Mapping[str, Any]]
+    nm: Float, column: str, remarks: str, medium: Medium | None, headers: Sequence[Mapping[str, Any]]
 ) -> tuple[Float, tuple[str, ...]]:
     """Return vacuum wavelengths, nm, and messages about them.
 
-    The medium is the given one, else that in the name of the column, in keywords of headers, or in remarks.
+    The medium is the stated one, else that in the name of the column, in keywords of headers, or in remarks.
     """
-    named, said = _media_in(column), _media_in(remarks)
-    own, remarked = (media[0] if len(media) == 1 else None for media in (named, said))
-    medium = given or own or medium_of(headers) or remarked
-    if medium is None and (named or said):
+    in_name, in_remarks = _media_in(column), _media_in(remarks)
+    named, remarked = (media[0] if len(media) == 1 else None for media in (in_name, in_remarks))
+    medium = medium or named or medium_of(headers) or remarked
+    if medium is None and (in_name or in_remarks):
         return nm, ("its header speaks of air and of vacuum: ASSUMED vacuum; `wavelength_unit='nm air'` says air",)
     if medium != "air":
         return nm, ()
@@ -481,10 +478,10 @@ def vacuum_from_air(air_nm: Float) -> Float:
     wavelengths by convention and remain unchanged (Morton 1991, ApJS 77, 119).
     """
     vacuum = air_nm.copy()
-    there = np.isfinite(air_nm) & (air_nm >= 200.0)
+    in_air = np.isfinite(air_nm) & (air_nm >= 200.0)
     for _ in range(4):
         # Squared wavenumber, um-2. The index hardly changes over the shift, so the iteration converges at once.
-        wavenumber2 = (1000.0 / vacuum[there]) ** 2
+        wavenumber2 = (1000.0 / vacuum[in_air]) ** 2
         index = 1.0 + 0.05792105 / (238.0185 - wavenumber2) + 0.00167917 / (57.362 - wavenumber2)
-        vacuum[there] = air_nm[there] * index
+        vacuum[in_air] = air_nm[in_air] * index
     return vacuum

@@ -387,14 +387,14 @@ class RateTable(Rates):
         for name, unit in (("energy", "erg"), ("rate", "1 / d")):
             column = rows.first((name,))
             if column is None:
-                raise InputError(f"{rows.named} has no column {name!r}, but needs energy and rate", key="columns")
+                raise InputError(f"{rows.label} has no column {name!r}, but needs energy and rate", key="columns")
             values = [rows.number(column, row, unit) for row in range(rows.n)]
             columns.append(np.array([np.nan if value is None else value for value in values]))
         energy, rate = columns
         largest = np.nanmax(energy, initial=0.0)
         if largest < LIKELY_LOGARITHM:
             raise InputError(
-                f"{rows.named} has energies up to {largest:g}, which look like logarithms; give them in erg",
+                f"{rows.label} has energies up to {largest:g}, which look like logarithms; give them in erg",
                 key="energy",
             )
         rates = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)

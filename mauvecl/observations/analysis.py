@@ -423,7 +423,7 @@ def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
             size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
             yield f"The {CAUSES[name]} of single frames changes: {size}, which the search marginalises over."
         elif name == "light":
-            left = f"{100 * spectra.kept:.2g} %"
+            left = f"{100 * spectra.snr_kept:.2g} %"
             yield (
                 "The level of each frame is free in the search, because pointing losses change it: flares keep "
                 f"{left} of their S/N; search.frame.light states its standard deviation instead (1e-6: steady)."

@@ -97,7 +97,7 @@ ROUNDING = 1.0 / 12.0
 #: Iterations of the weights, which follow the fitted variances.
 ITERATIONS = 20
 #: Difference of chi-squared above which the unit of the dark counts is determined (5 %).
-TELLS = 3.84
+MIN_CHI2_DIFFERENCE = 3.84
 #: Smallest S/N of the gain with which it is reported.
 MIN_SNR = 5.0
 #: Relative error of a gain that is not measured: the rms deviation of the quoted 20 to 25 uV per electron from 20.
@@ -171,20 +171,20 @@ def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
 def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit, nominal: Instrument) -> Float:
     """Measure the variance of frames from differences of consecutive ones, where light and dark may jitter.
 
-    Returned are variance, light and dark of each usable pixel of each observation, of dark frames at each temperature,
-    and the degrees of freedom of the variance, shape (4, n_value).
+    The rows of the result, shape (4, n_value), are the variance, light and dark of each usable pixel of each
+    observation (of dark frames, at each temperature) and the degrees of freedom of the variance.
     """
     measured = []
-    for one in observations:
-        breaks = np.flatnonzero(np.abs(np.diff(one.temperature_c)) > SAME_TEMPERATURE_C) + 1
-        for part in np.split(np.arange(one.n_frames), breaks if one.star is None else []):
-            if part.size < 3:
+    for frames in observations:
+        breaks = np.flatnonzero(np.abs(np.diff(frames.temperature_c)) > SAME_TEMPERATURE_C) + 1
+        for rows in np.split(np.arange(frames.n_frames), breaks if frames.star is None else []):
+            if rows.size < 3:
                 continue
-            same = replace(one, raw_dn=one.raw_dn[part], temperature_c=one.temperature_c[part])
+            same = replace(frames, raw_dn=frames.raw_dn[rows], temperature_c=frames.temperature_c[rows])
             # A pixel that never changes is dead.
-            usable = one.usable(nominal) & np.any(same.raw_dn != same.raw_dn[0], axis=0)
+            usable = frames.usable(nominal) & np.any(same.raw_dn != same.raw_dn[0], axis=0)
             mean, steps = dark.mean_dn(same)[usable], np.diff(same.raw_dn[:, usable], axis=0)
-            light = np.zeros(mean.size) if one.star is None else same.raw_dn[:, usable].mean(axis=0) - mean
+            light = np.zeros(mean.size) if frames.star is None else same.raw_dn[:, usable].mean(axis=0) - mean
             counts, n = mean - dark.bias_dn[usable], len(steps)
             variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, counts]))
             # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann
@@ -196,14 +196,14 @@ def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit,
 def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: float = 0.0) -> PhotonTransfer:
     """Fit gain, read noise and the unit of dark counts to `measured_variances` by weighted least squares.
 
-    The nominal values are kept where the data determine none. The standard error of the dark of a mean frame,
-    `dark_error_dn`, moves the read noise.
+    Values that the data do not determine stay nominal. The standard error of the dark of a mean frame, `dark_error_dn`,
+    adds to that of the read noise.
     """
     variance, light, dark, dof = measured
     fits = {"DN": _fit(light, dark, variance, dof), "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof)}
     better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
     assumed: tuple[str, ...] = ("unit of the dark counts",)
-    if abs(better) > TELLS:
+    if abs(better) > MIN_CHI2_DIFFERENCE:
         unit, assumed = "electrons" if better > 0 else "DN", ()
     (read, gain), covariance, chi2, model = fits[unit]
     errors = np.sqrt(np.diag(covariance))
@@ -223,17 +223,17 @@ def _fit(column: Float, fixed: Float, variance: Float, dof: Float) -> tuple[Floa
     """Fit variance = fixed + read + gain * column; return the values, covariance, chi-squared and the model."""
     design = np.column_stack([np.ones_like(column), column])
     model = np.maximum(variance, 1.0)
-    found, covariance = np.zeros(2), np.eye(2)
+    fitted, covariance = np.zeros(2), np.eye(2)
     for _ in range(ITERATIONS):
         weight = dof / (2 * model**2)
         weighted = design * weight[:, None]
         covariance = np.linalg.pinv(weighted.T @ design)
-        found = covariance @ (weighted.T @ (variance - fixed))
-        model = np.maximum(fixed + design @ found, ROUNDING)
+        fitted = covariance @ (weighted.T @ (variance - fixed))
+        model = np.maximum(fixed + design @ fitted, ROUNDING)
     # The cube roots of chi-squared variables are nearly normal (Wilson & Hilferty 1931).
     spread = 2 / (9 * dof)
     normal = (np.cbrt(variance / model) - (1 - spread)) / np.sqrt(spread)
-    return found, covariance, float(np.sum(normal**2)), model
+    return fitted, covariance, float(np.sum(normal**2)), model
 
 
 #: Smallest range of temperatures, deg C, from which the slope is fitted, and from which the bias is as well.
@@ -264,8 +264,8 @@ class DarkFit(GoodnessOfFit):
     @property
     def bias_error(self) -> Float:
         """Standard errors of the biases, shape (n_pixel,): of each, or of all together; 0 if they are assumed."""
-        own = self.covariance[:, 0, 0]
-        return np.asarray(np.sqrt(np.where(own > 0, own, self.shared[0, 0])))
+        variance = self.covariance[:, 0, 0]
+        return np.asarray(np.sqrt(np.where(variance > 0, variance, self.shared[0, 0])))
 
     @property
     def level_error(self) -> Float:
@@ -302,9 +302,9 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)
     if not dark:
         return _assumed_dark(nominal, level, bias)
-    raw = np.concatenate([one.raw_dn for one in dark])
-    temperature = np.concatenate([one.temperature_c for one in dark])
-    exposure = np.concatenate([np.full(one.n_frames, one.exposure_s) for one in dark])
+    raw = np.concatenate([frames.raw_dn for frames in dark])
+    temperature = np.concatenate([frames.temperature_c for frames in dark])
+    exposure = np.concatenate([np.full(frames.n_frames, frames.exposure_s) for frames in dark])
     n_pixel, reference, spread = raw.shape[1], float(temperature.mean()), float(np.ptp(temperature))
     offset = temperature - reference
     fits_slope, by_pixel = spread >= SLOPE_RANGE_C, float(exposure.max() / exposure.min()) >= EXPOSURE_RATIO
@@ -320,12 +320,12 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     seconds = exposure * np.exp(slope * offset)
     columns = np.column_stack([np.ones_like(seconds), seconds, seconds * offset])
     values, used = (raw, [0, 1]) if by_pixel else (raw - bias, [1])
-    found, errors = _fit_pixels(columns[:, used], 1.0 / typical, values, noise)
-    level, bias = found[-1], found[0] if by_pixel else bias
+    fitted, errors = _fit_pixels(columns[:, used], 1.0 / typical, values, noise)
+    level, bias = fitted[-1], fitted[0] if by_pixel else bias
     covariance[:, -len(used) :, -len(used) :] = errors
     if fits_slope:
-        found, errors = _fit_pixels(columns[:, [*used, 2]], 1.0 / typical, values, noise, (seconds, level))
-        change, error = found[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
+        fitted, errors = _fit_pixels(columns[:, [*used, 2]], 1.0 / typical, values, noise, (seconds, level))
+        change, error = fitted[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
     mean = seconds[:, None] * level
     return DarkFit(
         reference_c=reference,
@@ -365,14 +365,14 @@ def _mean_dark(
     start = np.array([bias, (series - bias).mean() / exposure.mean(), nominal.dark_slope_per_c])
     typical = noise.variance(0.0, start[1] * exposure * np.exp(start[2] * offset))
 
-    def left(values: Float) -> Float:
+    def residuals(values: Float) -> Float:
         bias, level, slope = np.where(free, values, start)
         return np.asarray((series - bias - level * exposure * np.exp(slope * offset)) / np.sqrt(typical / raw.shape[1]))
 
-    found = scipy.optimize.least_squares(left, start, x_scale=np.maximum(np.abs(start), 1e-3), xtol=1e-14)
-    covariance, jacobian = np.zeros((3, 3)), np.asarray(found.jac)[:, free]
+    best_fit = scipy.optimize.least_squares(residuals, start, x_scale=np.maximum(np.abs(start), 1e-3), xtol=1e-14)
+    covariance, jacobian = np.zeros((3, 3)), np.asarray(best_fit.jac)[:, free]
     covariance[np.ix_(free, free)] = np.linalg.inv(jacobian.T @ jacobian)
-    return np.where(free, found.x, start), covariance, typical
+    return np.where(free, best_fit.x, start), covariance, typical
 
 
 def _fit_pixels(
@@ -380,12 +380,12 @@ def _fit_pixels(
 ) -> tuple[Float, Float]:
     """Fit a linear model to each pixel with the weights of a typical one.
 
-    The last column is the signal of the level unless `dark` has exposure times and levels of the dark current. Returned
-    are the values, shape (n_column, n_pixel), and their covariance, shape (n_pixel, n_column, n_column).
+    The last column is the signal of the level unless `dark` has exposure times and levels of the dark current. Return
+    the values, shape (n_column, n_pixel), and their covariance, shape (n_pixel, n_column, n_column).
     """
     weighted = columns * weight[:, None]
     hat = np.linalg.solve(weighted.T @ columns, weighted.T)
-    found = np.asarray(hat @ values)
-    seconds, level = (columns[:, -1], found[-1]) if dark is None else dark
+    fitted = np.asarray(hat @ values)
+    seconds, level = (columns[:, -1], fitted[-1]) if dark is None else dark
     photons = noise.dark_factor * level[:, None, None] * ((hat * seconds) @ hat.T)
-    return found, noise.read_variance * hat @ hat.T + photons
+    return fitted, noise.read_variance * hat @ hat.T + photons

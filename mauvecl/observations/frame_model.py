@@ -27,7 +27,7 @@ LEAST_OF_OFFSET = 0.5
 MAX_OFFSET = 0.5
 #: Largest relative difference between exposure times.
 SAME_EXPOSURE = 0.01
-#: Level beyond every count, for pixels whose saturation was dealt with before.
+#: Level above all counts, for pixels whose saturation is excluded before.
 NO_CEILING_DN = 2**31 - 1
 
 
@@ -78,11 +78,11 @@ class FrameModel:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
             return cls(quiet, flare, bins, flux / (bins @ per_flux), False)
-        ones = np.ones(len(bins))
+        per_dn = np.ones(len(bins))
         if unit != "adu":
-            return cls(quiet, flare, bins, ones / exposure, False)
-        raw = cls(quiet, flare, bins, ones, True)
-        # Light is added to bias and dark current: where a pixel has far less than these, they were subtracted.
+            return cls(quiet, flare, bins, per_dn / exposure, False)
+        raw = cls(quiet, flare, bins, per_dn, True)
+        # Where a pixel has far less light than bias and dark current, these were subtracted.
         included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
         return raw if included.all() else replace(raw, raw=False)
 
@@ -125,14 +125,14 @@ class FrameModel:
         gain = self.gain / self.per_dn
         electrons = np.maximum(light / self.per_dn, 0.0) / gain / self.quiet.n_frames
         total = variance / self.per_dn**2 / self.quiet.n_frames
-        rest = np.maximum(total - gain**2 * electrons - 1 / 12, 0.0)
+        read_variance = np.maximum(total - gain**2 * electrons - 1 / 12, 0.0)
         nm, none = self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1), np.zeros(electrons.size)
         dark: dict[str, Any] = dict.fromkeys(("sky_electrons", "neighbour_electrons", "dark_dn", "bias_dn"), none)
         return replace(
             self.quiet,
             **dark,
             source_electrons=electrons,
-            read_noise_dn=np.sqrt(rest),
+            read_noise_dn=np.sqrt(read_variance),
             gain_dn_per_electron=gain,
             wavelength_nm=nm,
             element=np.arange(nm.size, dtype=np.int32),
@@ -148,26 +148,26 @@ def _per_flam(unit: str, wavelength_nm: Float) -> Float | None:
     """Return a flux density of 1 erg s-1 cm-2 nm-1 in a unit, shape (n_value,); None if it is not one."""
     import astropy.units as u
 
-    one = np.ones(wavelength_nm.size) * u.Unit("erg / (s cm2 nm)")
+    flux = np.ones(wavelength_nm.size) * u.Unit("erg / (s cm2 nm)")
     try:
-        return np.asarray(one.to_value(u.Unit(unit), u.spectral_density(wavelength_nm * u.nm)))
+        return np.asarray(flux.to_value(u.Unit(unit), u.spectral_density(wavelength_nm * u.nm)))
     except (ValueError, TypeError):
         return None
 
 
-def _matched(wanted: Float, given: Float) -> NDArray[np.intp] | None:
+def _matched(wavelengths: Float, instrument_nm: Float) -> NDArray[np.intp] | None:
     """Return the index of each wavelength among those of an instrument, or None if one is not there."""
-    nearest = np.array([int(np.argmin(np.abs(given - each))) for each in wanted])
-    step = float(np.median(np.diff(given)))
-    same = np.abs(given[nearest] - wanted) < MAX_OFFSET * step
-    # Wavelengths of pixels are those of elements only where pixels are as wide.
-    alike = wanted.size < 2 or abs(float(np.median(np.diff(wanted))) / step - 1.0) < MAX_OFFSET
+    nearest = np.array([int(np.argmin(np.abs(instrument_nm - nm))) for nm in wavelengths])
+    step = float(np.median(np.diff(instrument_nm)))
+    same = np.abs(instrument_nm[nearest] - wavelengths) < MAX_OFFSET * step
+    # Pixels and elements correspond only if they have the same width.
+    alike = wavelengths.size < 2 or abs(float(np.median(np.diff(wavelengths))) / step - 1.0) < MAX_OFFSET
     return nearest if same.all() and alike and np.unique(nearest).size == nearest.size else None
 
 
 #: Numbers of frames before and after a change whose means are compared.
 WIDTHS = (2, 4, 8, 16, 32, 64)
-#: Expected number of changes that noise feigns in a light curve.
+#: Expected number of false changes in a light curve, due to noise.
 CHANCE = 0.001
 #: Fall of chi-squared by which one cause must fit better than another: 3 standard deviations for one parameter.
 CLEARLY = 9.0
@@ -188,18 +188,18 @@ class LightChange:
 def chi2_of_one(spectrum: Float, variance: Float, rows: Float) -> Float:
     """Return chi-squared of a spectrum with each of some spectra alone, whose amplitude is fitted, shape (n_row,)."""
     along = rows @ (spectrum / variance)
-    whole = float((spectrum**2 / variance).sum())
-    return np.asarray(whole - along**2 / np.einsum("kp,kp->k", rows, rows / variance))
+    total = float((spectrum**2 / variance).sum())
+    return np.asarray(total - along**2 / np.einsum("kp,kp->k", rows, rows / variance))
 
 
 def light_changes(
-    excess: Float, frames: NDArray[np.intp], numbers: NDArray[np.int64], light: Float, others: Float, sd: Float
+    excess: Float, frames: NDArray[np.intp], numbers: NDArray[np.int64], light: Float, alternatives: Float, sd: Float
 ) -> list[LightChange]:  # fmt: skip
     """Find sudden changes of the light that all pixels share, in order of time.
 
     The light is fitted to some frames, ascending, and its means before and after each are compared. The spectrum of a
-    change must clearly be that of the star rather than one of `others`: flares, dark current and sky. `excess` are all
-    frames less the star's `light`, with their `numbers` on the regular grid and the noise `sd`.
+    change must clearly be that of the star rather than one of the `alternatives`: flares, dark current and sky.
+    `excess` are all frames less the star's `light`, with their `numbers` on the regular grid and the noise `sd`.
     """
     weights = light / sd**2 / float(((light / sd) ** 2).sum())
     amplitude, at = excess[frames] @ weights, numbers[frames]
@@ -212,25 +212,25 @@ def light_changes(
     sizes = np.zeros((len(widths), amplitude.size))
     for row, width in zip(sizes, widths, strict=True):
         k = np.arange(width, amplitude.size - width + 1)
-        whole = at[k + width - 1] - at[k - width] <= 2 * width - 1 + MISSING
-        row[k[whole]] = ((total[k + width] - 2 * total[k] + total[k - width]) / width)[whole]
+        gapless = at[k + width - 1] - at[k - width] <= 2 * width - 1 + MISSING
+        row[k[gapless]] = ((total[k + width] - 2 * total[k] + total[k - width]) / width)[gapless]
     errors = noise * np.sqrt(2.0 / np.array(widths))[:, None]
     significance = np.abs(sizes) / errors
-    found = []
+    changes = []
     while significance.max() > limit:
         best, place = divmod(int(significance.argmax()), amplitude.size)
         width = widths[best]
         step = excess[frames[place : place + width]].mean(axis=0) - excess[frames[place - width : place]].mean(axis=0)
         variance = 2 * sd**2 / width
-        if chi2_of_one(step, variance, light[None])[0] < chi2_of_one(step, variance, others).min() - CLEARLY:
-            found.append(LightChange(int(frames[place]), width, float(sizes[best, place]), float(errors[best, 0])))
+        if chi2_of_one(step, variance, light[None])[0] < chi2_of_one(step, variance, alternatives).min() - CLEARLY:
+            changes.append(LightChange(int(frames[place]), width, float(sizes[best, place]), float(errors[best, 0])))
         # Windows that overlap this one see the same change.
-        for other, wide in zip(significance, widths, strict=True):
-            other[max(0, place - width - wide + 1) : place + width + wide] = 0.0
-    return sorted(found, key=lambda one: one.frame)
+        for values, wide in zip(significance, widths, strict=True):
+            values[max(0, place - width - wide + 1) : place + width + wide] = 0.0
+    return sorted(changes, key=lambda change: change.frame)
 
 
-#: Expected number of values of normal noise in all frames that are mistaken for cosmic rays.
+#: Expected number of values in all frames that are mistaken for cosmic rays in normal noise.
 CHANCE_RAYS = 0.01
 #: Flares that explain the light of many pixels at once, K; their residual in one pixel of one frame is a cosmic ray.
 RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
@@ -272,24 +272,24 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
         raise InputError(f"{frames.name}: at least one frame must be below saturation, but none is", key="flux")
     light = np.median(flux[good], axis=0)
     error = None if frames.error is None else frames.error[:, fine]
-    stated = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)
+    noise = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)
     rays = np.zeros(frames.n_frames, np.int64)
-    rays[good] = _replace_rays(flux, np.flatnonzero(good), light, stated, model, frames.numbers)
-    made = replace(
-        frames, flux=flux, error=np.broadcast_to(stated, flux.shape) if error is None else error,
+    rays[good] = _replace_rays(flux, np.flatnonzero(good), light, noise, model, frames.numbers)
+    cleaned = replace(
+        frames, flux=flux, error=np.broadcast_to(noise, flux.shape) if error is None else error,
         wavelength_nm=frames.wavelength_nm[fine],
     )  # fmt: skip
-    return CleanedSpectra(made, model, rays, stated, "instrument" if error is None else "file", saturated)
+    return CleanedSpectra(cleaned, model, rays, noise, "instrument" if error is None else "file", saturated)
 
 
 def _replace_rays(
-    flux: Float, at: NDArray[np.intp], light: Float, stated: Float, model: FrameModel, numbers: NDArray[np.int64]
+    flux: Float, at: NDArray[np.intp], light: Float, noise: Float, model: FrameModel, numbers: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Replace bad values in some frames of `flux`, in place, and return their number in each of these frames."""
     excess = flux[at] - light
-    # Measured robustly, so that a wrong statement makes no rays.
+    # A robust measurement, so that errors that are stated too small make no rays.
     scatter = PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0)
-    sd = np.maximum(stated, scatter)
+    sd = np.maximum(noise, scatter)
     spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
     basis = np.linalg.svd(spectra / np.linalg.norm(spectra, axis=1, keepdims=True) / sd, full_matrices=False)[2]
     limit = float(scipy.stats.norm.isf(CHANCE_RAYS / 2 / excess.size))
@@ -297,11 +297,11 @@ def _replace_rays(
     rows = np.arange(at.size)
     for _ in range(RAY_ROUNDS):
         fit = (excess[rows] / sd) @ basis.T @ basis * sd
-        left = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
-        left[bad[rows]] = 0.0
-        # The farthest alone: a large one moves the fit away from the others.
-        worst = left.argmax(axis=1)
-        far = left[np.arange(rows.size), worst] > limit
+        residual = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
+        residual[bad[rows]] = 0.0
+        # Only the largest residual is replaced, since it moves the fit away from the other pixels.
+        worst = residual.argmax(axis=1)
+        far = residual[np.arange(rows.size), worst] > limit
         bad[rows[far], worst[far]] = True
         moved = np.where(bad[rows], fit - excess[rows], 0.0)
         excess[rows] += moved
@@ -310,9 +310,9 @@ def _replace_rays(
             break
     # An excess in the same pixel of a neighbouring frame as well is not a ray, but light that the fit does not include.
     adjacent = np.diff(numbers[at]) == 1
-    both = bad[1:] & bad[:-1] & adjacent[:, None]
-    bad[1:] &= ~both
-    bad[:-1] &= ~both
+    persistent = bad[1:] & bad[:-1] & adjacent[:, None]
+    bad[1:] &= ~persistent
+    bad[:-1] &= ~persistent
     where = np.nonzero(bad)
     flux[at[where[0]], where[1]] = (excess + light)[where]
     return np.asarray(bad.sum(axis=1), np.int64)

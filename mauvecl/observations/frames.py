@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import Float
 from mauvecl.host.orbit.orbit import Orbit, Target
-from mauvecl.host.tables.units import SCALES, offline
+from mauvecl.host.tables.units import SCALES, mission_of, offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S, Moment, Unit
@@ -54,10 +54,9 @@ class QualityBits:
     noted: int = 0  # bits that are reported, though they do not exclude a frame
 
     @classmethod
-    def of(cls, header: Mapping[str, Any], chosen: str | int | None, what: str) -> QualityBits:
+    def of(cls, header: Mapping[str, Any], chosen: str | int | None, label: str) -> QualityBits:
         """Return the bits that are chosen for a file, or its mission's defaults; see `FrameMapping.quality_bits`."""
-        said = {str(header.get(key, "") or "").strip().upper() for key in ("TELESCOP", "MISSION")}
-        mission = "Kepler" if said & {"KEPLER", "K2"} else "TESS" if "TESS" in said else ""
+        mission = {"KEPLER": "Kepler", "K2": "Kepler", "TESS": "TESS"}.get(mission_of(header), "")
         if chosen is None or str(chosen).strip().lower() == "default":
             return cls(DEFAULTS.get(mission, ALL_BITS), mission, NOTED.get(mission, 0))
         names, mask = NAMES.get(mission, {}), 0
@@ -69,8 +68,8 @@ class QualityBits:
             elif word.lower() in by_name and (len(words) == 1 or word.lower() not in ("all", "none")):
                 mask |= by_name[word.lower()]
             else:
-                known = f"names among {', '.join(names.values())}" if names else "for Kepler, K2 and TESS names"
-                raise InputError.of("quality_bits", word, f"all, none, default, or numbers, and {known}", where=what)
+                usual = f"names among {', '.join(names.values())}" if names else "for Kepler, K2 and TESS names"
+                raise InputError.of("quality_bits", word, f"all, none, default, or numbers, and {usual}", where=label)
         return cls(mask, mission)
 
     def excluded(self, quality: NDArray[Any]) -> NDArray[np.bool_]:
@@ -84,9 +83,9 @@ class QualityBits:
         bits = [1 << k for k in range(value.bit_length()) if value >> k & 1]
         return ", ".join(f"{names[bit]} ({bit})" if bit in names else str(bit) for bit in bits)
 
-    def remarks(self, quality: NDArray[Any], name: str) -> tuple[str, ...]:
+    def remarks(self, quality: NDArray[Any] | None, name: str) -> tuple[str, ...]:
         """Return the remark on frames that have a noted bit and are kept."""
-        flags = np.asarray(quality, np.int64)
+        flags = np.asarray(0 if quality is None else quality, np.int64)
         n = int(np.count_nonzero((flags & self.noted != 0) & ~self.excluded(flags)))
         if not n:
             return ()
@@ -99,7 +98,7 @@ class QualityBits:
 MIN_FRAMES = 20
 #: Largest number of frames, for which a search needs some 2 GiB.
 MAX_FRAMES = 2**22
-#: Largest time from the first to the last frame in median steps, of which searches make a grid: 42 years of 20 s.
+#: Largest time from the first to the last frame in median steps, the grid of searches: 42 years of 20 s.
 MAX_SPAN = 2**26
 #: Largest flux, whose square and sums of squares are finite numbers.
 MAX_FLUX = 1e100
@@ -122,13 +121,14 @@ class Reason(IntFlag):
     @classmethod
     def words(cls, values: NDArray[Any]) -> NDArray[np.str_]:
         """Return the reasons of frames in words."""
-        found, place = np.unique(values, return_inverse=True)
-        names = {one: str(one.name).lower().replace("_", " ") for one in cls}
-        return np.array([", ".join(names[one] for one in cls if value & one) for value in found], np.str_)[place]
+        distinct, place = np.unique(values, return_inverse=True)
+        names = {reason: str(reason.name).lower().replace("_", " ") for reason in cls}
+        words = [", ".join(name for reason, name in names.items() if value & reason) for value in distinct]
+        return np.array(words, np.str_)[place]
 
 
 def _cadence_of(name: str, time: Float, light: Float) -> float:
-    """Return the median step of times; raise InputError for frames of a wrong shape or size, too near or too far."""
+    """Return the median step of times; raise InputError for wrong shapes and sizes, and for frames too near or far."""
     n, refused = time.size, partial(InputError.of, where=name)
     if time.ndim != 1 or light.ndim not in (1, 2) or len(light) != n:
         raise refused("shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
@@ -142,12 +142,12 @@ def _cadence_of(name: str, time: Float, light: Float) -> float:
     step = np.diff(np.sort(time))
     cadence = float(np.median(step))
     if not cadence > 0 or (step < MIN_STEP * cadence).any():
-        least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
-        least = least if cadence > 0 else "a different time for each frame"
-        raise refused("time", f"{step.min():g} s from one frame to the next", least)
+        expected = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
+        expected = expected if cadence > 0 else "a different time for each frame"
+        raise refused("time", f"{step.min():g} s from one frame to the next", expected)
     if not (span := float(np.ptp(time))) <= MAX_SPAN * cadence:
-        most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
-        raise refused("time", f"{span:g} s from the first frame to the last", most)
+        expected = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
+        raise refused("time", f"{span:g} s from the first frame to the last", expected)
     return cadence
 
 
@@ -211,22 +211,22 @@ class Frames:
         exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise refused("exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-        each: dict[str, Any] = {"error": error, "temperature_c": how.pop("temperature_c", None),
-                                "quality": np.zeros(n) if quality is None else quality}  # fmt: skip
-        for key, given in each.items():
-            if given is not None:
-                values = np.asarray(given, np.int64 if key == "quality" else np.float64)
+        by_frame: dict[str, Any] = {"error": error, "temperature_c": how.pop("temperature_c", None),
+                                    "quality": np.zeros(n) if quality is None else quality}  # fmt: skip
+        for key, column in by_frame.items():
+            if column is not None:
+                values = np.asarray(column, np.int64 if key == "quality" else np.float64)
                 if values.shape != (shape := light.shape if key == "error" else (n,)):
                     raise refused(key.removesuffix("_c"), values.shape, f"the shape {shape}")
-                each[key] = values[order]
-        made = cls(time[order], exposure[order], light[order], name=name, **each, **how)
+                by_frame[key] = values[order]
+        frames = cls(time[order], exposure[order], light[order], name=name, **by_frame, **how)
         if (np.diff(time) < 0).any():
-            made = made.with_remarks((f"the times of {name} are not ascending; its frames were sorted by time",))
-        wavelength = made.wavelength_nm
-        if (wavelength is None) != (light.ndim == 1) or (wavelength is not None and wavelength.size != light.shape[1]):
-            found = None if wavelength is None else wavelength.shape
-            raise refused("wavelength", found, "one wavelength for each pixel of spectra, none for a light curve")
-        return made if wavelength is None else made._with_sorted_live_pixels(wavelength)
+            frames = frames.with_remarks((f"the times of {name} are not ascending; its frames were sorted by time",))
+        nm = frames.wavelength_nm
+        if (None if nm is None else nm.shape) != (None if light.ndim == 1 else light.shape[1:]):
+            expected = "one wavelength for each pixel of spectra, none for a light curve"
+            raise refused("wavelength", None if nm is None else nm.shape, expected)
+        return frames if nm is None else frames._with_sorted_live_pixels(nm)
 
     def _with_sorted_live_pixels(self, wavelength: Float) -> Self:
         """Return spectra in order of wavelength, without the pixels that are not finite in most frames."""
@@ -239,8 +239,8 @@ class Frames:
         if np.array_equal(chosen, np.arange(wavelength.size)):
             return self
         error = None if self.error is None else self.error[:, chosen]
-        made = replace(self, flux=self.flux[:, chosen], error=error, wavelength_nm=wavelength[chosen])
-        return made.with_remarks(remarks)
+        frames = replace(self, flux=self.flux[:, chosen], error=error, wavelength_nm=wavelength[chosen])
+        return frames.with_remarks(remarks)
 
     @property
     def white_light(self) -> tuple[Float, Float | None]:
@@ -278,7 +278,7 @@ class Frames:
         finite = np.isfinite(values).all(axis=1)
         if self.error is not None:
             errors = self.error.reshape(self.n_frames, -1)
-            # An error below the rounding of the number is none.
+            # An error below the rounding of the number is not an error.
             finite &= (np.isfinite(errors) & (errors > 1e-16 * np.abs(values))).all(axis=1)
         flagged = self.quality is not None and QualityBits(self.quality_mask).excluded(self.quality)
         return np.asarray(np.where(flagged, Reason.QUALITY, 0) | np.where(finite, 0, Reason.NOT_FINITE), np.int64)
@@ -290,9 +290,9 @@ class Frames:
             return [""] * self.n_frames
         return [*map(cache(QualityBits(self.quality_mask, self.mission).words), self.quality.tolist())]
 
-    def shifted(self, by_s: Annotated[Float, Unit("s")]) -> Self:
-        """Return the frames with other times."""
-        return replace(self, time_s=self.time_s + by_s)
+    def shifted(self, by_s: Annotated[ArrayLike, Unit("s")]) -> Self:
+        """Return the frames with other times: all `by_s` later, or each by its own time, shape (n_frame,)."""
+        return replace(self, time_s=self.time_s + np.asarray(by_s, np.float64))
 
     def with_remarks(self, remarks: tuple[str, ...]) -> Self:
         """Return the frames with additional remarks."""
@@ -301,12 +301,13 @@ class Frames:
     @property
     def time_keywords(self) -> dict[str, str | float]:
         """Keywords of FITS (standard 4.0, section 9) for epoch, scale and place of the times; those that are known."""
-        known: dict[str, str | float | None] = {
+        keywords: dict[str, str | float | None] = {
             "MJDREF": self.reference_mjd, "TIMESYS": self.scale.upper(), "TREFPOS": self.position,
         }  # fmt: skip
         if self.direction_deg is not None:
-            known |= {"TREFDIR": "RA_OBJ,DEC_OBJ", "RA_OBJ": self.direction_deg[0], "DEC_OBJ": self.direction_deg[1]}
-        return {key: value for key, value in known.items() if value not in (None, "")}
+            ra, dec = self.direction_deg
+            keywords |= {"TREFDIR": "RA_OBJ,DEC_OBJ", "RA_OBJ": ra, "DEC_OBJ": dec}
+        return {key: value for key, value in keywords.items() if value not in (None, "")}
 
     def date(self, time_s: Moment) -> str:
         """Return a time as an ISO 8601 date, or as seconds if the times have no date."""
@@ -328,8 +329,6 @@ def live_pixels(finite: NDArray[np.int64], n_frames: int, name: str) -> tuple[ND
     return live, (f"{words} not finite in most frames of {name} and left out",) if number else ()
 
 
-#: Speed of light, km/s (exact).
-LIGHT_KM_S = 299_792.458
 #: Times that are converted at once.
 PIECE = 50_000
 
@@ -349,6 +348,7 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
         Orbit of the satellite, for ``TOPOCENTER``.
     """
     import astropy.units as u
+    from astropy.constants import c
     from astropy.time import Time
 
     name = frames.name
@@ -357,8 +357,8 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
     if frames.position == "BARYCENTER":
         return frames.with_remarks((f"the times of {name} are barycentric already",))
     if frames.scale not in SCALES.values():
-        known = ", ".join(sorted(set(SCALES.values())))
-        raise InputError.of("scale", frames.scale, f"one of {known}, as a mapping states", where=name)
+        scales = ", ".join(sorted(set(SCALES.values())))
+        raise InputError.of("scale", frames.scale, f"one of {scales}, as a mapping states", where=name)
     if frames.position not in ("GEOCENTER", "TOPOCENTER"):
         raise InputError.of("position", frames.position, "TOPOCENTER or GEOCENTER, as a mapping states", where=name)
     if frames.position == "TOPOCENTER" and orbit is None:
@@ -366,22 +366,24 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
         raise InputError(f"{name}: the orbit of {whose} needs two-line elements in `orbit.tle`", key="orbit.tle")
     with offline():
         when = Time(frames.reference_mjd, frames.time_s / DAY_S, format="mjd", scale=frames.scale)
-        parts = [when[k : k + PIECE] for k in range(0, frames.n_frames, PIECE)]
+        pieces = [when[k : k + PIECE] for k in range(0, frames.n_frames, PIECE)]
         place = None if frames.position == "GEOCENTER" else orbit
-        late = np.concatenate([_light_travel_s(part, target, place) for part in parts])
-        first = when[0].tdb + late[0] * u.s
-        seconds = (when.tdb - first).to_value(u.s) + late
+        delay = np.concatenate([_light_travel_s(times, target, place) for times in pieces])
+        first = when[0].tdb + delay[0] * u.s
+        seconds = (when.tdb - first).to_value(u.s) + delay
     remark = f"times are at the Solar System's barycentre (TDB) for {target.name} ({target.source})"
     if place is not None:
         days = float(np.abs(when.utc.jd - place.elements.epoch_jd).max())
         if place.resolved_at(days) == "mean":
-            off_ms = 1e3 * place.elements.axis_km / LIGHT_KM_S
-            remark += f", good to {off_ms:.0f} ms: the place in the orbit is not known"
+            error_ms = (place.elements.axis_km * u.km / c).to_value(u.ms)
+            remark += f", good to {error_ms:.0f} ms: the place in the orbit is not known"
         else:
-            off_ms = 1e3 * place.along_track_km(days) / LIGHT_KM_S
-            remark += f", good to {off_ms:.2g} ms along the track of {place.elements.source}"
-    made = replace(frames, time_s=seconds, reference_mjd=float(first.mjd), scale="tdb", position="BARYCENTER")
-    return replace(made, direction_deg=(target.ra_deg, target.dec_deg)).with_remarks((remark,))
+            error_ms = (place.along_track_km(days) * u.km / c).to_value(u.ms)
+            remark += f", good to {error_ms:.2g} ms along the track of {place.elements.source}"
+    return replace(
+        frames, time_s=seconds, reference_mjd=float(first.mjd), scale="tdb", position="BARYCENTER",
+        direction_deg=(target.ra_deg, target.dec_deg),
+    ).with_remarks((remark,))  # fmt: skip
 
 
 def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:

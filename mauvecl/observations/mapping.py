@@ -14,7 +14,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.host.tables import units
 from mauvecl.host.tables.files import read_text, toml
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude, key_of
-from mauvecl.host.tables.table import TableFile, Values, converted, unit_in, unit_in_name
+from mauvecl.host.tables.table import TableFile, Values, convert, unit_in
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import DAY_S, Accepted, Exposure, WholeNumber
 from mauvecl.schema.section import Record
@@ -68,8 +68,8 @@ class FrameMapping(Record):
     def _consistent(self) -> Self:
         if self.scale and units.scale_of(self.scale) not in units.SCALES.values():
             raise InputError.of("scale", self.scale, f"one of {', '.join(sorted(set(units.SCALES.values())))}")
-        given = [self.exposure is not None, self.exposure_s is not None, not isinstance(self.time, str)]
-        if sum(given) > 1:
+        is_given = [self.exposure is not None, self.exposure_s is not None, not isinstance(self.time, str)]
+        if sum(is_given) > 1:
             fault = "the exposure time is given twice; give only one of exposure, exposure_s and two columns of time"
             raise InputError(fault, key="exposure")
         return self
@@ -78,10 +78,10 @@ class FrameMapping(Record):
     def read(cls, path: str | Path) -> Self:
         """Read a mapping from a TOML file."""
         path = Path(path)
-        given = toml(read_text(path, "mapping"), f"mapping {shortened(path.name)}")
-        if isinstance(given.get("wavelength_file"), str):
-            given["wavelength_file"] = str(path.parent / given["wavelength_file"])
-        return cls(**given)
+        keys = toml(read_text(path, "mapping"), f"mapping {shortened(path.name)}")
+        if isinstance(keys.get("wavelength_file"), str):
+            keys["wavelength_file"] = str(path.parent / keys["wavelength_file"])
+        return cls(**keys)
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -107,7 +107,7 @@ class FrameMapping(Record):
 
 #: Names of columns that need no mapping, in order of preference, in any case: those of mauvecl, of the pipelines of
 #: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor, TASOC and gPhoton.
-KNOWN = {
+COLUMN_NAMES = {
     "time": ("time",),
     "flux": ("flux_bgsub", "flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux",
              "fcor", "flux_corr", "detrended_flux", "rate", "rel_flux", "relative_flux", "normalized_flux",
@@ -118,62 +118,62 @@ KNOWN = {
 }  # fmt: skip
 #: Names of times where no column is called time and none is named after its dates, such as BJD.
 OTHER_TIMES = ("t", "date", "datetime", "timestamp", "date-obs", "date_obs", "utc", "ut")
-#: Part of a frame that times refer to.
-PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
+#: Places in a frame that times refer to, as a part of its exposure.
+PLACES_IN_FRAME = {"start": 0.0, "middle": 0.5, "end": 1.0}
 #: Dates of observed light, MJD, from 1845 to 2269.
 DATES_MJD = (-5000.0, 150_000.0)
-#: Columns of files that state no unit of their times, these times, and what they are: Gaia DR3's epoch photometry, BJD
+#: Columns of files that state no unit of their times, these times, and words for them: Gaia DR3's epoch photometry, BJD
 #: in TCB less 2455197.5 (documentation of vari_epoch_photometry), and GALEX, Unix time less 315964800 s (user guide of
-#: gPhoton), of which the columns are those of gPhoton's light curves.
+#: gPhoton), with the columns of gPhoton's light curves.
 TIMES_OF_COLUMNS = (
-    ({"transit_id", "rejected_by_photometry"}, units.TimeUnit("d", 55_197.0, "tcb", "BARYCENTER"),
+    ({"transit_id", "rejected_by_photometry"}, units.TimeSystem("d", 55_197.0, "tcb", "BARYCENTER"),
      "days from 2010-01-01 in TCB, as in Gaia DR3's epoch photometry"),
-    ({"t0", "t1", "cps", "cps_err"}, units.TimeUnit("s", units.EPOCHS_MJD["gps"], "utc"),
+    ({"t0", "t1", "cps", "cps_err"}, units.TimeSystem("s", units.EPOCHS_MJD["gps"], "utc"),
      "seconds from 1980-01-06 in UTC, as in GALEX light curves of gPhoton"),
 )  # fmt: skip
 #: Extension of the light curves of CHEOPS. UTC in its header is that of the start and the end of a visit;
 #: BJD_TIME is in TT: pycheops 1.1.14, documentation of `Dataset`.
 CHEOPS = "SCI_COR_LIGHTCURVE"
-#: What a cell of times may be.
+#: Expected content of a cell of times, for messages.
 DATE = "a number or a date such as 2026-03-01T12:00:00"
 
 
 def recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
-    # Of FITS files also images, but no columns of other extensions.
+    # FITS files also have images, and columns of other extensions, which do not count.
     names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
-    columns: dict[str, Any] = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
+    columns: dict[str, Any] = {key: first_of(usual, names, file.label) for key, usual in COLUMN_NAMES.items()}
     if columns["time"] is None:
-        said = {name: found for name in names if (found := units.time_in_name(name)) is not None}
-        dated = [name for name, one in said.items() if one.epoch_mjd is not None]
+        times = {name: time for name in names if (time := units.time_in_name(name)) is not None}
+        dated = [name for name, time in times.items() if time.epoch_mjd is not None]
         for place in ("BARYCENTER", "HELIOCENTER"):
-            # Dates at the barycentre are those of the light; those at the Sun are seconds from them.
-            dated = [name for name in dated if said[name].position == place] or dated
+            # Barycentric dates are preferred; heliocentric ones differ from them by seconds.
+            dated = [name for name in dated if times[name].position == place] or dated
         if len(dated) > 1:
             named = ", ".join(map(shortened, dated))
-            fault = f"{file.what}: {len(dated)} columns may be the time; give a mapping that names one of {named}"
+            fault = f"{file.label}: {len(dated)} columns may be the time; give a mapping that names one of {named}"
             raise InputError(fault, key="time")
-        timed = [name for name in said if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
-        columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.what)
+        timed = [name for name in times if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
+        columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.label)
     if columns["time"] is None:
         # The start and the end of each frame.
-        edges = tuple(first_of((name,), names, file.what) for name in ("t0", "t1"))
+        edges = tuple(first_of((name,), names, file.label) for name in ("t0", "t1"))
         columns["time"] = None if None in edges else edges
     flux = divided_unit(columns["flux"] or "")[0]
-    # Errors of another flux would be wrong ones.
+    # Errors of another flux would be wrong.
     ends = ("_err", "_error", "err", "_e", "_unc", "_uncertainty", "_sigma", "_std")
     errors = [f"{flux}{end}" for end in ends] + [f"{start}{flux}" for start in ("e_", "err_", "sigma_", "sig_", "d")]
     errors += [flux.lower().replace("flux_", "flux_err_")] if "flux_" in flux.lower() else []
-    columns["error"] = first_of((*errors, "error", "err", "uncertainty", "unc", "sigma"), names, file.what)
+    columns["error"] = first_of((*errors, "error", "err", "uncertainty", "unc", "sigma"), names, file.label)
     if columns["flux"] is None and (magnitudes := [name for name in names if is_magnitude(name)]):
         raise InputError(
-            f"{file.what} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light; "
+            f"{file.label} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light; "
             "give light in a linear unit, in a column named flux or that a mapping names",
             key="flux",
         )
     if columns["time"] is None or columns["flux"] is None:
         raise InputError(
-            f"{file.what} must have columns named time and flux, or a mapping that names them, but has the columns "
+            f"{file.label} must have columns named time and flux, or a mapping that names them, but has the columns "
             f"{shortened(', '.join(file.names), 300)}",
             key="mapping",
         )
@@ -188,76 +188,73 @@ def times_of(
     """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
     import astropy.units as u
 
-    stated = units.TimeSystem.of(file.header, file.what)
-    scale = units.scale_of(mapping.scale) or stated.scale
-    position = units.position_of(mapping.position) or stated.position
+    label, header = file.label, units.TimeSystem.of(file.header, file.label)
+    scale = units.scale_of(mapping.scale) or header.scale
+    position = units.position_of(mapping.position) or header.position
     epoch, remarks = mapping.epoch_mjd, []
-    texts = [one.texts() for one in time]
-    if all(text is not None and any(units.is_dated(cell) for cell in text) for text in texts):
-        scale, unit, epoch, offset = scale or stated.default_scale or "utc", u.d, 0.0, 0.0
-        edges = [units.mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
-        if not (mapping.scale or stated.scale or stated.default_scale):
-            remarks.append(f"the dates of {file.what} state no time scale and are assumed to be in UTC")
+    texts = [values.texts() for values in time]
+    if all(cells is not None and any(map(units.is_dated, cells)) for cells in texts):
+        scale, unit, epoch, offset = scale or header.default_scale or "utc", u.d, 0.0, 0.0
+        edges = [units.mjd_of(cells or [], scale, values.name, label)
+                 for cells, values in zip(texts, time, strict=True)]  # fmt: skip
+        if not (mapping.scale or header.scale or header.default_scale):
+            remarks.append(f"the dates of {label} state no time scale and are assumed to be in UTC")
     else:
-        edges = [one.numbers(DATE).ravel() for one in time]
-        said, remarks = _time_unit(time, edges[0], file, mapping, stated)
-        unit = u.Unit(said.unit)
-        offset = stated.offset_in(unit, file.what)
-        scale, position = scale or said.scale or stated.default_scale, position or said.position
-        epoch = next((one for one in (epoch, stated.epoch_mjd, said.epoch_mjd) if one is not None), None)
-    is_cheops = str(file.header.get("EXTNAME", "")).upper().startswith(CHEOPS)
-    if is_cheops and position == "BARYCENTER" and not mapping.scale:
-        scale = "tt"
-        remarks.append(
-            f"{time[0].name} of {file.what} is in TT, as in all files of CHEOPS; UTC is the scale of its other dates"
-        )
+        edges = [values.numbers(DATE).ravel() for values in time]
+        column, remarks = _time_unit(time, edges[0], file, mapping, header)
+        unit = u.Unit(column.unit)
+        offset = header.offset_in(unit, label)
+        scale, position = scale or column.scale or header.default_scale, position or column.position
+        epoch = next((mjd for mjd in (epoch, header.epoch_mjd, column.epoch_mjd) if mjd is not None), None)
+    extension = str(file.header.get("EXTNAME", "")).upper()
+    if extension.startswith(CHEOPS) and position == "BARYCENTER" and not mapping.scale:
+        scale, dates = "tt", "as in all files of CHEOPS; UTC is the scale of its other dates"
+        remarks.append(f"{time[0].name} of {label} is in TT, {dates}")
     exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
     middles = np.mean(edges, axis=0) + offset
     first = float(np.min(middles, where=np.isfinite(middles), initial=np.inf))
     first = first if np.isfinite(first) else 0.0
     # Days since a date far in the past lose digits as seconds: subtract before the unit is changed.
     seconds, first_d = np.asarray(((middles - first) * unit).to_value(u.s)), float((first * unit).to_value(u.s)) / DAY_S
-    at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
+    at = 0.5 if len(edges) == 2 else PLACES_IN_FRAME.get(mapping.time_at or "", header.at)
     if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
         span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))
-        remarks.append(f"the times of {file.what} have no date, although their unit, name or header says so: {span}")
+        remarks.append(f"the times of {label} have no date, although their unit, name or header says so: {span}")
         epoch = None
-    dates = replace(stated, epoch_mjd=None if epoch is None else epoch + first_d, scale=scale, position=position, at=at)
-    return (seconds if epoch is not None else seconds + first_d * DAY_S), exposure, dates, tuple(remarks)
+    seconds, epoch = (seconds + first_d * DAY_S, None) if epoch is None else (seconds, epoch + first_d)
+    system = replace(header, epoch_mjd=epoch, scale=scale, position=position, at=at)
+    return seconds, exposure, system, tuple(remarks)
 
 
 def _time_unit(
-    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: units.TimeSystem
-) -> tuple[units.TimeUnit, list[str]]:
-    """Return the unit of times and what it says of their zero, by the mapping, the column, its name or the header."""
-    if len({one.unit or unit_in_name(one.name) for one in time}) > 1 and not mapping.time_unit:
-        names = " and ".join(repr(one.name) for one in time)
-        raise InputError(f"{file.what}: {names} must have the same unit, but have different units", key="time")
-    text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
-    named = units.time_in_name(time[0].name)
-    said = units.time_unit(text) if text else named
-    if said is None and (text := text or stated.unit) and (said := units.time_unit(text)) is None:
+    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, header: units.TimeSystem
+) -> tuple[units.TimeSystem, list[str]]:
+    """Return the unit and the zero of times, as the mapping, the column, its name or the header states them."""
+    if len({column.stated_unit for column in time}) > 1 and not mapping.time_unit:
+        names = " and ".join(repr(column.name) for column in time)
+        raise InputError(f"{file.label}: {names} must have the same unit, but have different units", key="time")
+    text, named = mapping.time_unit or time[0].stated_unit, units.time_in_name(time[0].name)
+    system = units.time_unit(text) if text else named
+    if system is None and (text := text or header.unit) and (system := units.time_unit(text)) is None:
         # Checks the unit; times keep theirs, so that long times lose no digits.
-        converted(replace(time[0], unit=text), None, "s", "time_unit")
-        said = units.TimeUnit(str(unit_in(text)))
+        convert(replace(time[0], unit=text), None, "s", "time_unit")
+        system = units.TimeSystem(str(unit_in(text)))
     remarks = list[str]()
-    if said is None:
-        held = {*map(key_of, file.columns)}
-        if known := [(times, words) for columns, times, words in TIMES_OF_COLUMNS if columns <= held]:
-            said, text = known[0]
+    if system is None:
+        keys, mission = {*map(key_of, file.columns)}, units.mission_of(file.header)
+        if usual := [(times, words) for columns, times, words in TIMES_OF_COLUMNS if columns <= keys]:
+            system, text = usual[0]
         else:
-            keywords = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
-            mission = next((one for one in units.MISSIONS if one in keywords), None)
             finite = values[np.isfinite(values)]
-            if mission is None or not (finite.size and 0 < float(np.median(finite)) < 20_000):
-                converted(time[0], None, "s", "time_unit")
+            if not (mission and finite.size and 0 < float(np.median(finite)) < 20_000):
+                convert(time[0], None, "s", "time_unit")
             name = units.MISSIONS[mission or "TESS"].upper()
-            said, text = units.time_unit(name) or units.TimeUnit("d"), f"{name}, days, as in files of {mission}"
-        remarks = [f"ASSUMED: the times of {file.what} are {text}; it states no unit"]
-    elif said.epoch_mjd is None and named is not None and named.unit == said.unit:
-        said = named
-    own, header = said.epoch_mjd, stated.epoch_mjd
-    if mapping.epoch is None and own is not None and header is not None and abs(own - header) > 1e-5:
-        fault = f"{file.what}: {time[0].name!r} counts from MJD {own:g} by its unit or name and from {header:g} by"
-        raise InputError(f"{fault} its header; give one epoch, or a mapping with epoch", key="epoch")
-    return said, remarks
+            system, text = units.time_unit(name) or units.TimeSystem("d"), f"{name}, days, as in files of {mission}"
+        remarks = [f"ASSUMED: the times of {file.label} are {text}; it states no unit"]
+    elif system.epoch_mjd is None and named is not None and named.unit == system.unit:
+        system = named
+    epoch, of_header = system.epoch_mjd, header.epoch_mjd
+    if mapping.epoch is None and epoch is not None and of_header is not None and abs(epoch - of_header) > 1e-5:
+        fault = f"{file.label}: {time[0].name!r} counts from MJD {epoch:g} by its unit or name and from {of_header:g}"
+        raise InputError(f"{fault} by its header; give one epoch, or a mapping with epoch", key="epoch")
+    return system, remarks

@@ -88,7 +88,7 @@ class SpectralSeries:
     cleaned: CleanedSpectra
     jitters: Mapping[str, float]  # standard deviations of unknowns of frames; infinite if they are projected out
     changes: list[LightChange]  # sudden changes of the light that all pixels share
-    kept: float  # S/N of flares over that with a steady level of the frames
+    snr_kept: float  # S/N of flares over that with a steady level of the frames
     dark_drift: float  # range of the slow changes of the dark current over the light in the sum; 0 if they are small
 
     @property
@@ -103,8 +103,8 @@ class SpectralSeries:
         quiet = model.quiet
         dn = quiet.n_frames * quiet.source_electrons * quiet.gain_dn_per_electron
         star = model.bins @ dn * model.per_dn
-        others = [spectrum for name, spectrum in model.unknowns(self.light).items() if name != "light"]
-        columns = np.array([star, *others]).T / self.noise.used[:, None]
+        unknowns = [spectrum for name, spectrum in model.unknowns(self.light).items() if name != "light"]
+        columns = np.array([star, *unknowns]).T / self.noise.used[:, None]
         amplitude = np.linalg.lstsq(columns, self.light / self.noise.used, rcond=None)[0][0]
         return float(amplitude * star.sum() / abs(self.light.sum()))
 
@@ -117,8 +117,8 @@ def relative_error(differences: int) -> float:
 def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared: Float, nm: Float) -> PixelNoise:
     """Measure the noise of each pixel from differences of the quiescent frames of `pairs` and their successors."""
     blocks = [pairs[first : first + BLOCK] for first in range(0, pairs.size, BLOCK)]
-    variances = [variance_of_steps(excess[some + 1] - excess[some], stated, shared) for some in blocks]
-    measured = np.sqrt(np.average(variances, axis=0, weights=[some.size for some in blocks]))
+    variances = [variance_of_steps(excess[block + 1] - excess[block], stated, shared) for block in blocks]
+    measured = np.sqrt(np.average(variances, axis=0, weights=[block.size for block in blocks]))
     reach = float(scipy.stats.norm.isf(0.025)) * relative_error(pairs.size)
     return PixelNoise(nm, stated, measured, stated * (1 - reach), stated * (1 + reach), int(pairs.size))
 
@@ -149,15 +149,15 @@ def survey_spectra(
     for _ in range(ROUNDS):
         series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
         lit, level = np.maximum(series.light, 0.0), float(np.median(flux[used & ~events]))
-        # Frames without light, such as dark frames, have no photon noise to weight by.
+        # Frames without light, such as dark frames, have no photon noise that could weight the gains.
         photon = float(np.average(cleaned.model.gain, weights=lit if lit.any() else None))
         # The noise of the sums follows that of the whole light in time.
         survey = SeriesSurvey.of(frames, flux, error**2, used, level, photon, shape, weighted=(templates, sums))
-        survey, taken = fit_quiet_light(survey, events[used], None, fits)
+        survey, in_events = fit_quiet_light(survey, events[used], None, fits)
         now = np.zeros(flux.size, np.bool_)
-        now[used] = taken
+        now[used] = in_events
         sigmas = np.zeros(flux.size)
-        sigmas[used] = survey.along(len(survey.bank.directions) // 2, ~taken)
+        sigmas[used] = survey.along(len(survey.bank.directions) // 2, ~in_events)
         single = single_frames(frames.numbers, sigmas, used)
         settled = not single.any() and float((now ^ events).mean()) <= SETTLED_EVENTS
         events = now
@@ -192,25 +192,25 @@ def _weighted_sums(
     noise = measure_noise(excess, pairs, cleaned.stated, shared, frames.wavelength_nm)
     flares = model.flares(TEMPERATURES_K)
     compared = np.flatnonzero(reasons == 0)
-    others = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
-    changes = light_changes(excess, compared, frames.numbers, light, others, noise.used)
+    alternatives = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
+    changes = light_changes(excess, compared, frames.numbers, light, alternatives, noise.used)
     dark, drift = _dark_changes(excess, pairs, quiet, noise.used, shared)
-    known = {"light": np.inf} | dark | dict(jitters or {})
-    names = tuple(name for name in known if name in unknown)
+    deviations = {"light": np.inf} | dark | dict(jitters or {})
+    names = tuple(name for name in deviations if name in unknown)
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
-                          np.array([known[name] for name in names]))  # fmt: skip
+                          np.array([deviations[name] for name in names]))  # fmt: skip
     # Flares that double the light of the star, in the sum over wavelength.
     flares *= abs(float(light.sum())) / flares.sum(axis=1, keepdims=True)
     templates, steady = (
-        Templates.of_spectra(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=some, rank=rank)
-        for some in (nuisances, nuisances.without(["light"]))
+        Templates.of_spectra(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=included, rank=rank)
+        for included in (nuisances, nuisances.without(["light"]))
     )
-    kept = float(np.median(templates.best / steady.best))
+    snr_kept = float(np.median(templates.best / steady.best))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
     mixing = _independent(sums, pairs, quiet)
     templates, sums = templates.mixed(mixing), sums @ mixing.T
     drift *= abs(float(unknown["dark"].sum() / light.sum()))
-    return SpectralSeries(excess, light, noise, cleaned, known, changes, kept, drift), templates, sums
+    return SpectralSeries(excess, light, noise, cleaned, deviations, changes, snr_kept, drift), templates, sums
 
 
 def _independent(sums: Float, pairs: NDArray[np.intp], quiet: Bool) -> Float:
@@ -277,7 +277,8 @@ def event_colour(spectra: Float, error: Float, event: Bool, quiet: Bool) -> tupl
     scale = _multiple(excess, star, variance)
     chi2 = ((excess - scale[0] * star) ** 2 / variance).sum()
     half = fine.sum() // 2
-    blue, red = (_multiple(excess[part], star[part], variance[part]) for part in (slice(None, half), slice(half, None)))
+    halves = (slice(None, half), slice(half, None))
+    blue, red = (_multiple(excess[pixels], star[pixels], variance[pixels]) for pixels in halves)
     ratio = blue[0] / red[0]
     relative = np.hypot(blue[1] / blue[0], red[1] / red[0])
     return float(ratio), float(abs(ratio) * relative), float(scipy.stats.chi2.sf(chi2, fine.sum() - 1))
@@ -289,7 +290,7 @@ def _multiple(excess: Float, star: Float, variance: Float) -> tuple[float, float
     return float((excess * star / variance).sum()) / information, information**-0.5
 
 
-#: Words for the unknowns of frames that may cause an event.
+#: Kinds of events that unknowns of the frames may cause.
 CAUSES: dict[str, Kind] = {"light": "throughput", "dark": "dark current", "sky": "sky"}
 #: S/N of a flare, next to unknown changes of star, dark current and sky, from which an event is a flare.
 FLARE_SNR = 4.0
@@ -297,7 +298,7 @@ FLARE_SNR = 4.0
 RAY_SHARE = 0.5
 #: Smallest number of means of quiescent frames from which drifts are measured.
 MIN_PARTS = 8
-#: Share of the frames of such a part that must be quiescent.
+#: Share of the frames of a mean that must be quiescent.
 QUIET_SHARE = 0.5
 #: Probability of a worse fit below which no spectrum that is known explains an event.
 NO_FIT = 1e-6
@@ -316,8 +317,8 @@ class EventSpectrum:
     @property
     def ambiguous(self) -> bool:
         """True if a flare explains the spectrum best, but hardly better than a change of the instrument does."""
-        others = min(value for cause, value in self.chi2.items() if cause != "flare")
-        return self.cause == "flare" and others < self.chi2["flare"] + CLEARLY
+        rival = min(value for cause, value in self.chi2.items() if cause != "flare")
+        return self.cause == "flare" and rival < self.chi2["flare"] + CLEARLY
 
     @property
     def reason(self) -> str:
@@ -332,15 +333,17 @@ class EventSpectrum:
         return "no flare of one temperature fits its spectrum" if self.p_value < NO_FIT else ""
 
 
-def event_spectrum(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one: DetectedEvent) -> EventSpectrum:
+def event_spectrum(
+    survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, event: DetectedEvent
+) -> EventSpectrum:
     """Compare the spectrum of an event with those of flares and of changes that resemble them.
 
     Its spectrum is that of the template of the search, which is fitted to each pixel with a straight line.
     """
-    model, at = series.cleaned.model, _window(survey, taken, one)[0]
+    model, at = series.cleaned.model, _window(survey, in_events, event)[0]
     start = survey.stare.start_s[at]
     edges = np.column_stack([start, start + survey.stare.frame_s])
-    shape = survey.bank.shape.mean_over(edges, one.peak_s, one.half_width_s)
+    shape = survey.bank.shape.mean_over(edges, event.peak_s, event.half_width_s)
     middle = (start - start.mean()) / max(float(np.ptp(start)), 1.0)
     weights = np.linalg.pinv(np.column_stack([shape, np.ones(at.size), middle]))[0]
     spectrum = np.asarray(weights @ series.excess[at])
@@ -350,7 +353,7 @@ def event_spectrum(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, on
     causes: dict[Kind, Float] = {"flare": flares}
     causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
     fits = {cause: chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
-    chi2 = {cause: float(each.min()) for cause, each in fits.items()}
+    chi2 = {cause: float(values.min()) for cause, values in fits.items()}
     # Light is added, never taken away.
     rises = flares @ (spectrum / variance) > 0
     chi2["flare"] = float(np.where(rises, fits["flare"], (spectrum**2 / variance).sum()).min())
@@ -363,27 +366,27 @@ def event_spectrum(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, on
     dof = spectrum.size - 1
     least = chi2[cause]
     row = causes[cause][fits[cause].argmin()]
-    left = spectrum - (row @ (spectrum / variance)) / (row @ (row / variance)) * row
+    residual = spectrum - (row @ (spectrum / variance)) / (row @ (row / variance)) * row
     p_value = float(scipy.stats.chi2.sf(least, dof))
-    if p_value < NO_FIT and (left**2 / variance).max() > RAY_SHARE * least:
+    if p_value < NO_FIT and (residual**2 / variance).max() > RAY_SHARE * least:
         cause = "cosmic ray"
     elif cause != "flare" and (chi2["flare"] - least < CLEARLY or snr >= FLARE_SNR):
         cause = "flare"
     return EventSpectrum(cause, snr, chi2, dof, p_value)
 
 
-def _window(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> tuple[NDArray[np.intp], Bool]:
+def _window(survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> tuple[NDArray[np.intp], Bool]:
     """Return the frames of an event and of its surroundings without other events, and which belong to the event."""
-    lead, tail = survey.bank.window(one.half_width_s)
+    lead, tail = survey.bank.window(event.half_width_s)
     numbers = survey.stare.numbers
     inside = np.zeros(numbers.size, np.bool_)
-    inside[one.first : one.last + 1] = True
-    near = (numbers >= numbers[one.first] - lead) & (numbers <= numbers[one.last] + tail)
-    at = np.flatnonzero(near & (inside | ~taken))
+    inside[event.first : event.last + 1] = True
+    near = (numbers >= numbers[event.first] - lead) & (numbers <= numbers[event.last] + tail)
+    at = np.flatnonzero(near & (inside | ~in_events))
     return at, inside[at]
 
 
-def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, n_frames: int) -> dict[str, float]:
+def drifts(survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, n_frames: int) -> dict[str, float]:
     """Return the standard deviations by which star, dark current and sky differ in an event from its surroundings.
 
     They follow from means of `n_frames` quiescent frames, compared with those before and after: the scatter in excess
@@ -394,14 +397,14 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, n_frames: 
     names = ("light", "dark")
     spectra = np.array([unknown[name] for name in names])
     amplitudes, covariance = fit_changes(series.excess, spectra, series.noise.used)
-    found = dict.fromkeys(names, np.inf)
+    drift = dict.fromkeys(names, np.inf)
     size, means, counts = n_frames, list[Float](), np.zeros(0, np.intp)
     while size > 0 and len(means) < MIN_PARTS:
-        part = survey.stare.numbers // size
-        counts = np.bincount(part[~taken], minlength=int(part[-1]) + 1)
-        # A part without the frames of a short event still shows the drift.
+        segment = survey.stare.numbers // size
+        counts = np.bincount(segment[~in_events], minlength=int(segment[-1]) + 1)
+        # A mean without the frames of a short event still shows the drift.
         enough = np.flatnonzero(counts > QUIET_SHARE * size)
-        means, counts = [amplitudes[(part == k) & ~taken].mean(axis=0) for k in enough], counts[enough]
+        means, counts = [amplitudes[(segment == k) & ~in_events].mean(axis=0) for k in enough], counts[enough]
         size = size if len(means) >= MIN_PARTS else size // 2
     if len(means) >= MIN_PARTS:
         bends = np.diff(np.array(means), 2, axis=0) / 2
@@ -410,18 +413,20 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, n_frames: 
             # A mean less that of its neighbours has 3/2 of the variance of a mean, where all are of as many frames.
             expected = float(covariance[k, k]) * float((share[:-2] / 4 + share[1:-1] + share[2:] / 4).mean())
             beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
-            found[name] = n_frames / size * float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
+            drift[name] = n_frames / size * float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
     if "sky" in unknown and (sd := NUISANCES["sky"].sd) is not None:
-        found["sky"] = sd
-    return found
+        drift["sky"] = sd
+    return drift
 
 
-def measure_flare(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one: DetectedEvent) -> Measurement | str:
-    """Fit a flare to the sum of the spectra of an event, or return the reason why none is.
+def measure_flare(
+    survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, event: DetectedEvent
+) -> Measurement | str:
+    """Fit a flare to the sum of the spectra of an event, or return the reason why none is fitted.
 
     Star, dark current and sky may differ from the surroundings as much as other parts of the frames do; see `drifts`.
     """
-    at, inside = _window(survey, taken, one)
+    at, inside = _window(survey, in_events, event)
     n, base = int(inside.sum()), int((~inside).sum())
     if base < MIN_BASELINE:
         return f"{base} frames around it show the quiescent star, {MIN_BASELINE} are needed"
@@ -432,9 +437,9 @@ def measure_flare(survey: SeriesSurvey, series: SpectralSeries, taken: Bool, one
     variance = series.noise.used**2 * (1 + n / base)
     exposure = model.exposure(series.light, variance, n)
     unknown = {name: row * n / model.per_dn for name, row in model.unknowns(series.light).items()}
-    sd = drifts(survey, series, taken, n)
+    sd = drifts(survey, series, in_events, n)
     spectra, errors = np.array(list(unknown.values())), np.array([sd[name] for name in unknown])
-    # What changes the light of the star changes that of the flare alike.
+    # A change of the throughput changes the light of the flare as much as that of the star.
     of_flare = np.array([np.full(summed.size, float(name == "light")) for name in unknown])
     nuisances = Nuisances(tuple(unknown), spectra, errors, of_flare)
     # In the sum of the frames, with one pixel for each value.

@@ -28,7 +28,7 @@ from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.detector import CalibrationFrames, DarkFit, GoodnessOfFit, PhotonTransfer
 from mauvecl.schema.errors import InputError
 
-#: Knots of the errors of a star's spectrum, and their relative size if one star alone cannot tell: an assumption.
+#: Knots of the errors of a star's spectrum, and their assumed relative size if only one star is observed.
 ERROR_KNOTS, ONE_STAR_ERROR = 12, 0.10
 #: Probability of chi-squared below which errors of the stars' spectra are fitted.
 REJECTED = 0.01
@@ -36,7 +36,7 @@ REJECTED = 0.01
 WIDTHS = (1.0, 0.9, 1.1)
 #: Steps of wavelength, nm, and of the relative width for derivatives.
 STEP_NM, STEP_WIDTH = 0.2, 0.05
-#: Largest fitted shift and stretch, nm, and relative change of the line's width, beyond which nothing is linear.
+#: Largest fitted shift and stretch, nm, and relative change of the line's width, up to which the problem is linear.
 LIMITS = np.array([5.0, 5.0, 0.3, 0.3])
 #: Largest number of iterations, and the change of log throughput at which they end.
 ITERATIONS, SETTLED = 50, 1e-5
@@ -84,10 +84,10 @@ class _Linearised:
         self.normal, self.projected = design.T @ design, design.T @ values
         n = len(penalty)
         middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(penalty))
-        # That of the largest restricted likelihood.
+        # The smoothing parameter of the largest restricted likelihood.
         self.smoothing = _best(self.likelihood, tuple(middle + np.array(LOG_SMOOTHING)))
         self.covariance: Float = np.asarray(np.linalg.inv(self._information(self.smoothing, prior)))
-        self.found: Float = self.covariance @ self.projected
+        self.solution: Float = self.covariance @ self.projected
 
     def _information(self, smoothing: float, prior: Float) -> Float:
         full, n = np.diag(prior**-2.0), len(self.penalty)
@@ -98,12 +98,12 @@ class _Linearised:
         """Return minus twice the logarithm of the restricted likelihood, up to a constant."""
         prior = self.prior if prior is None else prior
         full = self._information(smoothing, prior)
-        found = np.linalg.solve(full, self.projected)
+        best_fit = np.linalg.solve(full, self.projected)
         rank = len(self.penalty) - 2
-        known = np.isfinite(prior)
+        constrained = np.isfinite(prior)
         return float(
-            self.values @ self.values - self.projected @ found - rank * np.log(smoothing)
-            + 2 * np.log(prior[known]).sum() + np.linalg.slogdet(full)[1]
+            self.values @ self.values - self.projected @ best_fit - rank * np.log(smoothing)
+            + 2 * np.log(prior[constrained]).sum() + np.linalg.slogdet(full)[1]
         )  # fmt: skip
 
     def scaled(self, basis: Float) -> Float:
@@ -117,8 +117,10 @@ class _Linearised:
             """Return the variance of a curve at the pixels from the covariance of its coefficients."""
             return np.asarray(np.einsum("pi,pi->p", basis @ values[:n, :n], basis))
 
-        variance, bias = spread(covariance), basis @ (pull @ self.found)[:n]
-        of_noise, expected = (float(np.mean(spread(each) / variance)) for each in (pull @ noise @ pull.T, pull @ noise))
+        variance, bias = spread(covariance), basis @ (pull @ self.solution)[:n]
+        of_noise, expected = (
+            float(np.mean(spread(matrix) / variance)) for matrix in (pull @ noise @ pull.T, pull @ noise)
+        )
         if not expected > of_noise:
             return covariance
         scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
@@ -127,20 +129,20 @@ class _Linearised:
     def pixels(self, model: ThroughputModel) -> tuple[bool, float, float, float, Float, Float]:
         """Divide the residuals into those that all stars share, and those by which they differ.
 
-        Returned are whether the stars differ from each other, chi-squared and degrees of freedom of the fit with a
-        factor for each pixel, the relative standard deviation of these factors, zero if the spline follows the
+        Return whether the stars differ from each other, chi-squared and degrees of freedom of the fit with a factor for
+        each pixel, the relative standard deviation of these factors, which is zero if the spline follows the
         throughput, their logarithms, shape (n_pixel,), and the variances of these.
         """
         n_star, n_pixel = model.observed_dn.shape
         design = self.design
-        every = self.values - design @ self.found
-        left = every.reshape(n_star, n_pixel)
+        residuals = self.values - design @ self.solution
+        by_star = residuals.reshape(n_star, n_pixel)
         # The columns of the spline sum to one.
-        whole = design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
-        information = np.sum(whole**2, axis=0)
+        scale = design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
+        information = np.sum(scale**2, axis=0)
         used = information > 0
-        shared = np.divide(np.sum(whole * left, axis=0), information, out=np.zeros(n_pixel), where=used)
-        chi2 = float(every @ every)
+        shared = np.divide(np.sum(scale * by_star, axis=0), information, out=np.zeros(n_pixel), where=used)
+        chi2 = float(residuals @ residuals)
         dof = float(np.any(design != 0, axis=1).sum() - np.sum(self.covariance * self.normal))
         of_shared = float(np.sum(shared**2 * information))
         dof_shared = dof - model.usable.sum() + used.sum()
@@ -148,16 +150,16 @@ class _Linearised:
         if model.order != "paper" or scipy.stats.chi2.sf(of_shared, dof_shared) >= REJECTED:
             return disagree, chi2, dof, 0.0, np.zeros(n_pixel), np.zeros(n_pixel)
         variance = (of_shared - dof_shared) / float(np.sum(information))
-        kept = variance * information / (1 + variance * information)
-        chi2 -= float(np.sum(shared**2 * information * kept * (2 - kept)))
-        factors = np.log1p(kept * shared), variance * (1 - kept)
-        return disagree, chi2, dof - float(kept.sum()), float(np.sqrt(variance)), *factors
+        share = variance * information / (1 + variance * information)
+        chi2 -= float(np.sum(shared**2 * information * share * (2 - share)))
+        factors = np.log1p(share * shared), variance * (1 - share)
+        return disagree, chi2, dof - float(share.sum()), float(np.sqrt(variance)), *factors
 
 
 def _best(likelihood: Callable[[float], float], log_range: tuple[float, float]) -> float:
     """Return the positive number at which -2 log likelihood is smallest."""
-    found = minimize_scalar(lambda log: likelihood(np.exp(log)), bounds=log_range, method="bounded")
-    return float(np.exp(found.x))
+    minimum = minimize_scalar(lambda log: likelihood(np.exp(log)), bounds=log_range, method="bounded")
+    return float(np.exp(minimum.x))
 
 
 class ThroughputModel:
@@ -179,14 +181,14 @@ class ThroughputModel:
         # Wavelengths of the pixels from -1 to 1.
         self.x = 2 * (nm - nm[0]) / np.ptp(nm) - 1
         # Mean light of a frame, and pixels that stay below saturation, shape (n_star, n_pixel).
-        self.observed_dn = np.array([one.raw_dn.mean(axis=0) - dark.mean_dn(one) for one in stars])
-        self.usable = np.array([one.usable(nominal) for one in stars])
+        self.observed_dn = np.array([frames.raw_dn.mean(axis=0) - dark.mean_dn(frames) for frames in stars])
+        self.usable = np.array([frames.usable(nominal) for frames in stars])
         # Seconds of dark current and their change with its slope, shape (n_star, 2).
-        self.dark_terms = np.array([dark.terms(one) for one in stars])
+        self.dark_terms = np.array([dark.terms(frames) for frames in stars])
         # Covariance between stars of each pixel's subtracted dark, shape (n_pixel, n_star, n_star).
         jacobian = np.column_stack([np.ones(len(stars)), self.dark_terms[:, 0]])
         self.dark_covariance = jacobian @ dark.covariance @ jacobian.T
-        spectra = [one.star for one in stars if one.star is not None]
+        spectra = [frames.star for frames in stars if frames.star is not None]
         # Zodiacal light of a second in each pixel, shape (n_pixel,).
         quiet = expect(spectra[0], nominal, exposure=frame_s, sky=sky, order=order)
         self.sky_electrons = quiet.sky_electrons / frame_s
@@ -197,8 +199,8 @@ class ThroughputModel:
         # Stars that differ in brightness alone count once.
         flux = [star.flux_flam / star.flux_flam.max() for star in spectra]
         self.n_stars = sum(
-            all(one.shape != other.shape or not np.allclose(one, other) for other in flux[:k])
-            for k, one in enumerate(flux)
+            all(later.shape != earlier.shape or not np.allclose(later, earlier) for earlier in flux[:k])
+            for k, later in enumerate(flux)
         )
         # Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star.
         self.n_shape = 0 if self.n_stars < 2 else 4 if fwhm > 0 else 2
@@ -217,7 +219,7 @@ class ThroughputModel:
         shift, stretch, width, change = np.pad(shape, (0, 4 - shape.size))
         nm, local, step = self.nominal.wavelength_nm, width + change * self.x, WIDTHS[-1] - 1.0
         light = []
-        for one, (star, responses) in zip(self.stars, self.responses, strict=True):
+        for frames, (star, responses) in zip(self.stars, self.responses, strict=True):
             at, flux = star.wavelength_nm, star.flux_flam
             if shift or stretch:
                 flux = np.interp(at + shift + stretch * np.interp(at, nm, self.x), at, flux)
@@ -229,31 +231,29 @@ class ThroughputModel:
                 slope, bend = (wide - narrow) / (2 * step), (wide + narrow - 2 * electrons) / (2 * step**2)
                 electrons = electrons + local * (slope + local * bend)
             electrons = np.maximum(electrons * self.nominal.per_pixel("response", 1.0), 0.0) + self.sky_electrons
-            light.append(self.transfer.noise.gain * electrons * one.exposure_s)
+            light.append(self.transfer.noise.gain * electrons * frames.exposure_s)
         return np.array(light) if self.order == "physical" else np.array(light) * np.exp(log_factor)
 
     def variance_dn2(self, light_dn: Float) -> Float:
         """Return the variance of the mean frames of all stars, shape (n_star, n_pixel)."""
-        frames = np.array([one.n_frames for one in self.stars])
+        frames = np.array([observation.n_frames for observation in self.stars])
         dark = self.dark_terms[:, :1] * self.dark.level_dn_per_s
         return np.asarray(self.transfer.noise.variance(light_dn, dark) / frames[:, None])
 
     def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
         """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""
-        n_star, own = len(self.stars), self.basis @ coefficients
-        model = self.light_dn(own, shape)
+        n_star, log_factor = len(self.stars), self.basis @ coefficients
+        model = self.light_dn(log_factor, shape)
         columns = [model * column for column in self.basis.T]
-        columns += [slope * np.exp(own) for slope in self.slopes_dn]
+        columns += [slope * np.exp(log_factor) for slope in self.slopes_dn]
         around = np.concatenate([coefficients, shape])
         prior = [np.inf] * around.size
-        for k in range(n_star):
-            alone = np.zeros((n_star, 1))
-            alone[k] = 1.0
+        for star in np.eye(n_star)[:, :, None]:
             if self.light_error > 0:
-                columns.append(alone * model)
+                columns.append(star * model)
                 prior.append(self.light_error)
             if error > 0:
-                columns += [alone * model * column for column in _linear_basis(self.nominal.wavelength_nm).T]
+                columns += [star * model * column for column in _linear_basis(self.nominal.wavelength_nm).T]
                 prior += [error] * ERROR_KNOTS
         level = self.dark.level_dn_per_s.mean()
         jacobian = np.column_stack([np.ones(n_star), self.dark_terms[:, 0], level * self.dark_terms[:, 1]])
@@ -267,8 +267,8 @@ class ThroughputModel:
         covariance = np.where(used[:, :, None] & used[:, None, :], self.dark_covariance, 0.0)
         covariance[:, index, index] += np.where(used, self.variance_dn2(model).T, 1.0)
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-        every = [np.where(used.T, each, 0.0) for each in (*columns, self.observed_dn - model)]
-        *columns, observed = (np.einsum("pij,jp->ip", inverse, each).ravel() for each in every)
+        masked = [np.where(used.T, values, 0.0) for values in (*columns, self.observed_dn - model)]
+        *columns, observed = (np.einsum("pij,jp->ip", inverse, values).ravel() for values in masked)
         design = np.column_stack(columns)
         return _Linearised(observed + design[:, : around.size] @ around, design, np.array(prior), self.penalty)
 
@@ -289,7 +289,7 @@ def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) 
         of_spectra = trial.prior == ONE_STAR_ERROR
         error = _best(lambda sd: trial.likelihood(trial.smoothing, np.where(of_spectra, sd, trial.prior)), LOG_ERROR)
         best = _iterated(model, error)
-    shape = best.found[n : n + m]
+    shape = best.solution[n : n + m]
     if (np.abs(shape) > LIMITS[:m]).any():
         fault = "the stars' spectra must match a wavelength scale and line width near the nominal ones, but do not"
         most = f"use standards with shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %"
@@ -300,7 +300,7 @@ def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) 
     onto, errors = scipy.linalg.block_diag(model.basis, np.eye(m)), apart * _linear_basis(nm)
     joint = np.asarray(onto @ best.scaled(model.basis)[: n + m, : n + m] @ onto.T)
     joint[: nm.size, : nm.size] += np.diag(variance) + errors @ errors.T + model.transfer.relative_gain_error**2
-    log_factor = model.basis @ best.found[:n] + log_pixel
+    log_factor = model.basis @ best.solution[:n] + log_pixel
     light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
@@ -321,12 +321,12 @@ def _iterated(model: ThroughputModel, error: float) -> _Linearised:
     coefficients, shape = np.zeros(n), np.zeros(m)
     for _ in range(ITERATIONS):
         linear = model.linearised(coefficients, shape, error)
-        step = linear.found[:n] - coefficients
+        step = linear.solution[:n] - coefficients
         moved = np.abs(model.basis @ step).max()
         if moved < SETTLED:
             return linear
         coefficients = coefficients + step * min(1.0, LARGEST_STEP / moved)
-        shape = np.clip(linear.found[n : n + m], -LIMITS[:m], LIMITS[:m])
+        shape = np.clip(linear.solution[n : n + m], -LIMITS[:m], LIMITS[:m])
         if not np.abs(model.basis @ coefficients).max() < LARGEST_LOG:
             break
     raise InputError(

@@ -293,7 +293,7 @@ def _target(
     rows: Rows, columns: dict[str, str | None], row: int, folder: Path | None, unused: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return the data of a target from the cells of its row."""
-    named = f"{rows.named}: row {row + 1}"
+    named = f"{rows.label}: row {row + 1}"
     target: dict[str, Any] = {}
     for key, field in PlanTarget.model_fields.items():
         column = columns.get(key)
@@ -347,7 +347,7 @@ def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: d
     ra, dec = columns["ra"], columns["dec"]
     n_angles = sum(bool(rows.text(name, row)) for name in (ra, dec))
     if n_angles == 1 or (n_angles and "coordinates" in target):
-        raise InputError(f"{rows.named}: row {row + 1} needs either coordinates, or both ra and dec", key="coordinates")
+        raise InputError(f"{rows.label}: row {row + 1} needs either coordinates, or both ra and dec", key="coordinates")
     if ra is not None and dec is not None and n_angles:
         east, north = (rows.degrees(name, row, right_ascension=name == ra) for name in (ra, dec))
         second = rows.first(names.SEXAGESIMAL)

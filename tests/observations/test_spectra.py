@@ -167,8 +167,8 @@ def test_share_of_the_signal_that_a_free_level_leaves() -> None:
     _, survey, series = prepared(frames)
     flares, star = model().flares(survey.templates.temperatures_k) / series.noise.used, series.light / series.noise.used
     correlations = flares @ star / np.linalg.norm(flares, axis=1) / np.linalg.norm(star)
-    assert series.kept == pytest.approx(np.median(np.sqrt(1 - correlations**2)), abs=1e-9)
-    assert prepared(frames, jitters={"light": 1e-6})[2].kept == pytest.approx(1.0, abs=1e-6)
+    assert series.snr_kept == pytest.approx(np.median(np.sqrt(1 - correlations**2)), abs=1e-9)
+    assert prepared(frames, jitters={"light": 1e-6})[2].snr_kept == pytest.approx(1.0, abs=1e-6)
 
 
 def test_cosmic_rays_are_replaced_and_counted_and_flares_are_not() -> None:
