@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,17 +59,9 @@ class NormalMixture:
         """Logarithm of the sum of the weights."""
         return float(scipy.special.logsumexp(self.log_weight))
 
-    @cached_property
-    def _parts(self) -> tuple[Float, Float, Float]:
-        """Weight, mean and standard deviation of the parts that are not negligible, shape (n_part,)."""
-        log = self.log_weight - self.log_total
-        kept = log > LEAST_LOG_WEIGHT
-        mean = self.mean[kept]
-        return np.exp(log[kept]), mean, np.maximum(self.sd[kept], max(LEAST_ERROR * float(np.abs(mean).max()), 1e-300))
-
     def quantile(self, probability: float) -> float:
         """Return a quantile of the part above zero."""
-        weight, mean, sd = self._parts
+        weight, mean, sd = self._significant
         goal = _above(0.0, weight, mean, sd, 0.0) * (1.0 - probability)
         high = max(float((mean + 10 * sd).max()), float(sd.max()))
         if np.isinf(high):
@@ -77,15 +70,23 @@ class NormalMixture:
         # `brentq` keeps its function until the next collection of garbage, but not the arrays.
         return float(scipy.optimize.brentq(_above, 0.0, high, args=(weight, mean, sd, goal), xtol=1e-9 * high))
 
+    @cached_property
+    def _significant(self) -> tuple[Float, Float, Float]:
+        """Weight, mean and standard deviation of the parts that are not negligible, shape (n_part,)."""
+        log = self.log_weight - self.log_total
+        rows = log > LEAST_LOG_WEIGHT
+        mean = self.mean[rows]
+        return np.exp(log[rows]), mean, np.maximum(self.sd[rows], max(LEAST_ERROR * float(np.abs(mean).max()), 1e-300))
+
 
 def _above(x: float, weight: Float, mean: Float, sd: Float, goal: float) -> float:
     """Return the probability of a mixture above x, less a goal."""
     return float(weight @ scipy.special.ndtr((mean - x) / sd)) - goal
 
 
-def joined(parts: Sequence[NormalMixture]) -> NormalMixture:
+def joined(mixtures: Sequence[NormalMixture]) -> NormalMixture:
     """Return the mixture of several."""
-    return NormalMixture(*np.hstack([(part.log_weight, part.mean, part.sd) for part in parts]))
+    return NormalMixture(*np.hstack([(mixture.log_weight, mixture.mean, mixture.sd) for mixture in mixtures]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +118,9 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
     return fits + _single(window, Family.general(), *best.best, wide)
 
 
-def flares_of(survey: SeriesSurvey, taken: Bool, one: DetectedEvent) -> tuple[list[FittedFlare], float, float]:
+def flares_of(survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> tuple[list[FittedFlare], float, float]:
     """Return the flares of the bank's shape that fit an event best, and scale and photon noise of its `Window`."""
-    window = Window.of(survey, taken, one)
+    window = Window.of(survey, in_events, event)
     shape = survey.bank.shape
     return _further(window, shape, [_first_fit(window, Family.of(shape, 1.0)).best[1]]), window.scale, window.photon
 
@@ -175,7 +176,7 @@ class PosteriorGrid:
         brightest = np.exp(MAX_LOG_AMPLITUDE) * light / window.scale
         for _ in range(REFINEMENTS):
             axes = [np.linspace(low, high, n_node) for low, high in box]
-            p, w = (each.ravel() for each in np.meshgrid(axes[0], axes[1], indexing="ij"))
+            p, w = (nodes.ravel() for nodes in np.meshgrid(*axes, indexing="ij"))
             if before is not None and np.array_equal(before.box, box):
                 parts = before.parts
             else:
@@ -187,10 +188,10 @@ class PosteriorGrid:
             snr = np.maximum(slope / np.sqrt(information), 1.0)
             log = 0.5 * slope**2 / information - np.log(snr) + float(np.log(step).sum()) + family.log_prior[:, None]
             log[(slope <= 0) | (amplitude > max(brightest, 1e-12))] = -1e300
-            which, node = np.nonzero(log >= log.max() - NEGLIGIBLE)
-            found = cls(
-                family, parts, which, node, p[node], np.exp(w[node]), log[which, node], amplitude[which, node],
-                information[which, node], box,
+            rows, node = np.nonzero(log >= log.max() - NEGLIGIBLE)
+            grid = cls(
+                family, parts, rows, node, p[node], np.exp(w[node]), log[rows, node], amplitude[rows, node],
+                information[rows, node], box,
             )  # fmt: skip
             ends = np.array([[p[node].min(), p[node].max()], [w[node].min(), w[node].max()]])
             low, high = ends[:, 0] - step, ends[:, 1] + step
@@ -203,7 +204,7 @@ class PosteriorGrid:
             if ((size > 0.6) & (size < 1.1)).all():
                 break
             box = new
-        return found
+        return grid
 
 
 def _ranges(window: Window) -> Float:
@@ -211,17 +212,17 @@ def _ranges(window: Window) -> Float:
 
     A gap before the event may hold the peak, at most as long before as the event lasts.
     """
-    one, survey = window.one, window.survey
+    event, survey = window.event, window.survey
     frame_s = survey.stare.frame_s
-    first_s, last_s = survey.stare.start_s[one.first], survey.stare.start_s[one.last] + frame_s
-    low, high = one.peak_s - PEAK_RANGE * one.half_width_s, one.peak_s + PEAK_RANGE * one.half_width_s
-    before_s = float(survey.stare.start_s[one.first - 1]) + frame_s if one.first else -np.inf
-    low = min(low, max(first_s - max(4 * one.half_width_s, last_s - first_s), before_s))
+    first_s, last_s = survey.stare.start_s[event.first], survey.stare.start_s[event.last] + frame_s
+    low, high = event.peak_s - PEAK_RANGE * event.half_width_s, event.peak_s + PEAK_RANGE * event.half_width_s
+    before_s = float(survey.stare.start_s[event.first - 1]) + frame_s if event.first else -np.inf
+    low = min(low, max(first_s - max(4 * event.half_width_s, last_s - first_s), before_s))
     high = min(max(high, low + frame_s), last_s)
-    widest = max(survey.bank.half_widths_s[-1], one.half_width_s) * 3
+    widest = max(survey.bank.half_widths_s[-1], event.half_width_s) * 3
     if low < first_s - frame_s:
         widest = max(widest, last_s - first_s)
-    width = (max(one.half_width_s / WIDTH_RANGE, 0.2 * frame_s), min(one.half_width_s * WIDTH_RANGE, widest))
+    width = (max(event.half_width_s / WIDTH_RANGE, 0.2 * frame_s), min(event.half_width_s * WIDTH_RANGE, widest))
     return np.array([[low, high], np.log(width)])
 
 
@@ -242,11 +243,11 @@ def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[
     widths = np.geomspace(max(frame_s, 0.1 * flares[0].half_width_s), max(2 * frame_s, 3 * flares[0].half_width_s), 8)
     step = max(frame_s / 2, float(np.ptp(inside)) / 200)
     p, w = (grid.ravel() for grid in np.meshgrid(np.arange(inside[0], inside[-1], step), widths, indexing="ij"))
-    every = window.model(shape, p, w)[None]
+    models = window.model(shape, p, w)[None]
     while len(flares) < MAX_FLARES:
         likelihood = Likelihood.of(window, flares, shape, FURTHER_EPSILON)
         light = light_of(window, shape, flares)
-        slope, information = likelihood.matched(every, np.ones((1, 1)), window.values - light)
+        slope, information = likelihood.matched(models, np.ones((1, 1)), window.values - light)
         gain = np.where(slope > 0, slope**2 / information, 0.0)[0]
         k = int(np.argmax(gain))
         if gain[k] < FURTHER_GAIN:
@@ -256,24 +257,24 @@ def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[
         fall = float(likelihood.chi2(light) - likelihood.chi2(light_of(window, shape, refined)))
         if fall < FURTHER_GAIN:
             break
-        flares = sorted(refined, key=lambda one: -one.equivalent_duration_s)
+        flares = sorted(refined, key=lambda flare: -flare.equivalent_duration_s)
     return _necessary(window, shape, flares) if len(flares) > 2 else flares
 
 
 def _necessary(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
     """Leave out flares that would not be added to the others: they stood for flares that were not found yet."""
     while len(flares) > 1:
-        light, left = light_of(window, shape, flares), []
-        for without in flares:
-            fewer = [one for one in flares if one is not without]
+        light, options = light_of(window, shape, flares), []
+        for k in range(len(flares)):
+            fewer = flares[:k] + flares[k + 1 :]
             fewer = _refined(Likelihood.of(window, fewer, shape, FURTHER_EPSILON), shape, fewer)
             likelihood = Likelihood.of(window, fewer, shape, FURTHER_EPSILON)
-            left.append((float(likelihood.chi2(light_of(window, shape, fewer)) - likelihood.chi2(light)), fewer))
-        fall, fewer = min(left, key=lambda pair: pair[0])
+            options.append((float(likelihood.chi2(light_of(window, shape, fewer)) - likelihood.chi2(light)), fewer))
+        fall, fewer = min(options, key=itemgetter(0))
         if fall >= FURTHER_GAIN:
             break
         flares = fewer
-    return sorted(flares, key=lambda one: -one.equivalent_duration_s)
+    return sorted(flares, key=lambda flare: -flare.equivalent_duration_s)
 
 
 def light_of(window: Window, shape: Profile, flares: Sequence[FittedFlare]) -> Float:
@@ -325,11 +326,11 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
     def jacobian(x: Float) -> Float:
         return np.asarray(-root @ _slopes(window, shape, x).T)
 
-    found = scipy.optimize.least_squares(
+    result = scipy.optimize.least_squares(
         residual, np.clip(start, low, high), jac=jacobian, bounds=(low, high), x_scale=scale,
         ftol=1e-6, xtol=1e-6, max_nfev=60,
     )  # fmt: skip
-    return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in found.x.reshape(-1, 3)]
+    return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in result.x.reshape(-1, 3)]
 
 
 def _single(
@@ -348,26 +349,27 @@ def _single(
         last = grid = PosteriorGrid.of(likelihood, family, box, outer, last)
         for _ in range(ROUNDS - 1 if epsilon else 0):
             # The departures are those of a flare, and the likelihood may fall as they follow the fit.
-            found, member = grid.best, shape.name == family.name
-            own = Likelihood.of(window, [found[1]], found[0], epsilon)
+            (best_shape, best), member = grid.best, shape.name == family.name
+            updated = Likelihood.of(window, [best], best_shape, epsilon)
             before = likelihood.log_of(light_of(window, shape, [flare]))
-            if member and own.log_of(light_of(window, found[0], [found[1]])) <= before:
+            if member and updated.log_of(light_of(window, best_shape, [best])) <= before:
                 break
-            change = abs(np.log(found[1].equivalent_duration_s / flare.equivalent_duration_s))
-            (shape, flare), likelihood = found, own
-            last = grid = PosteriorGrid.of(own, family, grid.box, outer, grid)
+            change = abs(np.log(best.equivalent_duration_s / flare.equivalent_duration_s))
+            shape, flare, likelihood = best_shape, best, updated
+            last = grid = PosteriorGrid.of(likelihood, family, grid.box, outer, grid)
             if member and change < SETTLED:
                 break
         box = grid.box
         shape, flare = grid.best
-        per_amplitude = grid.half_widths_s * durations[grid.shape] - grid.along(likelihood.toward)
+        per_amplitude = grid.half_widths_s * durations[grid.shape] - grid.along(likelihood.departure)
         in_level = grid.along(likelihood.level)
         level = float(window.values @ likelihood.level) - grid.amplitude * in_level
         level = np.where(level > 0, level, window.quiet_level)
-        mean = (grid.amplitude * per_amplitude + float(likelihood.toward @ window.values)) / level
+        mean = (grid.amplitude * per_amplitude + float(likelihood.departure @ window.values)) / level
         # Durations are relative to the level, which is lower where the flare is brighter.
         along = per_amplitude + mean * in_level
-        sd = np.sqrt(along**2 / grid.information + likelihood.left + mean**2 * likelihood.level_variance) / level
+        unknown = likelihood.departure_variance + mean**2 * likelihood.level_variance
+        sd = np.sqrt(along**2 / grid.information + unknown) / level
         constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
         prior = float(np.log(family.prior / len(family.epsilon)))
         fits.append(Fit(NormalMixture(grid.log + constant + prior, mean, sd), shape, [flare]))
@@ -380,8 +382,8 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
     # Each further flare may have any peak in the event, half-width and amplitude, in any order.
     outer = _ranges(window)
     span = window.edges[window.inside]
-    each = np.log(span[-1, 1] - span[0, 0]) + np.log(np.ptp(outer[1])) + np.log(MAX_LOG_AMPLITUDE)
-    prior = float(np.log(family.prior / len(family.epsilon)) - (n - 1) * (each + 1.0) + scipy.special.gammaln(n + 1))
+    volume = np.log(span[-1, 1] - span[0, 0]) + np.log(np.ptp(outer[1])) + np.log(MAX_LOG_AMPLITUDE)
+    prior = float(np.log(family.prior / len(family.epsilon)) - (n - 1) * (volume + 1.0) + scipy.special.gammaln(n + 1))
     fits = []
     for epsilon in family.epsilon:
         for _ in range(ROUNDS if epsilon else 1):
@@ -399,12 +401,13 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
         covariance = np.linalg.inv(slopes @ likelihood.inverse @ slopes.T + np.diag(wide**-2.0))
         total = np.array([f.equivalent_duration_s for f in flares])
         level = float(likelihood.level_without(light))
-        mean = float(total.sum() + likelihood.toward @ (window.values - light)) / level
+        mean = float(total.sum() + likelihood.departure @ (window.values - light)) / level
         # Durations are relative to the level, which is lower where the flares are brighter.
-        along = slopes @ (mean * likelihood.level - likelihood.toward)
+        along = slopes @ (mean * likelihood.level - likelihood.departure)
         along[0::3] += total
         along[2::3] += total
-        variance = float(along @ covariance @ along) + likelihood.left + mean**2 * likelihood.level_variance
+        variance = float(along @ covariance @ along) + likelihood.departure_variance
+        variance += mean**2 * likelihood.level_variance
         # As the grid of a single flare, without the factor of one amplitude.
         log = likelihood.log_of(light) + prior
         log += 0.5 * float(np.linalg.slogdet(covariance)[1]) + (3 * n - 1) / 2 * np.log(2 * np.pi)
