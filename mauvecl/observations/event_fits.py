@@ -93,9 +93,20 @@ def joined(mixtures: Sequence[NormalMixture]) -> NormalMixture:
 class Fit:
     """Fit of an event by flares of a family with some departure from their shape."""
 
+    window: Window
     mixture: NormalMixture
     shape: Profile  # the best of the family
     flares: list[FittedFlare]  # the best, of that shape
+
+    @cached_property
+    def light(self) -> Float:
+        """Light of the flares in the bins, shape (n,)."""
+        return light_of(self.window, self.shape, self.flares)
+
+    @cached_property
+    def plain(self) -> Likelihood:
+        """Likelihood of flares without departures from their shape."""
+        return Likelihood.of(self.window, self.flares, self.shape, 0.0)
 
 
 def fit_event(window: Window, searched: Shape) -> list[Fit]:
@@ -372,7 +383,7 @@ def _single(
         sd = np.sqrt(along**2 / grid.information + unknown) / level
         constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
         prior = float(np.log(family.prior / len(family.epsilon)))
-        fits.append(Fit(NormalMixture(grid.log + constant + prior, mean, sd), shape, [flare]))
+        fits.append(Fit(window, NormalMixture(grid.log + constant + prior, mean, sd), shape, [flare]))
     return fits
 
 
@@ -411,5 +422,5 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
         # As the grid of a single flare, without the factor of one amplitude.
         log = likelihood.log_of(light) + prior
         log += 0.5 * float(np.linalg.slogdet(covariance)[1]) + (3 * n - 1) / 2 * np.log(2 * np.pi)
-        fits.append(Fit(NormalMixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares))
+        fits.append(Fit(window, NormalMixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares))
     return fits

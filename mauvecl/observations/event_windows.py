@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
+from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape, consecutive_integrals
@@ -114,19 +115,16 @@ class Family:
         rises = [Half(SHAPES["davenport2014"].before), *(Half(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES)]
         gaussian = Half(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
-        # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points,
-        # whose barycentric weights are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715, equation 5.4);
-        # scipy would compute them with the points in a random order, which changes the last bits.
-        middle, half = np.log(SLOW_RATES[[0, -1]].prod()) / 2, np.log(SLOW_RATES[-1] / SLOW_RATES[0]) / 2
-        points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
-        barycentric = (-1.0) ** np.arange(EXPONENTIALS)
-        barycentric[[0, -1]] /= 2
-        interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
-        slow, interpolated = [_exponential(float(rate)) for rate in np.exp(points)], interpolate(np.log(SLOW_RATES))
+        # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
+        low, high = np.log(SLOW_RATES[[0, -1]])
+        points, degree = chebyshev.chebpts2(EXPONENTIALS), EXPONENTIALS - 1
+        slow = [_exponential(rate) for rate in np.exp(low + (high - low) * (points + 1) / 2).tolist()]
+        places = 2 * (np.log(SLOW_RATES) - low) / (high - low) - 1
+        interpolated = chebyshev.chebvander(places, degree) @ np.linalg.inv(chebyshev.chebvander(points, degree))
         # Each share has the same weight: without a slow decay, its rate does not matter.
         share = np.append(0.0, np.repeat(SLOW_SHARES, SLOW_RATES.size))
         rates = np.where(share == 0, 1.0, 1 / SLOW_RATES.size)
-        decays = share[:, None] * np.vstack([interpolated[:1], *[interpolated] * len(SLOW_SHARES)])
+        decays = np.vstack([np.zeros((1, EXPONENTIALS)), *(share * interpolated for share in SLOW_SHARES)])
         rise, start, decay = np.indices((len(rises), len(fast), share.size)).reshape(3, -1)
         starts = np.eye(len(fast))[start] * (1.0 - share[decay, None])
         weights = np.hstack([np.eye(len(rises))[rise], starts, decays[decay]])

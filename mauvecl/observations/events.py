@@ -16,8 +16,8 @@ import scipy
 
 from mauvecl.flares.shapes import consecutive_integrals
 from mauvecl.host.arrays import Bool, Float, map_in_threads
-from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, joined, light_of
-from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Likelihood, Window, log_time
+from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, joined
+from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Window, log_time
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.fields import DAY_S
@@ -226,20 +226,14 @@ GAP_FRAMES = 3
 UNSEEN = 0.05
 
 
-def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
-    """Return the likelihood of flares without departures from their shape, and their light in the bins, shape (n,)."""
-    return Likelihood.of(window, fit.flares, fit.shape, 0.0), light_of(window, fit.shape, fit.flares)
-
-
-def _kind(window: Window, fits: Sequence[Fit], summed: float, error: float) -> Kind:
+def _kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
     """Return whether an event is a flare by its fits of published shapes, since the general family resembles all kinds.
 
     The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse. The sum
     over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
     """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
-    plain, model = _without_departures(window, best)
-    level = float(plain.level_without(model))
+    level, window = float(best.plain.level_without(best.light)), best.window
     survey, event = window.survey, window.event
     start = survey.stare.start_s[event.first : event.last + 1]
     edges, within = np.column_stack([start, start + survey.stare.frame_s]), 0.0
@@ -251,7 +245,7 @@ def _kind(window: Window, fits: Sequence[Fit], summed: float, error: float) -> K
     lacking, uncertain = (within - summed) / level, float(np.hypot(error / level, (high - low) / 2))
     if not survey.weighted and lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level:
         return "dip"
-    return "step" if _is_step(window, fits) else "flare"
+    return "step" if _is_step(fits) else "flare"
 
 
 def _summed(survey: SeriesSurvey, in_events: Bool, level: Float, event: DetectedEvent) -> tuple[float, float]:
@@ -293,8 +287,9 @@ def _summed(survey: SeriesSurvey, in_events: Bool, level: Float, event: Detected
     return total, float(np.sqrt(max(variance, 0.0))) * factor
 
 
-def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
+def _is_step(fits: Sequence[Fit]) -> bool:
     """Return whether a step of the level fits an event better than the flares of every fit do."""
+    window = fits[0].window
     inside = window.middle[window.inside]
     if inside.size < 3:
         return False
@@ -303,10 +298,9 @@ def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
         return False
     scores = []
     for fit in fits:
-        plain, model = _without_departures(window, fit)
         # Each further flare has three parameters more (Schwarz 1978).
         penalty = 3 * (len(fit.flares) - 1) * float(np.log(window.values.size))
-        scores.append((float(plain.chi2(model)) + penalty, plain))
+        scores.append((float(fit.plain.chi2(fit.light)) + penalty, fit.plain))
     least, plain = min(scores, key=itemgetter(0))
     steps = (window.middle >= starts[:, None]).astype(np.float64)
     slope = steps @ (plain.inverse @ window.values)
@@ -393,17 +387,16 @@ def measure_event(
     window = replace(Window.of(survey, in_events, detected), quiet_level=at_peak if at_peak > 0 else 1.0)
     fits = fit_event(window, survey.bank.shape)
     best = max(fits, key=lambda fit: fit.mixture.log_total)
-    plain, model = _without_departures(window, best)
-    chi2, dof = float(plain.chi2(model)), window.values.size - 1 - 3 * len(best.flares)
-    of_star = float(plain.level_without(model))
-    mixture = _posterior(window, in_events, fits, scipy.stats.chi2.sf(chi2, dof) < POOR)
+    chi2, dof = float(best.plain.chi2(best.light)), window.values.size - 1 - 3 * len(best.flares)
+    of_star = float(best.plain.level_without(best.light))
+    mixture = _posterior(in_events, fits, scipy.stats.chi2.sf(chi2, dof) < POOR)
     fitted_s = mixture.quantile(0.5)
     low, high = ([mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1))
     flares = [replace(f, amplitude=f.amplitude / of_star, equivalent_duration_s=f.equivalent_duration_s / of_star)
               for f in best.flares]  # fmt: skip
     summed, error = _summed(survey, in_events, level, detected)
     published = [fit for fit in fits if fit.shape.name != GENERAL]
-    kind = _kind(window, published, summed, error) if cause == "flare" else cause
+    kind = _kind(published, summed, error) if cause == "flare" else cause
     flux = (survey.flux[rows] - level[rows]) * survey.scale
     # In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not near its peak.
     near = np.abs(middle[rows] - detected.peak_s) <= detected.half_width_s + frame_s
@@ -427,9 +420,9 @@ def measure_event(
     )  # fmt: skip
 
 
-def _posterior(window: Window, in_events: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixture:
+def _posterior(in_events: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixture:
     """Return the posterior of an event's equivalent duration."""
-    mixtures = [fit.mixture for fit in fits]
+    window, mixtures = fits[0].window, [fit.mixture for fit in fits]
     totals = np.array([mixture.log_total for mixture in mixtures])
     if poor:
         # What a wrong shape leaves varies slowly: bins count as many times as there are independent departures in the
