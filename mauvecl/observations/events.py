@@ -282,8 +282,8 @@ def _summed(survey: SeriesSurvey, in_events: Bool, level: Float, event: Detected
         shared = process.times(time, weights)
         # The variance of the constant level is 1 / (1^T C^-1 1).
         constant = float(weights.sum() - of_constant @ shared[quiet])
-        variance += float(weights @ shared - shared[quiet] @ covariance.solve(shared[quiet]))
-        variance += constant**2 / float(of_constant.sum())
+        of_level = float(weights @ shared - shared[quiet] @ covariance.solve(shared[quiet]))
+        variance += of_level + constant**2 / float(of_constant.sum())
     return total, float(np.sqrt(max(variance, 0.0))) * factor
 
 
