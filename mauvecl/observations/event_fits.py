@@ -38,8 +38,6 @@ NODES, NODES_OF_MANY, NEGLIGIBLE = 25, 17, 14.0
 MAX_LOG_AMPLITUDE = 5.0
 #: Largest number of refinements of the grid.
 REFINEMENTS = 6
-#: First range of the peak, in half-widths of the template, and factor on the half-width.
-PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
 #: Departure with which further flares of an event are searched, the fall of chi-squared they need, largest number.
 FURTHER_EPSILON, FURTHER_GAIN, MAX_FLARES = 0.2, 36.0, 6
 #: Rounds in which noise and departures follow the fit, and the change of the log duration at which they end.
@@ -117,7 +115,7 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
     fits = []
     for family, grid in zip(published, first, strict=True):
         shape, flare = grid.best
-        fits += _single(window, family, shape, flare, grid.box, grid)
+        fits += _single(window, family, shape, flare, grid.box, grid.parts)
         several = _further(window, shape, [flare])
         if len(several) > 1:
             fits += _several(window, family, several)
@@ -125,7 +123,7 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
     boxes = np.array([grid.box for grid in first])
     low, high = boxes[..., 0].min(axis=0), boxes[..., 1].max(axis=0)
     # The range contains all of these, and half as much on each side.
-    wide = np.column_stack([low - (high - low) / 2, high + (high - low) / 2])
+    wide = np.clip([low - (high - low) / 2, high + (high - low) / 2], *window.ranges.T).T
     return fits + _single(window, Family.general(), *best.best, wide)
 
 
@@ -170,14 +168,11 @@ class PosteriorGrid:
         return np.asarray((self.family.weights @ (self.parts @ weights))[self.shape, self.node])
 
     @classmethod
-    def of(
-        cls, likelihood: Likelihood, family: Family, box: Float, outer: Float, before: PosteriorGrid | None = None
-    ) -> PosteriorGrid:
+    def of(cls, likelihood: Likelihood, family: Family, box: Float, parts: Float | None = None) -> PosteriorGrid:
         """Compute the posterior on a grid that is refined or widened until it covers all that is not negligible.
 
-        `box` and `outer` are the first and the largest range of the peak and of the logarithm of the half-width.
-        `before` is a grid of the same window and family: its means are reused where the range is the same, as they take
-        most of the time.
+        `box` is the first range of the peak and of the logarithm of the half-width, and `parts` are the means of the
+        family at its nodes, if they are known, as they take most of the time.
         """
         window = likelihood.window
         n_node = NODES if len(family.weights) == 1 else NODES_OF_MANY
@@ -188,9 +183,7 @@ class PosteriorGrid:
         for _ in range(REFINEMENTS):
             axes = [np.linspace(low, high, n_node) for low, high in box]
             p, w = (nodes.ravel() for nodes in np.meshgrid(*axes, indexing="ij"))
-            if before is not None and np.array_equal(before.box, box):
-                parts = before.parts
-            else:
+            if parts is None:
                 parts = window.models(family.parts, p, np.exp(w))
             slope, information = likelihood.matched(parts, family.weights, window.values)
             amplitude = slope / information
@@ -210,39 +203,19 @@ class PosteriorGrid:
             wide = np.diff(box)[:, 0]
             low = np.where(ends[:, 0] <= box[:, 0] + step / 2, box[:, 0] - wide / 2, low)
             high = np.where(ends[:, 1] >= box[:, 1] - step / 2, box[:, 1] + wide / 2, high)
-            new = np.column_stack([np.maximum(low, outer[:, 0]), np.minimum(high, outer[:, 1])])
+            new = np.clip([low, high], *window.ranges.T).T
             size = np.diff(new)[:, 0] / wide
             if ((size > 0.6) & (size < 1.1)).all():
                 break
-            box = new
+            box, parts = new, None
         return grid
-
-
-def _ranges(window: Window) -> Float:
-    """Return the largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2).
-
-    A gap before the event may hold the peak, at most as long before as the event lasts.
-    """
-    event, survey = window.event, window.survey
-    frame_s = survey.stare.frame_s
-    first_s, last_s = survey.stare.start_s[event.first], survey.stare.start_s[event.last] + frame_s
-    low, high = event.peak_s - PEAK_RANGE * event.half_width_s, event.peak_s + PEAK_RANGE * event.half_width_s
-    before_s = float(survey.stare.start_s[event.first - 1]) + frame_s if event.first else -np.inf
-    low = min(low, max(first_s - max(4 * event.half_width_s, last_s - first_s), before_s))
-    high = min(max(high, low + frame_s), last_s)
-    widest = max(survey.bank.half_widths_s[-1], event.half_width_s) * 3
-    if low < first_s - frame_s:
-        widest = max(widest, last_s - first_s)
-    width = (max(event.half_width_s / WIDTH_RANGE, 0.2 * frame_s), min(event.half_width_s * WIDTH_RANGE, widest))
-    return np.array([[low, high], np.log(width)])
 
 
 def _first_fit(window: Window, family: Family) -> PosteriorGrid:
     """Return the posterior of a single flare without departures from a shape."""
-    outer = _ranges(window)
-    grid = PosteriorGrid.of(Likelihood.of(window, [], family.shape(0), 0.0), family, outer, outer)
+    grid = PosteriorGrid.of(Likelihood.of(window, [], family.shape(0), 0.0), family, window.ranges)
     shape, flare = grid.best
-    return PosteriorGrid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, outer, grid)
+    return PosteriorGrid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, grid.parts)
 
 
 def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
@@ -329,7 +302,7 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
     reach = max(f.half_width_s for f in flares)
     low[1::3], high[1::3] = span[0, 0] - 4 * reach, span[-1, 1]
     # A flare that is much longer than its event is no more than a level.
-    low[2::3], high[2::3] = start[2::3] - 3.0, np.minimum(start[2::3] + 3.0, max(_ranges(window)[1, 1], np.log(reach)))
+    low[2::3], high[2::3] = start[2::3] - 3.0, np.minimum(start[2::3] + 3.0, max(window.ranges[1, 1], np.log(reach)))
 
     def residual(x: Float) -> Float:
         return np.asarray(root @ (window.values - _lights(window, shape, x).sum(axis=0)))
@@ -345,19 +318,17 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
 
 
 def _single(
-    window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, last: PosteriorGrid | None = None
+    window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, parts: Float | None = None
 ) -> list[Fit]:
     """Fit a single flare with each departure of a family, which follows from a first fit, `shape` and `flare`.
 
-    The grid begins from the range `box`; `last` is the grid of the first fit, if that was a fit of the same family.
+    The grid begins from the range `box`; `parts` are the means of the family at its nodes, if they are known.
     """
-    outer = _ranges(window)
     durations = family.weights @ [part.equivalent_duration for part in family.parts]
-    box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])
     fits = []
     for epsilon in family.epsilon:
         likelihood = Likelihood.of(window, [flare], shape, epsilon)
-        last = grid = PosteriorGrid.of(likelihood, family, box, outer, last)
+        grid = PosteriorGrid.of(likelihood, family, box, parts)
         for _ in range(ROUNDS - 1 if epsilon else 0):
             # The departures are those of a flare, and the likelihood may fall as they follow the fit.
             (best_shape, best), member = grid.best, shape.name == family.name
@@ -367,10 +338,10 @@ def _single(
                 break
             change = abs(np.log(best.equivalent_duration_s / flare.equivalent_duration_s))
             shape, flare, likelihood = best_shape, best, updated
-            last = grid = PosteriorGrid.of(likelihood, family, grid.box, outer, grid)
+            grid = PosteriorGrid.of(likelihood, family, grid.box, grid.parts)
             if member and change < SETTLED:
                 break
-        box = grid.box
+        box, parts = grid.box, grid.parts
         shape, flare = grid.best
         per_amplitude = grid.half_widths_s * durations[grid.shape] - grid.along(likelihood.departure)
         in_level = grid.along(likelihood.level)
@@ -391,9 +362,8 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
     """Fit several flares of a published shape with each departure from it, by the linearised model."""
     shape, n = family.shape(0), len(flares)
     # Each further flare may have any peak in the event, half-width and amplitude, in any order.
-    outer = _ranges(window)
     span = window.edges[window.inside]
-    volume = np.log(span[-1, 1] - span[0, 0]) + np.log(np.ptp(outer[1])) + np.log(MAX_LOG_AMPLITUDE)
+    volume = np.log(span[-1, 1] - span[0, 0]) + np.log(np.ptp(window.ranges[1])) + np.log(MAX_LOG_AMPLITUDE)
     prior = float(np.log(family.prior / len(family.epsilon)) - (n - 1) * (volume + 1.0) + scipy.special.gammaln(n + 1))
     fits = []
     for epsilon in family.epsilon:

@@ -147,6 +147,8 @@ FLOOR = 0.1
 MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
 #: Bins outside are shorter than this share of the shortest time scale of the process.
 SHORT = 0.2
+#: First range of the peak, in half-widths of the template, and factor on the half-width.
+PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
 #: Number of frames on each side of an event that are fitted with it, and the same in lengths of the event: the level of
 #: further ones would lower the variance of its sum by 1 % at most in independent noise, and less in that of a process.
 WINDOW_FRAMES, WINDOW_LENGTHS = 2**15, 100
@@ -249,6 +251,25 @@ class Window:
             np.maximum(integral[:, place[1]] - integral[:, place[0]], 0.0, out=mean)
             mean *= per_amplitude
         return light
+
+    @cached_property
+    def ranges(self) -> Float:
+        """Largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2).
+
+        A gap before the event may hold the peak, at most as long before as the event lasts.
+        """
+        event, survey = self.event, self.survey
+        frame_s = survey.stare.frame_s
+        first_s, last_s = survey.stare.start_s[event.first], survey.stare.start_s[event.last] + frame_s
+        low, high = event.peak_s - PEAK_RANGE * event.half_width_s, event.peak_s + PEAK_RANGE * event.half_width_s
+        before_s = float(survey.stare.start_s[event.first - 1]) + frame_s if event.first else -np.inf
+        low = min(low, max(first_s - max(4 * event.half_width_s, last_s - first_s), before_s))
+        high = min(max(high, low + frame_s), last_s)
+        widest = max(survey.bank.half_widths_s[-1], event.half_width_s) * 3
+        if low < first_s - frame_s:
+            widest = max(widest, last_s - first_s)
+        width = (max(event.half_width_s / WIDTH_RANGE, 0.2 * frame_s), min(event.half_width_s * WIDTH_RANGE, widest))
+        return np.array([[low, high], np.log(width)])
 
     @cached_property
     def _times(self) -> tuple[Float, NDArray[np.intp]]:
