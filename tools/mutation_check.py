@@ -339,7 +339,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "intervals of events that are not truncated at zero": (
         "test_quantiles_are_those_of_a_truncated_normal_distribution[0.0]",
-        ("goal = _above(0.0, weight, mean, sd, 0.0) * ", "goal = "),
+        ("goal = _probability_above(0.0, weight, mean, sd, 0.0) * ", "goal = "),
     ),
     "a flare added to the level of its star": (
         "test_table_of_events_has_the_flare_in_its_units",
@@ -390,8 +390,8 @@ MUTATIONS: dict[str, Mutation] = {
     "statistics of a known level": (
         "test_statistics_have_unit_variance_over_gaps_and_changing_noise[process0-300-0.05-0.02-0-at-once]",
         (
-            "_correlated(on_grid, shape, first)[peaks] ** 2 / level.sum()",
-            "0.0 * _correlated(on_grid, shape, first)[peaks]",
+            "_correlate(on_grid, shape, first)[peaks] ** 2 / level.sum()",
+            "0.0 * _correlate(on_grid, shape, first)[peaks]",
         ),
     ),
     "a level without its process": (

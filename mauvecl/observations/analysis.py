@@ -95,7 +95,7 @@ def inject(
             segment = survey.frames(chosen)
         starts = segment.stare.start_s
         edges = np.column_stack([starts, starts + frame_s])
-        amplitudes = threshold / (size_of * _power(segment, width)) * np.geomspace(*RANGE, SIZES)
+        amplitudes = threshold / (size_of * _typical_snr(segment, width)) * np.geomspace(*RANGE, SIZES)
         durations[w] = amplitudes * width * bank.shape.equivalent_duration
         for first in range(0, TIMES, BATCH):
             count = min(BATCH, TIMES - first)
@@ -132,7 +132,7 @@ def _largest_near(
     return best
 
 
-def _power(survey: SeriesSurvey, width: float) -> float:
+def _typical_snr(survey: SeriesSurvey, width: float) -> float:
     """Return the typical S/N of a flare of a half-width whose peak is one standard deviation of a frame."""
     row = min(survey.search.rows, key=lambda row: abs(np.log(row.template.half_width_s / width)))
     searched = row.per_amplitude[row.per_amplitude > 0]
@@ -266,7 +266,7 @@ class Analysis:
             yield f"The scatter of quiescent frames is {excess}; the measured scatter is used."
 
     def _level_messages(self) -> Iterator[str]:
-        """Yield messages on changes of the light that are no flares."""
+        """Yield messages on changes of the light that are not flares."""
         if self.light_misleads:
             yield (
                 "The throughput changes, as by pointing losses; short changes may resemble flares: "
@@ -356,7 +356,7 @@ def analyse_frames(
     causes: list[Kind] = ["flare" if spectrum is None else spectrum.cause for spectrum in spectra]
     events = measure_events(survey, in_events, detected, causes, event_steps)
     measurements = [
-        _measured(survey, series, in_events, measured.kind, event)
+        _flare_of_event(survey, series, in_events, measured.kind, event)
         for measured, event in zip(events, detected, strict=True)
     ]
     quiet = ~in_events
@@ -372,7 +372,7 @@ def analyse_frames(
     )  # fmt: skip
 
 
-def _measured(
+def _flare_of_event(
     survey: SeriesSurvey, series: SpectralSeries | None, in_events: Bool, kind: Kind, event: DetectedEvent
 ) -> Measurement | str:
     """Return the flare that is fitted to the spectrum of an event, or the reason why none is."""

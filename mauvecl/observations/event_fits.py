@@ -34,11 +34,12 @@ LEAST_LOG_WEIGHT = -18.5
 LEAST_ERROR = 1e-9
 #: Nodes along peak and half-width for a shape and for many; fall of the log posterior beyond which they are neglected.
 NODES, NODES_OF_MANY, NEGLIGIBLE = 25, 17, 14.0
-#: Logarithm of the largest amplitude in units of the range of the frames of the event, for a peak that is not seen.
+#: Logarithm of the largest amplitude in units of the range of the frames of the event, for a peak between frames.
 MAX_LOG_AMPLITUDE = 5.0
 #: Largest number of refinements of the grid.
 REFINEMENTS = 6
-#: Departure with which further flares of an event are searched, the fall of chi-squared they need, largest number.
+#: Departure from the shape with which further flares of an event are searched, the fall of chi-squared that each needs,
+#: and the largest number of flares.
 FURTHER_EPSILON, FURTHER_GAIN, MAX_FLARES = 0.2, 36.0, 6
 #: Rounds in which noise and departures follow the fit, and the change of the log duration at which they end.
 ROUNDS, SETTLED = 3, 0.02
@@ -60,13 +61,15 @@ class NormalMixture:
     def quantile(self, probability: float) -> float:
         """Return a quantile of the part above zero."""
         weight, mean, sd = self._significant
-        goal = _above(0.0, weight, mean, sd, 0.0) * (1.0 - probability)
+        goal = _probability_above(0.0, weight, mean, sd, 0.0) * (1.0 - probability)
         high = max(float((mean + 10 * sd).max()), float(sd.max()))
         if np.isinf(high):
             # Frames without weight do not limit it.
             return high
         # `brentq` keeps its function until the next collection of garbage, but not the arrays.
-        return float(scipy.optimize.brentq(_above, 0.0, high, args=(weight, mean, sd, goal), xtol=1e-9 * high))
+        return float(
+            scipy.optimize.brentq(_probability_above, 0.0, high, args=(weight, mean, sd, goal), xtol=1e-9 * high)
+        )
 
     @cached_property
     def _significant(self) -> tuple[Float, Float, Float]:
@@ -77,12 +80,12 @@ class NormalMixture:
         return np.exp(log[rows]), mean, np.maximum(self.sd[rows], max(LEAST_ERROR * float(np.abs(mean).max()), 1e-300))
 
 
-def _above(x: float, weight: Float, mean: Float, sd: Float, goal: float) -> float:
+def _probability_above(x: float, weight: Float, mean: Float, sd: Float, goal: float) -> float:
     """Return the probability of a mixture above x, less a goal."""
     return float(weight @ scipy.special.ndtr((mean - x) / sd)) - goal
 
 
-def joined(mixtures: Sequence[NormalMixture]) -> NormalMixture:
+def join(mixtures: Sequence[NormalMixture]) -> NormalMixture:
     """Return the mixture of several."""
     return NormalMixture(*np.hstack([(mixture.log_weight, mixture.mean, mixture.sd) for mixture in mixtures]))
 
@@ -115,23 +118,23 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
     fits = []
     for family, grid in zip(published, first, strict=True):
         shape, flare = grid.best
-        fits += _single(window, family, shape, flare, grid.box, grid.parts)
-        several = _further(window, shape, [flare])
+        fits += _fit_single(window, family, shape, flare, grid.box, grid.parts)
+        several = _add_flares(window, shape, [flare])
         if len(several) > 1:
-            fits += _several(window, family, several)
+            fits += _fit_several(window, family, several)
     best = max(first, key=lambda grid: float(scipy.special.logsumexp(grid.log)))
     boxes = np.array([grid.box for grid in first])
     low, high = boxes[..., 0].min(axis=0), boxes[..., 1].max(axis=0)
     # The range contains all of these, and half as much on each side.
     wide = np.clip([low - (high - low) / 2, high + (high - low) / 2], *window.ranges.T).T
-    return fits + _single(window, Family.general(), *best.best, wide)
+    return fits + _fit_single(window, Family.general(), *best.best, wide)
 
 
 def flares_of(survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> tuple[list[FittedFlare], float, float]:
     """Return the flares of the bank's shape that fit an event best, and scale and photon noise of its `Window`."""
     window = Window.of(survey, in_events, event)
     shape = survey.bank.shape
-    return _further(window, shape, [_first_fit(window, Family.of(shape, 1.0)).best[1]]), window.scale, window.photon
+    return _add_flares(window, shape, [_first_fit(window, Family.of(shape, 1.0)).best[1]]), window.scale, window.photon
 
 
 def _flare(shape: Profile, peak: float, width: float, amplitude: float) -> FittedFlare:
@@ -218,7 +221,7 @@ def _first_fit(window: Window, family: Family) -> PosteriorGrid:
     return PosteriorGrid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, grid.parts)
 
 
-def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
+def _add_flares(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
     """Add flares to an event as long as they improve the fit, even if each departs from its shape."""
     frame_s = window.survey.stare.frame_s
     inside = window.middle[window.inside]
@@ -237,21 +240,21 @@ def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[
         if gain[k] < FURTHER_GAIN:
             break
         more = [*flares, _flare(shape, p[k], w[k], slope[0, k] / information[0, k])]
-        refined = _refined(likelihood, shape, more)
+        refined = _refine(likelihood, shape, more)
         fall = float(likelihood.chi2(light) - likelihood.chi2(light_of(window, shape, refined)))
         if fall < FURTHER_GAIN:
             break
         flares = sorted(refined, key=lambda flare: -flare.equivalent_duration_s)
-    return _necessary(window, shape, flares) if len(flares) > 2 else flares
+    return _drop_flares(window, shape, flares) if len(flares) > 2 else flares
 
 
-def _necessary(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
-    """Leave out flares that would not be added to the others: they stood for flares that were not found yet."""
+def _drop_flares(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
+    """Leave out flares that would not be added to the others: they stood for flares that were added later."""
     while len(flares) > 1:
         light, options = light_of(window, shape, flares), []
         for k in range(len(flares)):
             fewer = flares[:k] + flares[k + 1 :]
-            fewer = _refined(Likelihood.of(window, fewer, shape, FURTHER_EPSILON), shape, fewer)
+            fewer = _refine(Likelihood.of(window, fewer, shape, FURTHER_EPSILON), shape, fewer)
             likelihood = Likelihood.of(window, fewer, shape, FURTHER_EPSILON)
             options.append((float(likelihood.chi2(light_of(window, shape, fewer)) - likelihood.chi2(light)), fewer))
         fall, fewer = min(options, key=itemgetter(0))
@@ -263,23 +266,24 @@ def _necessary(window: Window, shape: Profile, flares: list[FittedFlare]) -> lis
 
 def light_of(window: Window, shape: Profile, flares: Sequence[FittedFlare]) -> Float:
     """Return the mean light of flares in the bins, in the unit of the values."""
-    return np.asarray(_lights(window, shape, _parameters(flares)).sum(axis=0))
+    return np.asarray(_light_of_each(window, shape, _parameters(flares)).sum(axis=0))
 
 
-def _lights(window: Window, shape: Profile, parameters: Float) -> Float:
+def _light_of_each(window: Window, shape: Profile, parameters: Float) -> Float:
     """Return the light of each flare, shape (n_flare, n), for the parameters of `_parameters`."""
     amplitude, peak, width = parameters.reshape(-1, 3).T
     return np.asarray(np.exp(amplitude)[:, None] * window.model(shape, peak, np.exp(width)))
 
 
-def _slopes(window: Window, shape: Profile, parameters: Float) -> Float:
+def _derivatives(window: Window, shape: Profile, parameters: Float) -> Float:
     """Return the derivatives of the light with the parameters of `_parameters`, shape (n_parameter, n)."""
     rows = parameters.reshape(-1, 3)
     steps = 1e-4 * np.column_stack([np.ones(len(rows)), np.exp(rows[:, 2]), np.ones(len(rows))])
     signs = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
-    light = _lights(window, shape, rows[:, None] + signs * steps[:, None]).reshape(len(rows), 4, -1)
+    light = _light_of_each(window, shape, rows[:, None] + signs * steps[:, None]).reshape(len(rows), 4, -1)
     along = (light[:, 0::2] - light[:, 1::2]) / (2 * steps[:, 1:, None])
-    return np.concatenate([_lights(window, shape, parameters)[:, None], along], axis=1).reshape(parameters.size, -1)
+    unmoved = _light_of_each(window, shape, parameters)[:, None]
+    return np.concatenate([unmoved, along], axis=1).reshape(parameters.size, -1)
 
 
 def _parameters(flares: Sequence[FittedFlare]) -> Float:
@@ -287,7 +291,7 @@ def _parameters(flares: Sequence[FittedFlare]) -> Float:
     return np.array([[np.log(f.amplitude), f.peak_s, np.log(f.half_width_s)] for f in flares]).ravel()
 
 
-def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlare]) -> list[FittedFlare]:
+def _refine(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlare]) -> list[FittedFlare]:
     """Return the flares that fit best, by least squares from a starting point."""
     window = likelihood.window
     # The inverse has rank n - 1; its root is that of its eigenvalues.
@@ -305,10 +309,10 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
     low[2::3], high[2::3] = start[2::3] - 3.0, np.minimum(start[2::3] + 3.0, max(window.ranges[1, 1], np.log(reach)))
 
     def residual(x: Float) -> Float:
-        return np.asarray(root @ (window.values - _lights(window, shape, x).sum(axis=0)))
+        return np.asarray(root @ (window.values - _light_of_each(window, shape, x).sum(axis=0)))
 
     def jacobian(x: Float) -> Float:
-        return np.asarray(-root @ _slopes(window, shape, x).T)
+        return np.asarray(-root @ _derivatives(window, shape, x).T)
 
     result = scipy.optimize.least_squares(
         residual, np.clip(start, low, high), jac=jacobian, bounds=(low, high), x_scale=scale,
@@ -317,7 +321,7 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
     return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in result.x.reshape(-1, 3)]
 
 
-def _single(
+def _fit_single(
     window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, parts: Float | None = None
 ) -> list[Fit]:
     """Fit a single flare with each departure of a family, which follows from a first fit, `shape` and `flare`.
@@ -358,7 +362,7 @@ def _single(
     return fits
 
 
-def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[Fit]:
+def _fit_several(window: Window, family: Family, flares: list[FittedFlare]) -> list[Fit]:
     """Fit several flares of a published shape with each departure from it, by the linearised model."""
     shape, n = family.shape(0), len(flares)
     # Each further flare may have any peak in the event, half-width and amplitude, in any order.
@@ -370,12 +374,12 @@ def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[
         for _ in range(ROUNDS if epsilon else 1):
             likelihood = Likelihood.of(window, flares, shape, epsilon)
             before = sum(f.equivalent_duration_s for f in flares)
-            flares = _refined(likelihood, shape, flares)
+            flares = _refine(likelihood, shape, flares)
             if abs(np.log(sum(f.equivalent_duration_s for f in flares) / before)) < SETTLED:
                 break
         likelihood = Likelihood.of(window, flares, shape, epsilon)
         parameters = _parameters(flares)
-        light, slopes = light_of(window, shape, flares), _slopes(window, shape, parameters)
+        light, slopes = light_of(window, shape, flares), _derivatives(window, shape, parameters)
         # Priors as wide as the parameters can be: a factor of e^2 in amplitude and half-width, two half-widths in peak.
         wide = np.tile([2.0, 1.0, 2.0], n)
         wide[1::3] = [2 * f.half_width_s for f in flares]

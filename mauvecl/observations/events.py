@@ -1,6 +1,6 @@
 """Events of observed light curves: flares, or other changes, their detection and their times, causes and energies.
 
-The largest statistics above a threshold become events; their frames are taken away, and the rest is searched again.
+The largest statistics above a threshold become events; their frames are removed, and the others are searched again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import scipy
 
 from mauvecl.flares.shapes import consecutive_integrals
 from mauvecl.host.arrays import Bool, Float, map_in_threads
-from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, joined
+from mauvecl.observations.event_fits import Fit, NormalMixture, fit_event, join
 from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, Window, log_time
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
@@ -25,7 +25,7 @@ from mauvecl.search.templates import REACH
 
 #: Largest number of searches.
 MAX_PASSES = 40
-#: Number of events after which no further ones are searched, and the same for each frame of a long light curve.
+#: Number of events at which the search ends, and the same for each frame of a long light curve.
 MOST_EVENTS, MOST_PER_FRAME = 500, 1 / 500
 #: Smallest number of quiescent frames to which a process is fitted; with fewer, the longest events are shortened.
 MIN_QUIET = 20
@@ -38,11 +38,12 @@ FAINT, FEW, MOST_IN_EVENTS = (0.05, 0.2, 0.8), 2, 0.3
 LONG_S = 2 * DAY_S
 #: Longest tail and beginning of a template that belong to an event, in half-widths.
 LONGEST_TAIL, BEGINNING = 60.0, 1.2
-#: Statistic of an event, relative to that of an event next to it, below which it is that one's beginning or tail.
+#: Ratio of the statistics of two adjacent events below which the smaller is the beginning or tail of the larger.
 BELONGING = 0.1
-#: Half-widths, and shortest time scales of the process, in which smaller events wait for the next search.
+#: Distance from a larger event within which smaller ones wait for the next search, in half-widths and in shortest time
+#: scales of the process.
 NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
-#: Mean of the last frames of an event, in standard deviations of a frame, and their number, with which it goes on.
+#: Mean of frames at the end of an event above which it continues, in standard deviations of a frame, and their number.
 STILL_BRIGHT, END_FRAMES = 1.0, 4
 
 
@@ -67,7 +68,7 @@ def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Step
     noise = float(np.sqrt(np.median(survey.variance))) * min(process.excess for process in survey.processes)
     for _ in range(MAX_PASSES):
         quiet = ~in_events
-        if quiet.sum() < MIN_QUIET or len(_merged(events)) >= most_events(n):
+        if quiet.sum() < MIN_QUIET or len(_merge(events)) >= most_events(n):
             break
         largest = _search_once(survey if quiet.all() else survey.frames(quiet), light[quiet], threshold)
         steps.step()
@@ -78,17 +79,17 @@ def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Step
             light[rows] += flux[:, None] * survey.bank.directions[event.direction]
         extents = []
         for event in largest:
-            first, last = _extent(survey, in_events, faint * noise, event)
+            first, last = _find_extent(survey, in_events, faint * noise, event)
             # Some frames remain for the level; they are the faintest of the event.
             short = MIN_QUIET - int(np.count_nonzero(~in_events)) + last - first + 1
             last = max(last - max(short, 0), first)
             extents.append((first, last))
             in_events[first : last + 1] = True
-        extents = _extended(survey, in_events, extents, largest, crowded=faint > FAINT[0])
+        extents = _extend(survey, in_events, extents, largest, crowded=faint > FAINT[0])
         for (first, last), event in zip(extents, largest, strict=True):
             in_events[first : last + 1] = True
             events.append(replace(event, first=first, last=last))
-    return _merged(events), in_events
+    return _merge(events), in_events
 
 
 def most_events(n_frames: int) -> int:
@@ -96,7 +97,7 @@ def most_events(n_frames: int) -> int:
     return max(MOST_EVENTS, int(MOST_PER_FRAME * n_frames))
 
 
-def _merged(events: list[DetectedEvent]) -> list[DetectedEvent]:
+def _merge(events: list[DetectedEvent]) -> list[DetectedEvent]:
     """Return the events in order of time, without those that overlap a larger one or are its beginning or tail."""
     merged: list[DetectedEvent] = []
     for event in sorted(events, key=lambda event: event.first):
@@ -150,7 +151,7 @@ def _search_once(survey: SeriesSurvey, light: Float, threshold: float) -> list[D
     return accepted
 
 
-def _extent(survey: SeriesSurvey, in_events: Bool, faint: float, event: DetectedEvent) -> tuple[int, int]:
+def _find_extent(survey: SeriesSurvey, in_events: Bool, faint: float, event: DetectedEvent) -> tuple[int, int]:
     """Return the first and last frame in which the template of an event is brighter than a flux."""
     tau = np.linspace(0.0, LONGEST_TAIL, 1200)
     bright = tau[event.amplitude * survey.bank.shape.at(tau) > faint]
@@ -171,7 +172,7 @@ def _extent(survey: SeriesSurvey, in_events: Bool, faint: float, event: Detected
     return first, max(first, last)
 
 
-def _extended(
+def _extend(
     survey: SeriesSurvey, in_events: Bool, extents: list[tuple[int, int]], events: list[DetectedEvent], *, crowded: bool
 ) -> list[tuple[int, int]]:
     """Extend events to frames that are brighter than the level; in crowded light curves, cut off those that are not."""
@@ -214,20 +215,20 @@ POOR = 1e-3
 LEVELS = (0.6826894921370859, 0.95)
 #: Number of frames on each side of an event from which the error of its level follows.
 NEARBY = 10_000
-#: Errors of the sum of an event's frames by which they are fainter than the level, from which they show no flare.
+#: An event shows no flare if its frames are together fainter than the level by this many errors of their sum.
 FAINTER_ERRORS = 2.0
 
 
 Kind = Literal["flare", "step", "dip", "throughput", "dark current", "sky", "cosmic ray"]
 
-#: Number of missing frames next to an event from which it may have begun before or gone on after them.
+#: Number of missing frames next to an event beyond which it may have begun before or continued after them.
 GAP_FRAMES = 3
 #: Share of a flare's light outside the frames of its event from which their sum is a lower limit.
 UNSEEN = 0.05
 
 
-def _kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
-    """Return whether an event is a flare by its fits of published shapes, since the general family resembles all kinds.
+def _find_kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
+    """Return the kind of an event by its fits of published shapes, since the general family resembles all kinds.
 
     The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse. The sum
     over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
@@ -240,7 +241,7 @@ def _kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
     for flare in best.flares:
         light = consecutive_integrals(best.shape, (edges - flare.peak_s) / flare.half_width_s)
         within += flare.amplitude * flare.half_width_s * float(light.sum())
-    mixture = joined([fit.mixture for fit in fits])
+    mixture = join([fit.mixture for fit in fits])
     low, high = (mixture.quantile(0.5 + sign * LEVELS[0] / 2) for sign in (-1, 1))
     lacking, uncertain = (within - summed) / level, float(np.hypot(error / level, (high - low) / 2))
     if not survey.weighted and lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level:
@@ -248,7 +249,7 @@ def _kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
     return "step" if _is_step(fits) else "flare"
 
 
-def _summed(survey: SeriesSurvey, in_events: Bool, level: Float, event: DetectedEvent) -> tuple[float, float]:
+def _sum_light(survey: SeriesSurvey, in_events: Bool, level: Float, event: DetectedEvent) -> tuple[float, float]:
     """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
 
     Missing frames are interpolated. The error includes that of the level given the quiescent frames.
@@ -394,9 +395,9 @@ def measure_event(
     low, high = ([mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1))
     flares = [replace(f, amplitude=f.amplitude / of_star, equivalent_duration_s=f.equivalent_duration_s / of_star)
               for f in best.flares]  # fmt: skip
-    summed, error = _summed(survey, in_events, level, detected)
+    summed, error = _sum_light(survey, in_events, level, detected)
     published = [fit for fit in fits if fit.shape.name != GENERAL]
-    kind = _kind(published, summed, error) if cause == "flare" else cause
+    kind = _find_kind(published, summed, error) if cause == "flare" else cause
     flux = (survey.flux[rows] - level[rows]) * survey.scale
     # In the sum over wavelength of spectra a drift of the dark current may exceed a flare, but not near its peak.
     near = np.abs(middle[rows] - detected.peak_s) <= detected.half_width_s + frame_s
@@ -430,7 +431,7 @@ def _posterior(in_events: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixtur
         place = log_time(window.middle[window.inside], fits[int(np.argmax(totals))].flares[0])
         power = min(1.0, (1.0 + float(np.ptp(place)) / LOG_TIME) / place.size)
         mixtures = [replace(m, log_weight=m.log_weight + (power - 1) * (m.log_total - totals.max())) for m in mixtures]
-    mixture, survey, event = joined(mixtures), window.survey, window.event
+    mixture, survey, event = join(mixtures), window.survey, window.event
     if len(survey.bank.directions) == 1:
         return mixture
     # Flares of other temperatures have another light for the same sum: the S/N of each, and the value of its amplitude.
@@ -448,4 +449,4 @@ def _posterior(in_events: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixtur
         if value > 0:
             factor, log_weight = scale / unit * value / snr, 0.5 * (value**2 - snr**2)
             scaled.append(NormalMixture(mixture.log_weight + log_weight, factor * mixture.mean, factor * mixture.sd))
-    return joined(scaled)
+    return join(scaled)

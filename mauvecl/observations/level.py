@@ -17,23 +17,24 @@ from mauvecl.schema.fields import DAY_S
 
 #: Standard deviation of a normal distribution in units of its median absolute deviation.
 PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
-#: Smallest distance of a frame without light of the star, below, and of a single bright frame, above.
+#: Distance from the level, in standard deviations, beyond which a frame below it lacks the light of the star, and a
+#: single frame above it is a spike.
 FAR = 5.0
-#: Largest distance of the neighbours of a single bright frame.
+#: Largest distance of the neighbours of a spike.
 NEAR = 3.0
-#: Rise in robust standard deviations from which a first guess of the flares begins, and the frames that it takes.
+#: A guessed flare begins with a rise of this many robust standard deviations, within one of these numbers of frames.
 JUMP, JUMP_FRAMES = 8.0, (1, 2, 3)
 #: A guessed flare ends at this share of its rise, or within this number of standard deviations of the level before it.
 DECAYED, WITHIN = 0.02, 3.0
 #: Largest share of the frames in guessed flares.
 MOST_GUESSED = 0.8
-#: Frames in which the end of a guessed flare is looked for first; the next pieces are longer.
+#: Number of frames in which the end of a guessed flare is sought first; further pieces are longer.
 FIRST_PIECE = 256
 #: Largest mean of counts in a frame whose noise is treated as Poisson noise rather than as normal noise.
 MAX_COUNTS = 100.0
 #: Factor by which the noise of frames without weight exceeds the standard deviation of the process.
 NO_WEIGHT = 1e4
-#: Largest share of frames far below the level that are left out; more of them are part of the light of the star.
+#: Largest share of frames far below the level that are left out; more of them are light of the star.
 MOST_BELOW = 0.03
 #: Smallest variance of the noise of a frame relative to the typical one.
 LEAST_VARIANCE = 0.1
@@ -241,7 +242,7 @@ BINS = (1, 2, 4, 8, 16, 32, 64, 128)
 MIN_BINS = 8
 #: Largest lag of correlations in frames.
 MAX_LAG = 40
-#: Correlation of the residuals from which the process does not describe them, if it is also as many standard errors.
+#: Correlation of the residuals above which the process does not describe them, if it also has this significance.
 CORRELATED, SIGNIFICANT = 0.12, 5.0
 
 
@@ -317,7 +318,8 @@ def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]
 
 Places = NDArray[np.intp]
 
-#: Frames on each side whose parabolas are compared, and their usual deviations from which it may be a step (assumed).
+#: Numbers of frames on each side whose parabolas are compared, and the difference, relative to its usual size, above
+#: which it may be a step (assumed).
 SIDES, SUDDEN = (12, 40), 8.0
 #: Largest number of steps (assumed).
 MOST_STEPS = 30
@@ -340,7 +342,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
     """
     constant = np.ones(flux.size)
     values = flux / Binned(time_s, flux, constant, frame_s).noise
-    places, sizes = _sudden_changes(time_s, values)
+    places, sizes = _find_sudden_changes(time_s, values)
     typical = float(np.median(values))
     process: Process | None = None
     if not places.size or not typical > 0:
@@ -353,11 +355,11 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         without_steps = values - np.cumsum(np.bincount(places, sizes, values.size))
         quiet = ~guess_flares(numbers, without_steps)
         process = fit_process(binned(without_steps), process)
-        change, error = _fitted_steps(process, time_s, without_steps, quiet, places, frame_s)
+        change, error = _fit_steps(process, time_s, without_steps, quiet, places, frame_s)
         # A flare may shine after each rise.
         rises = [(time_s >= start) & (time_s < start + FLARE_S) for start in time_s[places[sizes > 0]]]
         no_flare = quiet & ~np.any(rises, axis=0)
-        later_change, later_error = _fitted_steps(process, time_s, without_steps, no_flare, places, frame_s)
+        later_change, later_error = _fit_steps(process, time_s, without_steps, no_flare, places, frame_s)
         later_sizes, sizes = sizes + later_change, sizes + change
         steps = (np.abs(sizes) > SIGNIFICANT * error) & (later_sizes / np.sign(sizes) > AFTER_FLARE * later_error)
         settled = steps.all() and (np.abs(change) < error).all()
@@ -377,7 +379,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
     return level if costs[0] < costs[1] and level.min() > 1 / LARGEST and level.max() < LARGEST else constant
 
 
-def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
+def _find_sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
     """Return the first frames after sudden changes that last, in order of time, and the changes of the flux."""
     changes: dict[int, tuple[float, float]] = {}
     for side in SIDES:
@@ -406,7 +408,7 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
     return np.array(places, np.intp), np.array([changes[place][1] for place in places])
 
 
-def _fitted_steps(
+def _fit_steps(
     process: Process, time_s: Float, flux: Float, quiet: Bool, places: Places, frame_s: float
 ) -> tuple[Float, Float]:
     """Return the steps of a light curve by generalised least squares, and their standard errors, (n_step,) each."""

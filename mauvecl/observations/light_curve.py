@@ -37,7 +37,7 @@ from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, cri
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 
-#: Statistic of events whose frames take no part in fits of the process.
+#: Statistic above which the frames of an event are left out of fits of the process.
 PROVISIONAL = 5.0
 #: Largest number of alternations of process and events.
 ALTERNATIONS = 12
@@ -127,11 +127,11 @@ def criterion(
 def _shapeless_cost(survey: SeriesSurvey, event: DetectedEvent, light: Sequence[Sequence[EventLight]]) -> float:
     """Return the criterion of an event whose light is a process, alone or in addition to that of fitted flares."""
     size = float(np.log(survey.stare.n_frames))
-    rows, added = slice(event.first, event.last + 1), [(1, *_added(survey, [], 0.0))]
+    rows, added = slice(event.first, event.last + 1), [(1, *_add_light(survey, [], 0.0))]
     for fits in light:
         near = (fit for fit in fits if event.first <= fit.event.last and fit.event.first <= event.last)
         if number := sum(fit.n_flares for fit in near):
-            added += [(number, *_added(survey, fits, epsilon)) for epsilon in DEPARTURES]
+            added += [(number, *_add_light(survey, fits, epsilon)) for epsilon in DEPARTURES]
     costs = []
     for n_flares, flux, extra in added:
         values, variance = survey.sums[rows, 0] - flux[rows, 0], survey.variance[rows] + extra[rows]
@@ -141,7 +141,7 @@ def _shapeless_cost(survey: SeriesSurvey, event: DetectedEvent, light: Sequence[
     return min(costs)
 
 
-def _added(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> tuple[Float, Float]:
+def _add_light(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> tuple[Float, Float]:
     """Return the light of flares in the sums, (n_frame, n_sum), and the variance of flares that depart by a share."""
     light, variance = np.zeros_like(survey.sums), np.zeros(survey.stare.n_frames)
     for fit in fits:
@@ -153,7 +153,7 @@ def _added(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> 
 def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], chosen: Bool, epsilon: float) -> float:
     """Return the criterion of some frames, with flares that depart by a share from their shape."""
     start, size = survey.stare.start_s[chosen], float(np.log(survey.stare.n_frames))
-    light, extra = _added(survey, fits, epsilon)
+    light, extra = _add_light(survey, fits, epsilon)
     total = PARAMETERS * size * sum(fit.n_flares for fit in fits)
     for process, column in zip(survey.processes, (survey.sums - light)[chosen].T, strict=True):
         noise = (survey.variance * process.excess**2 + extra)[chosen]
@@ -276,7 +276,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, s
     many = active or (in_events.mean() > MOST_FLARING and not rotates)
     if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
         return lost
-    dark = ~_bright(survey)
+    dark = ~_bright_frames(survey)
     survey, fitted, in_events = survey.frames(dark), fitted.frames(dark), in_events[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
@@ -288,7 +288,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, s
         return criterion(fitted, light_of_events(fitted, in_events), in_events)
 
     # Those of a star that varies are most of its frames; eclipses repeat.
-    if active and guessed.mean() >= MOST_LOST and (eclipses := _eclipses(survey, usual)).any():
+    if active and guessed.mean() >= MOST_LOST and (eclipses := _find_eclipses(survey, usual)).any():
         lost[dark] = eclipses
         return lost
     other, losses = alternate(down, guessed, None, steps)
@@ -304,7 +304,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, s
     return lost
 
 
-def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
+def _find_eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     """Return the frames in periodic losses if these lower the criterion, which is `usual()` without them."""
     guessed = guess_eclipses(survey)
     lost = np.zeros_like(guessed)
@@ -381,7 +381,7 @@ def _turns(time: Float, period: float, middle: float) -> tuple[Float, Float]:
     return turn, np.abs(time - middle - turn * period)
 
 
-def _bright(survey: SeriesSurvey) -> Bool:
+def _bright_frames(survey: SeriesSurvey) -> Bool:
     """Return frames far above the level that most frames have, and those after them, as long as flares decay."""
     sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.variance)
     bright = np.zeros(sigmas.size, np.bool_)
@@ -392,7 +392,7 @@ def _bright(survey: SeriesSurvey) -> Bool:
 
 #: Number of frames whose median is the level around a single bright frame.
 SPIKE_FRAMES = 9
-#: Largest number of times that single frames are left out and the rest is fitted again.
+#: Largest number of times that single frames are left out and the others are fitted again.
 ROUNDS = 3
 
 
@@ -404,7 +404,7 @@ def survey_light_curve(
     Frames of few counts are returned with a remark and without errors. `steps` reports fits, searches and draws.
     """
     fits = steps.part(0.0, 0.9)
-    frames, counts, reasons, steps_of_level = _prepared(frames)
+    frames, counts, reasons, steps_of_level = _prepare(frames)
     used = reasons == 0
     flux, error = frames.white_light
     flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
@@ -430,7 +430,7 @@ def survey_light_curve(
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)
         guessed[used] = in_events
-        flagged = _single(frames, flux, level, sd, used, guessed, counts)
+        flagged = _flag_single_frames(frames, flux, level, sd, used, guessed, counts)
         if not flagged[used].any():
             break
         reasons = np.where(used, reasons | flagged, reasons)
@@ -442,7 +442,7 @@ def survey_light_curve(
     return survey, light.times(steps_of_level), frames
 
 
-def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], Float]:
+def _prepare(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], Float]:
     """Return frames, counts in a unit of their flux, why some are not searched, and the level relative to the typical.
 
     Frames of few counts have no errors; for others, counts are None. Raises InputError if too few frames are usable.
@@ -479,7 +479,7 @@ def _mean(name: str, flux: Float, least: float) -> float:
     return mean
 
 
-def _single(
+def _flag_single_frames(
     frames: Frames, flux: Float, level: Float, sd: Float, used: Bool, events: Bool, counts: float | None
 ) -> NDArray[np.int64]:
     """Return the reasons not to search single frames: far below the level, or alone far above it."""

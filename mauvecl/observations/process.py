@@ -36,9 +36,9 @@ NOISE_PRIOR = 0.3
 PERIODIC = 1e-3
 #: Smallest period in steps between values, and largest as a share of the length of the light curve.
 SHORTEST, LONGEST = 4.0, 1.0
-#: Frequencies of a periodogram in the width of a peak, and in all, approximately.
+#: Approximate numbers of frequencies of a periodogram: in the width of a peak, and in total.
 PER_PEAK, MOST_FREQUENCIES = 5, 2**17
-#: Period as a share of the length above which rotation is also searched in what a polynomial of a degree leaves.
+#: Period, as a share of the length, above which rotation is also searched in the residuals of a polynomial of a degree.
 FEW_TURNS, DEGREE = 0.2, 8
 #: Range of standard deviations of a term, in standard deviations of the noise of a value.
 AMPLITUDES = (1e-2, 1e5)
@@ -50,7 +50,7 @@ SMOOTH_QUALITY = 2**-0.5
 ITERATIONS, CONVERGED = 80, 1e-3
 #: Step of a parameter for the derivatives of a fit.
 DIFFERENCE = 1e-8
-#: Largest number of fits one after the other, and the change of log likelihood below which the last one is the best.
+#: Largest number of consecutive fits, and the change of log likelihood below which no further one follows.
 STARTS, SAME = 4, 0.5
 #: Largest change of the logarithm of a period in a fit, and bounds of the parameters beyond the first two.
 NEAR_PERIOD = 0.4
@@ -60,8 +60,8 @@ BOUNDS: dict[Kind, tuple[tuple[float, float], ...]] = {
 }  # fmt: skip
 #: Number of harmonics of sharp rotation, and their first standard deviation over that of the harmonic before.
 HARMONICS, EACH_HARMONIC = 6, 0.5
-#: What these harmonics cost beyond their parameters, so that only very strong evidence prefers them to two (Kass &
-#: Raftery 1995, doi 10.1080/01621459.1995.10476572).
+#: Penalty on these harmonics in addition to that on their parameters, so that only very strong evidence prefers them to
+#: two harmonics (Kass & Raftery 1995, doi 10.1080/01621459.1995.10476572).
 STRONG = 10.0
 #: Largest number of values to which these harmonics are fitted before they replace two in a longer light curve.
 MAX_TRIED = 5000
@@ -97,7 +97,7 @@ class Steps:
         self.step(1.0)
 
 
-#: Steps of work whose progress nobody follows.
+#: Steps of work whose progress is not reported.
 UNREPORTED = Steps()
 
 
@@ -215,7 +215,7 @@ class Process:
 
 
 def _time(seconds: float) -> str:
-    """Return a time in a unit that suits it."""
+    """Format a time in a suitable unit."""
     for unit, size in (("d", 86_400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
@@ -354,14 +354,14 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREP
     `steps` reports each combination of terms.
     """
     if start is not None:
-        return replace(_fitted(data, start.terms, float(np.log(start.excess)))[0], bic=start.bic)
-    best, value = _fitted(data, (), data.log_excess)
+        return replace(_fit_terms(data, start.terms, float(np.log(start.excess)))[0], bic=start.bic)
+    best, value = _fit_terms(data, (), data.log_excess)
     tried = {best.name: value}
     while len(best.terms) < MAX_TERMS:
         size, options = best.n_parameters, []
-        for terms in _starts(data, best):
+        for terms in _starting_terms(data, best):
             if (size + sum(len(term.parameters) for term in terms)) * VALUES_PER_PARAMETER <= data.values.size:
-                process, bic = _fitted(data, (*best.terms, *terms), data.log_excess)
+                process, bic = _fit_terms(data, (*best.terms, *terms), data.log_excess)
                 options.append((process, bic))
                 # A combination has several starting points.
                 tried[process.name] = min(bic, tried.get(process.name, np.inf))
@@ -370,27 +370,27 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREP
         if not lowest < value:
             break
         best, value = better, lowest
-        if best.terms[-1].kind == "rotation" and (sharp := _sharper(data, best)) is not None:
+        if best.terms[-1].kind == "rotation" and (sharp := _sharpen(data, best)) is not None:
             tried[sharp[0].name] = sharp[1]
             best, value = min((best, value), sharp, key=itemgetter(1))
     return replace(best, bic=tuple((name, bic - value) for name, bic in tried.items()))
 
 
-def _sharper(data: Binned, process: Process) -> tuple[Process, float] | None:
-    """Return a process whose last term, rotation, has more harmonics, and its BIC; None if these are not seen."""
+def _sharpen(data: Binned, process: Process) -> tuple[Process, float] | None:
+    """Return a process whose last term, rotation, has more harmonics, and its BIC; None if they do not fit better."""
     size, period, quality, *_ = process.terms[-1].parameters
     sharp = ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
     terms, log_excess = (*process.terms[:-1], sharp), float(np.log(process.excess))
     coarse = Binned.of(data.time_s, data.values, data.variance, data.step_s, MAX_TRIED)
-    fitted, bic = _fitted(coarse, terms, log_excess)
+    fitted, bic = _fit_terms(coarse, terms, log_excess)
     if coarse.step_s != data.step_s:
-        if bic + STRONG >= _fitted(coarse, process.terms, log_excess)[1]:
+        if bic + STRONG >= _fit_terms(coarse, process.terms, log_excess)[1]:
             return None
-        fitted, bic = _fitted(data, fitted.terms, log_excess)
+        fitted, bic = _fit_terms(data, fitted.terms, log_excess)
     return fitted, bic + STRONG
 
 
-def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
+def _starting_terms(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
     """Yield starting points of a further term, or of rotation with a slower change of the light."""
     covariance = best.covariance(data.time_s, data.variance * best.excess**2)
     spread = max(float(np.std(data.values - level_fit(covariance, data.values)[0])), data.noise)
@@ -403,14 +403,14 @@ def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
         return
     smooth = ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
     yield (smooth,)
-    if (period := _period(data, data.values, LONGEST)) is None:
+    if (period := _find_period(data, data.values, LONGEST)) is None:
         return
     for factor in (1.0, 2.0):
         yield (_rotation(spread, factor * period),)
     if not best.terms and period > FEW_TURNS * data.span_s:
         # Beside changes as long as the light curve, rotation is not the highest peak.
         slow = np.polynomial.Polynomial.fit(data.time_s, data.values, DEGREE)(data.time_s)
-        if (faster := _period(data, data.values - slow, FEW_TURNS)) is not None:
+        if (faster := _find_period(data, data.values - slow, FEW_TURNS)) is not None:
             yield smooth, _rotation(spread, faster)
 
 
@@ -419,10 +419,10 @@ def _rotation(size: float, period: float) -> ProcessTerm:
     return ProcessTerm("rotation", tuple(np.log([size, period, 10.0, 1.0, 0.3]).tolist()))
 
 
-def _period(data: Binned, values: Float, share: float) -> float | None:
+def _find_period(data: Binned, values: Float, share: float) -> float | None:
     """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
 
-    The values may be what is left of the data; `share` is the longest period over the length of the data.
+    The values may be residuals of the data; `share` is the longest period over the length of the data.
     """
     from astropy.timeseries import LombScargle
 
@@ -442,7 +442,7 @@ def _period(data: Binned, values: Float, share: float) -> float | None:
     return float(1.0 / frequency[best]) if chance < PERIODIC else None
 
 
-def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
+def _fit_terms(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
     """Return the process of some terms that fits best, and its BIC."""
     expected = data.log_excess
     start = np.array([log_excess, *(value for term in terms for value in term.parameters)])

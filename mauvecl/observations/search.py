@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from mauvecl.observations.process import Covariance
 
 
-#: Flux of a template relative to its peak below which it is neglected.
+#: Flux of a template, relative to its peak, below which it is neglected.
 NEGLECTED = 1e-4
 #: Frames around a template from which its denominator follows: a multiple of its length, smallest and largest number.
 MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 1024, 4096
@@ -46,7 +46,7 @@ MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 1024, 4096
 IRREGULAR = 1e-4
 #: Relative change of the variance of a frame that is treated exactly.
 OTHER_NOISE = 0.5
-#: Number of frames, unless a template is longer, and largest number of templates in one solution.
+#: Largest numbers of frames (unless a template is longer) and of templates that are solved together.
 CHUNK_FRAMES, CHUNK_TEMPLATES = 256, 512
 
 
@@ -114,7 +114,7 @@ class ProcessSearch:
         """Templates with the denominators that were solved by now."""
         _ = self._levels
         pairs = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
-        return list(map_in_threads(lambda pair: self._filter(*pair), pairs))
+        return list(map_in_threads(lambda pair: self._prepare_filter(*pair), pairs))
 
     @cached_property
     def rows(self) -> list[Filter]:
@@ -164,7 +164,7 @@ class ProcessSearch:
         numbers = places + self._lacking[np.searchsorted(self._middles, places, side="right")]
         return np.asarray((numbers + row.template.phases[row.phase]) * self.bank.frame_s)
 
-    def _filter(self, template: Template, phase: int) -> Filter:
+    def _prepare_filter(self, template: Template, phase: int) -> Filter:
         """Prepare the templates of a half-width and phase, with norms that are not solved next to gaps and ends."""
         flux = template.shapes[phase]
         bright = np.flatnonzero(flux > NEGLECTED * flux.max())
@@ -176,19 +176,21 @@ class ProcessSearch:
         on_grid = np.zeros(self.n_grid)
         for k, (process, level) in enumerate(zip(self.processes, self._levels, strict=True)):
             if process.terms:
-                norms[k], unsolved[k], units[k] = self._norms(k, shape, first, peaks)
+                norms[k], unsolved[k], units[k] = self._approximate_norms(k, shape, first, peaks)
             else:
                 # Independent noise.
                 variance = self.variance * process.excess**2
                 on_grid[self.at] = 1.0 / variance
-                norms[k] = _correlated(on_grid, shape**2, first)[peaks]
+                norms[k] = _correlate(on_grid, shape**2, first)[peaks]
                 units[k] = (shape**2).sum() / np.median(variance)
             on_grid[self.at] = level
-            lost[k] = _correlated(on_grid, shape, first)[peaks] ** 2 / level.sum()
+            lost[k] = _correlate(on_grid, shape, first)[peaks] ** 2 / level.sum()
         weights = self.bank.directions**2
         return Filter(template, phase, shape, first, peaks, norms, unsolved, lost, weights, weights @ units)
 
-    def _norms(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> tuple[Float, Bool, float]:
+    def _approximate_norms(
+        self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]
+    ) -> tuple[Float, Bool, float]:
         """Return s^T C^-1 s of a sum at peaks, whether it must be solved there, and its value without gaps."""
         process = self.processes[k]
         variance = self.variance * process.excess**2
@@ -214,7 +216,7 @@ class ProcessSearch:
         signals = np.pad([irregular, single, moved], [(0, 0), (size, size)])
         # The frames beyond the ends are irregular.
         signals[0, :size] = signals[0, -size:] = 1.0
-        share, missing, noise = _correlated(signals, response**2, first - margin)[:, size + peaks]
+        share, missing, noise = _correlate(signals, response**2, first - margin)[:, size + peaks]
         norm = np.maximum(unit - missing / diagonal, 0.0) / np.maximum(1.0 + noise / unit, 0.1)
         # A single frame contributes its squared response over the diagonal of C^-1.
         return norm, share > IRREGULAR * diagonal * np.maximum(norm, IRREGULAR * unit), unit
@@ -242,7 +244,7 @@ class ProcessSearch:
 
 
 class Correlations:
-    """Correlations of light curves with kernels of some largest reach, which share the transform of the light curves.
+    """Correlations of light curves with kernels up to a largest reach, which share the transform of the light curves.
 
     Values beyond the ends of the last axis are zero.
     """
@@ -259,7 +261,7 @@ class Correlations:
         return correlated[..., start : start + self.values.shape[-1]]
 
 
-def _correlated(values: Float, kernel: Float, first: int) -> Float:
+def _correlate(values: Float, kernel: Float, first: int) -> Float:
     """Return the correlation of values with a single kernel; see `Correlations`."""
     return Correlations(values, max(abs(first), kernel.size)).of(kernel, first)
 
@@ -317,7 +319,7 @@ class SeriesSurvey:
     ) -> SeriesSurvey:  # fmt: skip
         """Prepare the frames that can be searched, `used`, without a process; see the attributes.
 
-        What is searched is the flux, or sums of spectra, given `weighted` with their templates.
+        The flux is searched, or sums of spectra, which are given by `weighted` with their templates.
         """
         stare = stare_of(frames, used)
         scale = float(np.sqrt(np.median(variance[used])))
@@ -375,7 +377,7 @@ class SeriesSurvey:
 
 
 def stare_of(frames: Frames, used: Bool) -> Stare:
-    """Return the frames that are searched as a stare on the regular grid of the cadence."""
+    """Return the searched frames as a stare on the regular grid of the cadence."""
     numbers = frames.numbers[used]
     unit = np.ones(numbers.size)
     return Stare(

@@ -141,7 +141,7 @@ def _frequencies(base: float, low: float, high: float) -> Float:
     return np.asarray(max(low - 0.5 / base, step) + step * np.arange(count))
 
 
-#: Share of the information on a change that must be left by what is unknown; less is rounding.
+#: Smallest share of the information on a change that unknowns may leave; a smaller one is a rounding error.
 LEAST_KEPT = 1e-10
 #: Share of the largest change of a pixel above which a change concerns a pixel.
 LEAST_LIGHT = 1e-3
@@ -188,7 +188,7 @@ def smallest_change(
 
 
 def pixels_of(counts_dn: Float, quiet: Expectation) -> tuple[int, int]:
-    """Return how many of the pixels that a change of the light concerns are near saturation, and how many these are."""
+    """Return the number of pixels near saturation among those that a change of the light concerns, and of all these."""
     concerned = np.abs(counts_dn) > LEAST_LIGHT * np.abs(counts_dn).max(initial=0.0)
     return int((concerned & ~variance_of(quiet)[1]).sum()), int(concerned.sum())
 
@@ -232,7 +232,7 @@ def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None
 #: assumption; definitions of Mg II indices differ between experiments, and none for stars at this resolution was found.
 MG_II_NM = (278.5, 281.5)
 MG_II_CONTINUUM_NM = ((275.5, 278.0), (282.0, 284.5))
-#: Smallest number of pixels of the continuum, for a straight line and a sign of its scatter.
+#: Smallest number of pixels of the continuum, from which a straight line and its scatter follow.
 MIN_CONTINUUM = 3
 
 
@@ -400,9 +400,10 @@ class Change:
         starlight = np.interp(nm, star.wavelength_nm, star.flux_flam, left=0.0, right=0.0)
         words = name.strip().casefold()
         if words == "balmer jump":
-            flux, meaning = starlight * _below(BALMER_EDGE_NM), "relative change of the light below the Balmer edge"
+            flux = starlight * _share_below(BALMER_EDGE_NM)
+            meaning = "relative change of the light below the Balmer edge"
         elif words == "colour":
-            flux, unit = LOG_PER_MAG * starlight * _below(COLOUR_NM), "mag"
+            flux, unit = LOG_PER_MAG * starlight * _share_below(COLOUR_NM), "mag"
             meaning = f"brightening of the light below {COLOUR_NM:g} nm against that above"
         elif words == "spectrum":
             if file is None:
@@ -410,8 +411,8 @@ class Change:
             of_star, of_file = (photons(source.wavelength_nm, source.flux_flam, band) for source in (star, file))
             nm, flux = file.wavelength_nm, of_star / of_file * file.flux_flam
             meaning = f"light of {file.name} over that of the star in {band}"
-        elif (limits := _band(name)) is not None:
-            flux = starlight * (_below(limits[1]) - _below(limits[0]))
+        elif (limits := _parse_band(name)) is not None:
+            flux = starlight * (_share_below(limits[1]) - _share_below(limits[0]))
             meaning = f"relative change of the light in {limits[0]:g}-{limits[1]:g} nm"
         else:
             try:
@@ -427,7 +428,7 @@ class Change:
         return cls(name.strip(), unit, meaning, rate * _exposure_dn_per_electron(quiet, instrument))
 
 
-def _below(edge_nm: float) -> Float:
+def _share_below(edge_nm: float) -> Float:
     """Return factors at `GRID_NM` of light that ends at a wavelength, with the sum and mean of a sharp edge.
 
     The flux is linear between the wavelengths, and the factor of each is the share of its triangle below the edge.
@@ -436,7 +437,7 @@ def _below(edge_nm: float) -> Float:
     return np.asarray(np.where(distance < 0.0, (1.0 + distance) ** 2, 2.0 - (1.0 - distance) ** 2) / 2.0)
 
 
-def _band(name: str) -> tuple[float, float] | None:
+def _parse_band(name: str) -> tuple[float, float] | None:
     try:
         low, high = map(float, name.split("-"))
     except ValueError:
