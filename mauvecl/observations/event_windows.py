@@ -230,11 +230,11 @@ class Window:
         pairs = zip(unit, self.survey.processes, strict=True)
         return np.asarray(sum(weight**2 * process.at(lags) for weight, process in pairs))
 
-    def model(self, shape: Integrable, peak_s: Float, half_width_s: Float) -> Float:
+    def model(self, shape: Integrable, peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
         """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
         return np.asarray(self.models((shape,), peak_s, half_width_s)[0])
 
-    def models(self, parts: Sequence[Integrable], peak_s: Float, half_width_s: Float) -> Float:
+    def models(self, parts: Sequence[Integrable], peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
         """Return the mean of several parts of shapes in the bins, in the unit of the values, (n_part, n_shape, n)."""
         times, place = self._times
         peak, width = (np.atleast_1d(values)[:, None] for values in (peak_s, half_width_s))
@@ -312,8 +312,7 @@ class Likelihood:
         shared, variance = np.zeros(n), 0.0
         lengths = np.diff(window.edges)[:, 0]
         for flare in flares:
-            peak, width = np.array([flare.peak_s]), np.array([flare.half_width_s])
-            light = flare.amplitude * window.model(shape, peak, width)[0]
+            light = flare.amplitude * window.model(shape, flare.peak_s, flare.half_width_s)[0]
             covariance += np.diag(window.photon * light / window.scale / window.frames)
             if epsilon:
                 light = light + _floor(window.middle, flare) * window.scale

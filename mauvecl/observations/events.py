@@ -439,7 +439,7 @@ def _posterior(in_events: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixtur
     for direction in range(len(survey.bank.directions)):
         other = Window.of(survey, in_events, event, direction)
         noise = np.diag(other.process) + other.noise
-        model = other.model(survey.bank.shape, np.array([event.peak_s]), np.array([event.half_width_s]))[0]
+        model = other.model(survey.bank.shape, event.peak_s, event.half_width_s)[0]
         weight, outside = model / noise, ~other.inside
         level = float(np.average(other.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0
         scores.append((float(weight @ (other.values - level)) / np.sqrt(float(weight @ model)), other.scale))
