@@ -294,9 +294,7 @@ def _parameters(flares: Sequence[FittedFlare]) -> Float:
 def _refine(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlare]) -> list[FittedFlare]:
     """Return the flares that fit best, by least squares from a starting point."""
     window = likelihood.window
-    # The inverse has rank n - 1; its root is that of its eigenvalues.
-    value, vector = np.linalg.eigh(likelihood.inverse)
-    root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
+    root = likelihood.root
     start = _parameters(flares)
     scale = np.tile([0.3, 1.0, 0.3], len(flares))
     scale[1::3] = [0.3 * f.half_width_s for f in flares]

@@ -295,6 +295,7 @@ class Likelihood:
 
     window: Window
     inverse: Float  # shape (n, n)
+    root: Float  # shape (n, n); the inverse is root^T root
     log_factor: float  # of the likelihood, without the constant
     # Of the integral of the departures of the flares from their shape, in amplitude x s.
     departure: Float  # shape (n,); weights of the values in it
@@ -325,9 +326,8 @@ class Likelihood:
                 shared += light * (correlation[:n] @ integrals)
                 variance += float(integrals @ correlation @ integrals)
         factor = scipy.linalg.cholesky(covariance, lower=True)
-        # LAPACK's inverse from a factor, in half the time of a solution for each column; it leaves the upper half.
-        lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])
-        inverse = lower + np.tril(lower, -1).T
+        root = scipy.linalg.lapack.dtrtri(factor, lower=True)[0]
+        inverse = root.T @ root
         sums = inverse.sum(axis=1)
         total = float(sums.sum())
         level, level_variance = np.zeros(n), 0.0
@@ -340,10 +340,11 @@ class Likelihood:
             level_variance = float(of_process[peak_bin] - of_process @ weights) + constant**2 / total
             level_variance = max(level_variance, 0.0) / window.scale**2
         inverse = inverse - sums[:, None] * sums / total
+        root = root - root.sum(axis=1)[:, None] * sums / total
         log_factor = -float(np.log(np.diag(factor)).sum()) - 0.5 * float(np.log(total))
         departure = inverse @ shared
         departure_variance = max(variance - float(departure @ shared), 0.0)
-        return cls(window, inverse, log_factor, departure, departure_variance, level, level_variance)
+        return cls(window, inverse, root, log_factor, departure, departure_variance, level, level_variance)
 
     def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
         """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from mauvecl.flares.stare import Stare, select_frames
-from mauvecl.host.arrays import Bool, Float, map_in_threads
+from mauvecl.host.arrays import Bool, Float, array_cache, map_in_threads
 from mauvecl.observations.level import LevelGiven
 from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
 from mauvecl.schema.fields import DAY_S
@@ -195,13 +195,8 @@ class ProcessSearch:
         process = self.processes[k]
         variance = self.variance * process.excess**2
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
-        typical, frame_s = float(np.median(variance)), self.bank.frame_s
-        size = shape.size + 2 * margin
-        regular = process.covariance(np.arange(size, dtype=np.float64) * frame_s, np.full(size, typical))
-        columns = np.zeros((size, 2))
-        columns[margin : margin + shape.size, 0] = shape
-        columns[size // 2, 1] = 1.0
-        response, inverse = regular.solve(columns).T
+        typical, size = float(np.median(variance)), shape.size + 2 * margin
+        response, inverse = _regular_solution(process, typical, self.bank.frame_s, np.pad(shape, margin)).T
         # The norm and the diagonal of C^-1, without gaps and with constant noise.
         unit, diagonal = float(response[margin : margin + shape.size] @ shape), float(inverse[size // 2])
         # Frames at which the solution differs: gaps and ends, other noise; single missing frames are exact.
@@ -241,6 +236,18 @@ class ProcessSearch:
                     columns = padded[np.clip(place, 0, size + 1, out=place)]
                     norms[onsets[:stop]] = covariance.squared_norms(columns, int(begin), MOST_MARGIN)
                 onsets, starts = onsets[stop:], starts[stop:]
+
+
+@array_cache(maxsize=64)
+def _regular_solution(process: Process, variance: float, frame_s: float, shape: Float) -> Float:
+    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, shape (n, 2).
+
+    Searches of a light curve after each event ask for the same solutions.
+    """
+    single = np.zeros(shape.size)
+    single[shape.size // 2] = 1.0
+    covariance = process.covariance(np.arange(float(shape.size)) * frame_s, np.full(shape.size, variance))
+    return covariance.solve(np.column_stack([shape, single]))
 
 
 class Correlations:
