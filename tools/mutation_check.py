@@ -342,7 +342,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "intervals of events that are not truncated at zero": (
         "test_quantiles_are_those_of_a_truncated_normal_distribution[0.0]",
-        ("goal = _above(0.0, weight, mean, sd, 0.0) * ", "goal = "),
+        ("goal = _probability_above(0.0, weight, mean, sd, 0.0) * ", "goal = "),
     ),
     "a flare added to the level of its star": (
         "test_table_of_events_has_the_flare_in_its_units",
@@ -354,8 +354,8 @@ MUTATIONS: dict[str, Mutation] = {
     "durations without the error of their level": (
         "test_tables_of_default_questions_are_unchanged[analyse-counts]",
         (
-            "grid.information + likelihood.left + mean**2 * likelihood.level_variance) / level",
-            "grid.information + likelihood.left) / level",
+            "unknown = likelihood.departure_variance + mean**2 * likelihood.level_variance",
+            "unknown = likelihood.departure_variance",
         ),
     ),
     "brighter flares on a higher level": (
@@ -364,7 +364,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "light summed above a known level": (
         "test_error_of_a_summed_duration_includes_that_of_its_level",
-        ("variance += of_level", "pass"),
+        ("variance += of_level + constant**2 / float(of_constant.sum())", "pass"),
     ),
     "a slow decay on top of the fast one": (
         "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
@@ -381,22 +381,25 @@ MUTATIONS: dict[str, Mutation] = {
     "steps taken for flares": (
         "test_steps_single_frames_and_dips_are_no_flares_and_three_frames_are_one",
         (
-            "return whole - float(gain.max()) < least - STEP_GAIN",
-            "return whole - float(gain.max()) > least - STEP_GAIN",
+            "return constant - float(gain.max()) < least - STEP_GAIN",
+            "return constant - float(gain.max()) > least - STEP_GAIN",
         ),
     ),
     # The level of observed light curves, and the search.
     "norms that end with their template": (
         "test_level_norms_and_covariances_are_those_of_the_matrices",
-        ('total = np.einsum("jo,jo->o", state, self._forms[last, after] @ state)', "total = 0.0"),
+        ('total = np.einsum("jo,jo->o", state, (units / self._d[later, None]).T @ units @ state)', "total = 0.0"),
     ),
     "statistics of a known level": (
         "test_statistics_have_unit_variance_over_gaps_and_changing_noise[process0-300-0.05-0.02-0-at-once]",
-        ("_correlated(held, shape, first)[peaks] ** 2 / level.sum()", "0.0 * _correlated(held, shape, first)[peaks]"),
+        (
+            "_correlate(on_grid, shape, first)[peaks] ** 2 / level.sum()",
+            "0.0 * _correlate(on_grid, shape, first)[peaks]",
+        ),
     ),
     "a level without its process": (
         "test_level_norms_and_covariances_are_those_of_the_matrices",
-        ("held - self._noise[:, None] * self._covariance.solve(held) + mean", "0.0 * held + mean"),
+        ("process = residual - self._noise[:, None] * self._covariance.solve(residual)", "process = 0.0 * residual"),
     ),
     "a level with the stated errors": (
         "test_level_norms_and_covariances_are_those_of_the_matrices",
@@ -412,7 +415,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "means that scatter like frames": (
         "test_tables_of_default_questions_are_unchanged[analyse-rotating]",
-        ("scipy.stats.chi2.ppf(p, dof) / dof / size", "scipy.stats.chi2.ppf(p, dof) / dof"),
+        ("scipy.stats.chi2.ppf([0.025, 0.975], dof) / dof / size", "scipy.stats.chi2.ppf([0.025, 0.975], dof) / dof"),
     ),
     "means over gaps": (
         "test_tables_of_default_questions_are_unchanged[analyse-rotating]",

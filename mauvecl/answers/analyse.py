@@ -452,8 +452,8 @@ class AnalyseAnswer(Answer):
     def rows(self) -> list[EventRow]:
         """Events in order of time."""
         analysis = self.analysis
-        columns = analysis.events, analysis.found, analysis.fitted
-        return [EventRow(analysis, *values) for values in zip(*columns, strict=True)]
+        columns = zip(analysis.events, analysis.event_spectra, analysis.measurements, strict=True)
+        return [EventRow(analysis, *values) for values in columns]
 
     @property
     def json_tables(self) -> dict[str, Table]:
@@ -467,7 +467,7 @@ class AnalyseAnswer(Answer):
         number, undetected = verdicts.count("detected"), len(verdicts) - verdicts.count("detected")
         flares = f"{number} flare{' is' if number == 1 else 's are'}" if number else "No flare is"
         more = f", and {undetected} more event{'' if undetected == 1 else 's'} listed" if undetected else ""
-        expected = self.analysis.wanted * self.analysis.days
+        expected = self.analysis.rate * self.analysis.days
         return (
             f"{flares} detected in {self.analysis.days:.3g} star-days of {self.analysis.frames.name}, where "
             f"{expected:.2g} are expected from noise alone{more}."
@@ -477,7 +477,7 @@ class AnalyseAnswer(Answer):
     def views(self) -> list[View]:
         analysis = self.analysis
         where = f"in {analysis.days:.3g} star-days of {analysis.frames.name}"
-        rate = f"{analysis.wanted:.3g} false alarms per star-day"
+        rate = f"{analysis.rate:.3g} false alarms per star-day"
         if not analysis.events:
             return [View(f"Nothing above {analysis.candidates:.2f} {where} ({rate})."), *super().views]
         title = (
@@ -534,7 +534,7 @@ def analyse(
 
     report(0.0)
     analysis = analyse_frames(
-        frames, wanted=search.rate, shape=search.shape, seed=study.run.seed,
+        frames, rate=search.rate, shape=search.shape, seed=study.run.seed,
         model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=search.spreads() or None,
         temperature_k=study.flare.temperature_k, report=report,
     )  # fmt: skip

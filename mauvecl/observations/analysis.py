@@ -63,8 +63,8 @@ class InjectionCompleteness:
     def limit(self, width: int, power: float = POWER) -> float:
         """Return the equivalent duration of flares that are detected with a probability; NaN if none is."""
         shares = np.maximum.accumulate(self.detected[width]) / self.injected
-        found = size_at(self.equivalent_durations_s[width], shares, power)
-        return found if np.isfinite(found) else float("nan")
+        size = size_at(self.equivalent_durations_s[width], shares, power)
+        return size if np.isfinite(size) else float("nan")
 
 
 def inject(
@@ -75,42 +75,42 @@ def inject(
 
     They are injected into `free` frames, which belong to no event; the others are left out. `steps` reports each width.
     """
-    every = np.flatnonzero(free)
+    free_frames = np.flatnonzero(free)
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
     bank, frame_s = survey.bank, survey.stare.frame_s
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
     kelvin = survey.templates.nearest(temperature_k)
     direction = survey.templates.directions[kelvin]
     # Photon noise of a flare of unit amplitude.
-    own_noise = np.linalg.cholesky(survey.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
+    photon_noise = np.linalg.cholesky(survey.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
     size_of = float(np.linalg.norm(direction))
     durations = np.zeros((WIDTHS, SIZES))
     detected = np.zeros((WIDTHS, SIZES), np.int64)
-    for w, width in steps.each(enumerate(widths), WIDTHS):
-        if w == 0 or every.size > MAX_FRAMES:
+    for w, width in steps.track(enumerate(widths.tolist()), WIDTHS):
+        if w == 0 or free_frames.size > MAX_FRAMES:
             # Part of a long light curve, another one for each half-width.
-            start = int(rng.integers(max(every.size - MAX_FRAMES, 0) + 1))
-            kept = np.zeros(free.size, np.bool_)
-            kept[every[start : start + MAX_FRAMES]] = True
-            part = survey.frames(kept)
-        edges = np.column_stack([part.stare.start_s, part.stare.start_s + frame_s])
-        power = size_of * _power(part, float(width))
-        amplitudes = threshold / power * np.geomspace(*RANGE, SIZES)
+            start = int(rng.integers(max(free_frames.size - MAX_FRAMES, 0) + 1))
+            chosen = np.zeros(free.size, np.bool_)
+            chosen[free_frames[start : start + MAX_FRAMES]] = True
+            segment = survey.frames(chosen)
+        starts = segment.stare.start_s
+        edges = np.column_stack([starts, starts + frame_s])
+        amplitudes = threshold / (size_of * _typical_snr(segment, width)) * np.geomspace(*RANGE, SIZES)
         durations[w] = amplitudes * width * bank.shape.equivalent_duration
         for first in range(0, TIMES, BATCH):
             count = min(BATCH, TIMES - first)
-            peaks = part.stare.start_s[rng.integers(part.stare.n_frames, size=count)] + frame_s * rng.random(count)
-            shapes = np.array([bank.shape.mean_over(edges, peak, float(width)) for peak in peaks])
+            peaks = starts[rng.integers(starts.size, size=count)] + frame_s * rng.random(count)
+            shapes = np.array([bank.shape.mean_over(edges, peak, width) for peak in peaks])
             # The photon noise of the flare itself is added to that of the frames.
-            drawn = rng.standard_normal((*shapes.shape, direction.size)) @ own_noise.T
-            drawn *= np.sqrt(np.maximum(shapes, 0.0))[:, :, None]
-            best = _largest_near(part, peaks, float(width), amplitudes, shapes[:, :, None] * direction, drawn)
+            noise = rng.standard_normal((*shapes.shape, direction.size)) @ photon_noise.T
+            noise *= np.sqrt(np.maximum(shapes, 0.0))[:, :, None]
+            best = _largest_near(segment, peaks, width, amplitudes, shapes[:, :, None] * direction, noise)
             detected[w] += (best >= threshold).sum(axis=1)
     return InjectionCompleteness(widths, durations, detected, TIMES)
 
 
 def _largest_near(
-    part: SeriesSurvey, peaks: Float, width: float, amplitudes: Float, flares: Float, noise: Float
+    survey: SeriesSurvey, peaks: Float, width: float, amplitudes: Float, flares: Float, noise: Float
 ) -> Float:
     """Return the largest statistic near each flare that is added with its noise, shape (n_amplitude, n_flare).
 
@@ -119,22 +119,24 @@ def _largest_near(
     """
     count, size = peaks.size, amplitudes[:, None, None]
     best = np.full((amplitudes.size, count), -np.inf)
-    for row, rho in part.search.values(np.concatenate([part.sums[None], flares, noise])):
-        at = part.search.peaks_s(row)
-        tried = (row.per_amplitude > 0).any(axis=0)
+    for row, rho in survey.search.values(np.concatenate([survey.sums[None], flares, noise])):
+        times = survey.search.peaks_s(row)
+        searched = (row.per_amplitude > 0).any(axis=0)
         for k, peak in enumerate(peaks):
-            near = tried & (np.abs(at - peak) <= 2 * (width + part.stare.frame_s) + row.template.half_width_s)
+            reach = 2 * (width + survey.stare.frame_s) + row.template.half_width_s
+            near = searched & (np.abs(times - peak) <= reach)
             if near.any():
-                quiet, flare, own = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
-                best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * own).max((1, 2)))
+                quiet, flare, flare_noise = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
+                total = quiet + size * flare + np.sqrt(size) * flare_noise
+                best[:, k] = np.maximum(best[:, k], total.max((1, 2)))
     return best
 
 
-def _power(part: SeriesSurvey, width: float) -> float:
+def _typical_snr(survey: SeriesSurvey, width: float) -> float:
     """Return the typical S/N of a flare of a half-width whose peak is one standard deviation of a frame."""
-    row = min(part.search.rows, key=lambda one: abs(np.log(one.template.half_width_s / width)))
-    tried = row.per_amplitude[row.per_amplitude > 0]
-    typical = float(np.median(tried)) if tried.size else 1.0
+    row = min(survey.search.rows, key=lambda row: abs(np.log(row.template.half_width_s / width)))
+    searched = row.per_amplitude[row.per_amplitude > 0]
+    typical = float(np.median(searched)) if searched.size else 1.0
     return typical * float(np.sqrt(width / row.template.half_width_s))
 
 
@@ -162,10 +164,10 @@ class Analysis:
     flux: Float  # shape (n_frame,); the light curve that was searched; for spectra, the sum over wavelength
     level: QuiescentLevel
     survey: SeriesSurvey
-    wanted: float  # wanted false alarms per star-day
+    rate: float  # largest rate of false alarms per star-day at which an event is detected
     modelled: SimulatedRate  # false-alarm rate in light curves of the fitted process
     measured: SimulatedRate  # the same with residuals resampled from quiescent frames
-    threshold: float  # threshold for the wanted rate: the higher of the thresholds of both
+    threshold: float  # threshold for this rate: the higher of the thresholds of both
     candidates: float  # threshold for candidates
     dip: float  # statistic of the largest dip, which is the threshold if it is too large for the noise
     events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
@@ -175,8 +177,8 @@ class Analysis:
     quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals
     likeness: Likeness  # of the residuals and independent noise
     spectra: SpectralSeries | None  # if they are searched with weights for flares
-    found: list[EventSpectrum | None]  # of these, those of the events, in their order
-    fitted: list[Measurement | str]  # flares fitted to these, or the reasons why none are
+    event_spectra: list[EventSpectrum | None]  # of these, those of the events, in their order
+    measurements: list[Measurement | str]  # flares fitted to these, or the reasons why none are
 
     @property
     def days(self) -> float:
@@ -193,8 +195,8 @@ class Analysis:
     def inside(self) -> NDArray[np.bool_]:
         """Searched frames in events."""
         inside = np.zeros(self.survey.stare.n_frames, np.bool_)
-        for one in self.events:
-            inside[one.first : one.last + 1] = True
+        for event in self.events:
+            inside[event.first : event.last + 1] = True
         return inside
 
     @property
@@ -205,7 +207,7 @@ class Analysis:
     @property
     def crowded(self) -> bool:
         """True if most frames of a long light curve are in events, so that too few show the star without them."""
-        longest = max((one.half_width_s for one in self.events), default=0.0)
+        longest = max((event.half_width_s for event in self.events), default=0.0)
         many = len(self.events) > MOST_EVENTS and self.in_events > MOST_IN_EVENTS
         return many and self.survey.stare.duration_s > min(LONG * longest, LONG_S)
 
@@ -264,7 +266,7 @@ class Analysis:
             yield f"The scatter of quiescent frames is {excess}; the measured scatter is used."
 
     def _level_messages(self) -> Iterator[str]:
-        """Yield messages on changes of the light that are no flares."""
+        """Yield messages on changes of the light that are not flares."""
         if self.light_misleads:
             yield (
                 "The throughput changes, as by pointing losses; short changes may resemble flares: "
@@ -286,16 +288,20 @@ class Analysis:
                 f"{100 * spread:.2g} %, by {terms}."
             )
         if self.spectra is not None and self.dark_misleads:
-            series, known = self.spectra, self.spectra.cleaned.model.star_is_known
+            series = self.spectra
+            if series.cleaned.model.star_is_known:
+                reference = "relative to the light of the star by the shape of its spectrum"
+            else:
+                reference = (
+                    "stated only if the star is named: its spectrum distinguishes its light from the dark current"
+                )
             yield (
                 f"The dark current changes the sum over wavelength by {series.dark_drift:.2g} times its level, as in a "
-                "detector whose temperature changes: peaks are not stated, and equivalent durations "
-                + ("are relative to the light of the star by the shape of its spectrum." if known
-                   else "only where the star is named, whose spectrum distinguishes its light from the dark current.")
-            )  # fmt: skip
+                f"detector whose temperature changes: peaks are not stated, and equivalent durations are {reference}."
+            )
 
     def _verdict_messages(self) -> Iterator[str]:
-        """Yield messages on why events have no verdict or another threshold than the wanted one."""
+        """Yield messages on why events have no verdict or another threshold than that of the rate of false alarms."""
         if not self.likeness.alike:
             clearest = int(np.argmax(self.likeness.excess))
             yield (
@@ -309,7 +315,7 @@ class Analysis:
                 f"The light falls suddenly, as by losses of light, with an S/N of {self.dip:.3g}: rises of that size "
                 "may be returns from a loss, and only larger ones are called detected."
             )
-        if self.wanted < self.measured.smallest:
+        if self.rate < self.measured.smallest:
             yield (
                 f"Simulated light curves show rates down to {self.measured.smallest:.2g} false alarms per star-day; "
                 "the threshold for fewer is extrapolated with the tail of their noise."
@@ -319,7 +325,7 @@ class Analysis:
 def analyse_frames(
     frames: Frames,
     *,
-    wanted: float = 1.0,
+    rate: float = 1.0,
     shape: str = "davenport2014",
     seed: int = 1,
     model: FrameModel | None = None,
@@ -330,69 +336,71 @@ def analyse_frames(
 ) -> Analysis:
     """Find the flares in observed frames.
 
-    The `wanted` rate is that of false alarms per star-day. The `model` is that of the pixels of spectra, which are
+    The `rate` is that of false alarms per star-day. The `model` is that of the pixels of spectra, which are
     searched as their sum over wavelength without it; `rank` is the largest number of weighted sums. `jitters`, standard
     deviations of light, dark current and sky from frame to frame, are infinite for those that the search leaves out; by
     default the light, and the dark current as measured. The temperature is that of injected flares in spectra. `report`
     is called with the share of the work that is done, and may raise to stop the work.
     """
-    parts = (Steps(report).part(first, last) for first, last in pairwise(STAGES))
-    level_steps, rate_steps, search_steps, event_steps, injection_steps = parts
+    stages = (Steps(report).part(first, last) for first, last in pairwise(STAGES))
+    level_steps, rate_steps, search_steps, event_steps, injection_steps = stages
     series: SpectralSeries | None = None
     if model is None:
         survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
     else:
         survey, series, level = survey_spectra(frames, model, shape_of(shape), rank, seed, jitters, level_steps)
         frames = series.cleaned.frames
-    rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], wanted, seed, rate_steps)
-    detected, taken = detect_events(survey, candidates, search_steps)
-    seen = [None if series is None else event_spectrum(survey, series, taken, one) for one in detected]
-    causes: list[Kind] = ["flare" if one is None else one.cause for one in seen]
-    events = measure_events(survey, taken, detected, causes, event_steps)
-    fitted = [
-        _fitted(survey, series, taken, event.kind, one) for event, one in zip(events, detected, strict=True)
-    ]  # fmt: skip
-    quiet = ~taken
+    rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], rate, seed, rate_steps)
+    detected, in_events = detect_events(survey, candidates, search_steps)
+    spectra = [None if series is None else event_spectrum(survey, series, in_events, event) for event in detected]
+    causes: list[Kind] = ["flare" if spectrum is None else spectrum.cause for spectrum in spectra]
+    events = measure_events(survey, in_events, detected, causes, event_steps)
+    measurements = [
+        _flare_of_event(survey, series, in_events, measured.kind, event)
+        for measured, event in zip(events, detected, strict=True)
+    ]
+    quiet = ~in_events
     residual = innovations(survey, quiet)
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
     numbers = survey.stare.numbers[quiet]
     return Analysis(
-        frames, frames.white_light[0], level, survey, wanted, *rates,
+        frames, frames.white_light[0], level, survey, rate, *rates,
         threshold=threshold, candidates=candidates, dip=dip, events=events,
         completeness=inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
         scatter=binned_scatter(numbers, residual @ middle), residual=residual, quiet=quiet,
-        likeness=likeness(numbers, residual), spectra=series, found=seen, fitted=fitted,
+        likeness=likeness(numbers, residual), spectra=series, event_spectra=spectra, measurements=measurements,
     )  # fmt: skip
 
 
-def _fitted(
-    survey: SeriesSurvey, series: SpectralSeries | None, taken: Bool, kind: Kind, event: DetectedEvent
+def _flare_of_event(
+    survey: SeriesSurvey, series: SpectralSeries | None, in_events: Bool, kind: Kind, event: DetectedEvent
 ) -> Measurement | str:
     """Return the flare that is fitted to the spectrum of an event, or the reason why none is."""
     if series is None:
         return "no spectra of the instrument are given"
-    return measure_flare(survey, series, taken, event) if kind == "flare" else f"its kind is {kind}"
+    return measure_flare(survey, series, in_events, event) if kind == "flare" else f"its kind is {kind}"
 
 
 def _thresholds(
-    survey: SeriesSurvey, quiet: NDArray[np.bool_], wanted: float, seed: int, steps: Steps
+    survey: SeriesSurvey, quiet: NDArray[np.bool_], rate: float, seed: int, steps: Steps
 ) -> tuple[tuple[SimulatedRate, SimulatedRate], float, float, float]:
     """Return simulated rates of false alarms, the thresholds of events and of candidates, and the largest dip.
 
     Quiescent frames are searched upside down, in both directions of time, for dips that begin or end suddenly. Losses
     of light have larger dips than noise; those below `candidates` may be missed.
     """
-    rates = simulated_rates(survey, quiet, wanted, seed, steps)
-    threshold, candidates = (max(one.threshold(each) for one in rates) for each in (wanted, max(wanted, CANDIDATES)))
+    simulated = simulated_rates(survey, quiet, rate, seed, steps)
+    threshold, candidates = (
+        max(alarms.threshold(allowed) for alarms in simulated) for allowed in (rate, max(rate, CANDIDATES))
+    )
     down = survey.frames(quiet).inverted()
     start = down.stare.start_s
     stare = replace(down.stare, start_s=start[-1] + start[0] - start[::-1])
     back = replace(down, stare=stare, sums=down.sums[::-1], variance=down.variance[::-1])
-    values = (one.search.values(one.sums[None], candidates) for one in (down, back))
-    dip = max(float(rho.max(initial=-np.inf)) for found in values for _, rho in found)
-    if -np.expm1(-max(one.rate(dip) for one in rates) * survey.stare.observed_s / DAY_S) < CHANCE_DIP:
-        threshold = max(threshold, dip)
-    return rates, threshold, candidates, dip
+    values = (inverted.search.values(inverted.sums[None], candidates) for inverted in (down, back))
+    dip = max(float(rho.max(initial=-np.inf)) for rows in values for _, rho in rows)
+    chance = -np.expm1(-max(alarms.rate(dip) for alarms in simulated) * survey.stare.observed_s / DAY_S)
+    return simulated, max(threshold, dip) if chance < CHANCE_DIP else threshold, candidates, dip
 
 
 def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
@@ -412,7 +420,7 @@ def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
             f"{ratio.min():.2f} to {ratio.max():.2f} times it."
         )
     if changes := spectra.changes:
-        largest = max(changes, key=lambda one: abs(one.change))
+        largest = max(changes, key=lambda change: abs(change.change))
         times = "once" if len(changes) == 1 else f"{len(changes)} times"
         yield (
             f"The light that all pixels share changes suddenly {times}, by up to {100 * abs(largest.change):.2g} %, as "
@@ -423,10 +431,10 @@ def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
             size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
             yield f"The {CAUSES[name]} of single frames changes: {size}, which the search marginalises over."
         elif name == "light":
-            left = f"{100 * spectra.snr_kept:.2g} %"
             yield (
                 "The level of each frame is free in the search, because pointing losses change it: flares keep "
-                f"{left} of their S/N; search.frame.light states its standard deviation instead (1e-6: steady)."
+                f"{100 * spectra.snr_kept:.2g} % of their S/N; "
+                "search.frame.light states its standard deviation instead (1e-6: steady)."
             )
         else:
             yield f"The search leaves out all changes of the {CAUSES[name]} of single frames."

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
+from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape, consecutive_integrals
@@ -51,20 +52,19 @@ GENERAL_WEIGHT = 0.5
 
 @dataclass(frozen=True)
 class Half(Integrable):
-    """Rise of a flare that ends at the peak, or decay that begins there."""
+    """Rise of a flare that ends at the peak, or decay that begins there.
 
-    integral: Callable[[Float], Float]  # up to a time before the peak, or from a time after the peak on
+    Integrals are those up to a time before the peak and from a time after it, which is all that callers need.
+    """
+
+    integral: Callable[[Float], Float]
     decays: bool = False
 
     def before(self, tau: ArrayLike) -> Float:
-        return self._from_peak(np.maximum(tau, 0.0)) if self.decays else self.integral(np.minimum(tau, 0.0))
+        return np.zeros(np.shape(tau)) if self.decays else self.integral(np.asarray(tau))
 
     def after(self, tau: ArrayLike) -> Float:
-        return self.integral(np.maximum(tau, 0.0)) if self.decays else self._from_peak(np.minimum(tau, 0.0))
-
-    def _from_peak(self, tau: Float) -> Float:
-        """Return the integral between the peak and tau."""
-        return self.integral(np.zeros(())) - self.integral(tau) if tau.any() else np.zeros(tau.shape)
+        return self.integral(np.asarray(tau)) if self.decays else np.zeros(np.shape(tau))
 
 
 def _exponential(rate: float) -> Half:
@@ -115,19 +115,16 @@ class Family:
         rises = [Half(SHAPES["davenport2014"].before), *(Half(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES)]
         gaussian = Half(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
-        # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points,
-        # whose barycentric weights are known (Berrut & Trefethen 2004, doi:10.1137/S0036144502417715, equation 5.4);
-        # scipy would compute them with the points in a random order, which changes the last bits.
-        middle, half = np.log(SLOW_RATES[[0, -1]].prod()) / 2, np.log(SLOW_RATES[-1] / SLOW_RATES[0]) / 2
-        points = middle + half * np.cos(np.pi * np.arange(EXPONENTIALS) / (EXPONENTIALS - 1))
-        barycentric = (-1.0) ** np.arange(EXPONENTIALS)
-        barycentric[[0, -1]] /= 2
-        interpolate = scipy.interpolate.BarycentricInterpolator(points, np.eye(EXPONENTIALS), wi=barycentric)
-        slow, interpolated = [_exponential(float(rate)) for rate in np.exp(points)], interpolate(np.log(SLOW_RATES))
+        # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
+        low, high = np.log(SLOW_RATES[[0, -1]])
+        points, degree = chebyshev.chebpts2(EXPONENTIALS), EXPONENTIALS - 1
+        slow = [_exponential(rate) for rate in np.exp(low + (high - low) * (points + 1) / 2).tolist()]
+        places = 2 * (np.log(SLOW_RATES) - low) / (high - low) - 1
+        interpolated = chebyshev.chebvander(places, degree) @ np.linalg.inv(chebyshev.chebvander(points, degree))
         # Each share has the same weight: without a slow decay, its rate does not matter.
         share = np.append(0.0, np.repeat(SLOW_SHARES, SLOW_RATES.size))
         rates = np.where(share == 0, 1.0, 1 / SLOW_RATES.size)
-        decays = share[:, None] * np.vstack([interpolated[:1], *[interpolated] * len(SLOW_SHARES)])
+        decays = np.vstack([np.zeros((1, EXPONENTIALS)), *(share * interpolated for share in SLOW_SHARES)])
         rise, start, decay = np.indices((len(rises), len(fast), share.size)).reshape(3, -1)
         starts = np.eye(len(fast))[start] * (1.0 - share[decay, None])
         weights = np.hstack([np.eye(len(rises))[rise], starts, decays[decay]])
@@ -136,8 +133,8 @@ class Family:
 
     def shape(self, k: int) -> WeightedSum:
         """Return one of the shapes."""
-        return WeightedSum(self.name, tuple((float(w), part) for w, part in zip(self.weights[k], self.parts,
-                                                                                 strict=True) if w))  # fmt: skip
+        pairs = zip(self.weights[k].tolist(), self.parts, strict=True)
+        return WeightedSum(self.name, tuple((weight, part) for weight, part in pairs if weight))
 
 
 Profile = Shape | WeightedSum
@@ -150,6 +147,8 @@ FLOOR = 0.1
 MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
 #: Bins outside are shorter than this share of the shortest time scale of the process.
 SHORT = 0.2
+#: First range of the peak, in half-widths of the template, and factor on the half-width.
+PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
 #: Number of frames on each side of an event that are fitted with it, and the same in lengths of the event: the level of
 #: further ones would lower the variance of its sum by 1 % at most in independent noise, and less in that of a process.
 WINDOW_FRAMES, WINDOW_LENGTHS = 2**15, 100
@@ -170,7 +169,7 @@ class Window:
     """Bins of consecutive frames around an event, with sums along the direction of its template."""
 
     survey: SeriesSurvey
-    one: DetectedEvent
+    event: DetectedEvent
     edges: Float  # shape (n, 2); start and end of each bin
     values: Float  # shape (n,)
     noise: Float  # shape (n,); variance of the mean of each bin's frames
@@ -181,45 +180,41 @@ class Window:
     quiet_level: float = 1.0  # of the star at the peak, by the frames without events, in units of the survey's level
 
     @classmethod
-    def of(cls, survey: SeriesSurvey, taken: Bool, one: DetectedEvent, direction: int | None = None) -> Window:
+    def of(cls, survey: SeriesSurvey, in_events: Bool, event: DetectedEvent, direction: int | None = None) -> Window:
         """Collect the frames of an event, and those around it that belong to no event."""
-        direction = one.direction if direction is None else direction
+        direction = event.direction if direction is None else direction
         unit = survey.bank.directions[direction]
         row = survey.templates.chosen[direction]
         scale = float(np.linalg.norm(survey.templates.directions[row]))
         photon = float(unit @ survey.templates.noise[row] @ unit)
-        excess = float(unit**2 @ np.array([p.excess for p in survey.processes]) ** 2)
+        excess = float(unit**2 @ np.array([process.excess for process in survey.processes]) ** 2)
         frame_s = survey.stare.frame_s
-        peak = one.peak_s / frame_s
         # Only frames near the event, so that the time does not depend on the length of the light curve.
-        reach = max(WINDOW_FRAMES, WINDOW_LENGTHS * (one.last - one.first + 1))
-        low = max(0, one.first - reach)
-        near = slice(low, one.last + 1 + reach)
-        numbers, along, variance = survey.stare.numbers[near], survey.sums[near] @ unit, survey.variance[near]
-        begin, end = one.first - low, one.last - low
-        inside = np.zeros(along.size, np.bool_)
-        inside[begin : end + 1] = True
-        at = np.flatnonzero(inside | ~taken[near])
-        distance = np.abs(numbers[at] - peak)
-        length = numbers[end] - numbers[begin] + 1
+        reach = max(WINDOW_FRAMES, WINDOW_LENGTHS * (event.last - event.first + 1))
+        frames = np.arange(max(0, event.first - reach), min(event.last + 1 + reach, in_events.size))
+        inside = (frames >= event.first) & (frames <= event.last)
+        chosen = inside | ~in_events[frames]
+        frames, inside = frames[chosen], inside[chosen]
+        numbers, (begin, end) = survey.stare.numbers[frames], survey.stare.numbers[[event.first, event.last]]
+        # Distance from the event in frames; its peak may be outside of it.
+        peak = event.peak_s / frame_s
+        distance = np.abs(numbers - peak) - np.where(numbers > peak, end - peak, peak - begin)
         shortest = min(process.shortest_s for process in survey.processes)
-        ends = np.where(numbers[at] > peak, distance - (numbers[end] - peak), distance - (peak - numbers[begin]))
-        outer = np.clip(np.maximum(ends, 0.0) / GROWTH, 1.0, max(1.0, SHORT * shortest / frame_s))
-        size = np.where(inside[at], np.ceil(length / MAX_INSIDE), np.floor(outer))
-        first = _bins(numbers[at], size, inside[at])
-        count = np.diff(np.append(first, at.size))
-        is_inside = inside[at][first]
+        outer = np.clip(np.maximum(distance, 0.0) / GROWTH, 1.0, max(1.0, SHORT * shortest / frame_s))
+        size = np.where(inside, np.ceil((end - begin + 1) / MAX_INSIDE), np.floor(outer))
+        first = _bins(numbers, size, inside)
+        count = np.diff(np.append(first, frames.size))
+        is_inside = inside[first]
         # As the start of the next frame, to the bit.
-        start, stop = numbers[at[first]] * frame_s, (numbers[at[first + count - 1]] + 1) * frame_s
-        mean = np.add.reduceat(along[at], first) / count
-        noise = np.add.reduceat(variance[at] * excess, first) / count**2
-        # The nearest bins on each side are kept.
-        before = np.flatnonzero(~is_inside & (stop <= survey.stare.start_s[one.first] + frame_s / 2))
-        after = np.flatnonzero(~is_inside & (start >= survey.stare.start_s[one.last] + frame_s / 2))
-        kept = np.sort(np.concatenate([before[-MAX_OUTSIDE:], np.flatnonzero(is_inside), after[:MAX_OUTSIDE]]))
+        start, stop = numbers[first] * frame_s, (numbers[first + count - 1] + 1) * frame_s
+        mean = np.add.reduceat(survey.sums[frames] @ unit, first) / count
+        noise = np.add.reduceat(survey.variance[frames] * excess, first) / count**2
+        # The nearest bins on each side.
+        rows = np.flatnonzero(is_inside)
+        nearest = slice(max(rows[0] - MAX_OUTSIDE, 0), rows[-1] + 1 + MAX_OUTSIDE)
         return cls(
-            survey, one, np.column_stack([start, stop])[kept], mean[kept], noise[kept], count[kept], is_inside[kept],
-            scale, photon,
+            survey, event, np.column_stack([start, stop])[nearest], mean[nearest], noise[nearest], count[nearest],
+            is_inside[nearest], scale, photon,
         )  # fmt: skip
 
     @cached_property
@@ -230,21 +225,21 @@ class Window:
     @cached_property
     def process(self) -> Float:
         """Covariance of the level in the bins, shape (n, n)."""
-        unit = self.survey.bank.directions[self.one.direction]
+        unit = self.survey.bank.directions[self.event.direction]
         lags = self.middle[:, None] - self.middle
-        parts = zip(unit, self.survey.processes, strict=True)
-        return np.asarray(sum(weight**2 * process.at(lags) for weight, process in parts))
+        pairs = zip(unit, self.survey.processes, strict=True)
+        return np.asarray(sum(weight**2 * process.at(lags) for weight, process in pairs))
 
-    def model(self, shape: Integrable, peak_s: Float, half_width_s: Float) -> Float:
+    def model(self, shape: Integrable, peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
         """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
         return np.asarray(self.models((shape,), peak_s, half_width_s)[0])
 
-    def models(self, parts: Sequence[Integrable], peak_s: Float, half_width_s: Float) -> Float:
+    def models(self, parts: Sequence[Integrable], peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
         """Return the mean of several parts of shapes in the bins, in the unit of the values, (n_part, n_shape, n)."""
         times, place = self._times
-        peak, width = (np.atleast_1d(one)[:, None] for one in (peak_s, half_width_s))
+        peak, width = (np.atleast_1d(values)[:, None] for values in (peak_s, half_width_s))
         tau = (times - peak) / width
-        # Integrals from the peak. Each side is computed by itself: this dominates the time of a fit.
+        # Integrals from the peak. Each side is computed separately: this dominates the time of a fit.
         early = tau < 0
         before, after = tau[early], tau[~early]
         per_amplitude = self.scale * width / np.diff(self.edges)[:, 0]
@@ -256,6 +251,25 @@ class Window:
             np.maximum(integral[:, place[1]] - integral[:, place[0]], 0.0, out=mean)
             mean *= per_amplitude
         return light
+
+    @cached_property
+    def ranges(self) -> Float:
+        """Largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2).
+
+        A gap before the event may hold the peak, at most as long before as the event lasts.
+        """
+        event, survey = self.event, self.survey
+        frame_s = survey.stare.frame_s
+        first_s, last_s = survey.stare.start_s[event.first], survey.stare.start_s[event.last] + frame_s
+        low, high = event.peak_s - PEAK_RANGE * event.half_width_s, event.peak_s + PEAK_RANGE * event.half_width_s
+        before_s = float(survey.stare.start_s[event.first - 1]) + frame_s if event.first else -np.inf
+        low = min(low, max(first_s - max(4 * event.half_width_s, last_s - first_s), before_s))
+        high = min(max(high, low + frame_s), last_s)
+        widest = max(survey.bank.half_widths_s[-1], event.half_width_s) * 3
+        if low < first_s - frame_s:
+            widest = max(widest, last_s - first_s)
+        width = (max(event.half_width_s / WIDTH_RANGE, 0.2 * frame_s), min(event.half_width_s * WIDTH_RANGE, widest))
+        return np.array([[low, high], np.log(width)])
 
     @cached_property
     def _times(self) -> tuple[Float, NDArray[np.intp]]:
@@ -281,10 +295,11 @@ class Likelihood:
 
     window: Window
     inverse: Float  # shape (n, n)
+    root: Float  # shape (n, n); the inverse is root^T root
     log_factor: float  # of the likelihood, without the constant
     # Of the integral of the departures of the flares from their shape, in amplitude x s.
-    toward: Float  # shape (n,); weights of the values in it
-    left: float  # its variance given the values
+    departure: Float  # shape (n,); weights of the values in it
+    departure_variance: float  # its variance given the values
     # Weights of the values in the level of the star at the peak, and its variance with a known flare, relative to the
     # level; zero where the values are not its light.
     level: Float  # shape (n,)
@@ -296,40 +311,40 @@ class Likelihood:
         n = window.values.size
         covariance = window.process + np.diag(window.noise)
         shared, variance = np.zeros(n), 0.0
-        for one in flares:
-            light = one.amplitude * window.model(shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+        lengths = np.diff(window.edges)[:, 0]
+        for flare in flares:
+            light = flare.amplitude * window.model(shape, flare.peak_s, flare.half_width_s)[0]
             covariance += np.diag(window.photon * light / window.scale / window.frames)
             if epsilon:
-                light = light + _floor(window.middle, one) * window.scale
-                cells, cell_light = _unobserved(window, one, shape)
-                place = log_time(window.middle, one)
-                elsewhere = log_time(cells, one)
-                near = np.exp(-np.abs(place[:, None] - place) / LOG_TIME)
-                covariance += epsilon**2 * light[:, None] * light * near
-                lengths = window.edges[:, 1] - window.edges[:, 0]
-                whole = np.concatenate([light / window.scale * lengths, cell_light])
-                every = np.concatenate([place, elsewhere])
-                shared += epsilon**2 * light * (np.exp(-np.abs(place[:, None] - every) / LOG_TIME) @ whole)
-                variance += epsilon**2 * float(whole @ np.exp(-np.abs(every[:, None] - every) / LOG_TIME) @ whole)
+                light = light + _floor(window.middle, flare) * window.scale
+                unobserved, unobserved_light = _unobserved(window, flare, shape)
+                place = log_time(window.middle, flare)
+                places = np.concatenate([place, log_time(unobserved, flare)])
+                integrals = np.concatenate([light / window.scale * lengths, unobserved_light])
+                correlation = epsilon**2 * np.exp(-np.abs(places[:, None] - places) / LOG_TIME)
+                covariance += correlation[:n, :n] * light[:, None] * light
+                shared += light * (correlation[:n] @ integrals)
+                variance += float(integrals @ correlation @ integrals)
         factor = scipy.linalg.cholesky(covariance, lower=True)
-        # LAPACK's inverse from a factor, in half the time of a solution for each column; it leaves the upper half.
-        lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])
-        inverse = lower + np.tril(lower, -1).T
-        ones = inverse.sum(axis=1)
-        total = float(ones.sum())
+        root = scipy.linalg.lapack.dtrtri(factor, lower=True)[0]
+        inverse = root.T @ root
+        sums = inverse.sum(axis=1)
+        total = float(sums.sum())
         level, level_variance = np.zeros(n), 0.0
         if len(window.survey.bank.directions) == 1:
-            at = int(np.argmin(np.abs(window.middle - window.one.peak_s)))
-            by_values = inverse @ window.process[at]
-            rest = 1.0 - float(window.process[at] @ ones)
-            level = (by_values + rest * ones / total) / window.scale
-            known = float(window.process[at, at] - window.process[at] @ by_values) + rest**2 / total
-            level_variance = max(known, 0.0) / window.scale**2
-        inverse = inverse - ones[:, None] * ones / total
+            peak_bin = int(np.argmin(np.abs(window.middle - window.event.peak_s)))
+            of_process = window.process[peak_bin]
+            weights = inverse @ of_process
+            constant = 1.0 - float(of_process @ sums)
+            level = (weights + constant * sums / total) / window.scale
+            level_variance = float(of_process[peak_bin] - of_process @ weights) + constant**2 / total
+            level_variance = max(level_variance, 0.0) / window.scale**2
+        inverse = inverse - sums[:, None] * sums / total
+        root = root - root.sum(axis=1)[:, None] * sums / total
         log_factor = -float(np.log(np.diag(factor)).sum()) - 0.5 * float(np.log(total))
-        toward = inverse @ shared
-        left = max(variance - float(toward @ shared), 0.0)
-        return cls(window, inverse, log_factor, toward, left, level, level_variance)
+        departure = inverse @ shared
+        departure_variance = max(variance - float(departure @ shared), 0.0)
+        return cls(window, inverse, root, log_factor, departure, departure_variance, level, level_variance)
 
     def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
         """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).
@@ -342,14 +357,14 @@ class Likelihood:
         largest = parts.max(axis=(0, 1))
         bright = largest >= DARK * largest.max()
         parts, inverse = parts[:, :, bright], self.inverse[bright]
-        toward, inverse = inverse @ values, inverse[:, bright]
+        weighted_values, inverse = inverse @ values, inverse[:, bright]
         weighted = (parts.reshape(-1, len(inverse)) @ inverse).reshape(parts.shape)
         gram = weighted.transpose(1, 0, 2) @ parts.transpose(1, 2, 0)
         information = pairs @ gram.reshape(len(gram), -1).T
         # At least the sum without the level, by the triangle inequality.
-        whole = (np.abs(weights) @ np.sqrt(parts**2 @ np.diag(inverse))) ** 2
-        least = np.maximum(1e-9 * whole, 1e-300)
-        slope = np.where(information > least, weights @ (parts @ toward), 0.0)
+        without_level = (np.abs(weights) @ np.sqrt(parts**2 @ np.diag(inverse))) ** 2
+        least = np.maximum(1e-9 * without_level, 1e-300)
+        slope = np.where(information > least, weights @ (parts @ weighted_values), 0.0)
         return slope, np.maximum(information, least)
 
     def level_without(self, light: Float) -> Float:
@@ -367,30 +382,30 @@ class Likelihood:
 
     def chi2(self, model: Float) -> Float:
         """Return chi-squared of the values with models, of shape (n,) or (k, n), added to the level."""
-        left = self.window.values - model
-        return np.asarray(np.einsum("...i,...i->...", left @ self.inverse, left))
+        residual = self.window.values - model
+        return np.asarray(np.einsum("...i,...i->...", residual @ self.inverse, residual))
 
 
-def log_time(time_s: Float, one: FittedFlare) -> Float:
+def log_time(time_s: Float, flare: FittedFlare) -> Float:
     """Return the logarithm of the time from the peak, in which departures of a flare are correlated."""
-    tau = (time_s - one.peak_s) / one.half_width_s
+    tau = (time_s - flare.peak_s) / flare.half_width_s
     return np.asarray(np.sign(tau) * np.log1p(np.abs(tau)))
 
 
-def _floor(time_s: Float, one: FittedFlare) -> Float:
+def _floor(time_s: Float, flare: FittedFlare) -> Float:
     """Return the light of a flare that may be where its shape has none."""
-    return np.asarray(FLOOR * one.amplitude * np.exp(-np.abs(time_s - one.peak_s) / one.half_width_s))
+    return np.asarray(FLOOR * flare.amplitude * np.exp(-np.abs(time_s - flare.peak_s) / flare.half_width_s))
 
 
-def _unobserved(window: Window, one: FittedFlare, shape: Profile) -> tuple[Float, Float]:
+def _unobserved(window: Window, flare: FittedFlare, shape: Profile) -> tuple[Float, Float]:
     """Return middles of intervals without bins near a flare, and the light of the flare in them, in amplitude x s."""
     tau = np.concatenate([-np.geomspace(REACH[0], 0.05, 12), [0.0], np.geomspace(0.05, REACH[1], 24)])
-    edges = np.unique(np.concatenate([one.peak_s + tau * one.half_width_s, window.edges.ravel()]))
-    edges = edges[(edges >= one.peak_s - REACH[0] * one.half_width_s)
-                  & (edges <= one.peak_s + REACH[1] * one.half_width_s)]  # fmt: skip
+    start, stop = flare.peak_s + tau[[0, -1]] * flare.half_width_s
+    edges = np.unique(np.concatenate([flare.peak_s + tau * flare.half_width_s, window.edges.ravel()]))
+    edges = edges[(edges >= start) & (edges <= stop)]
     middle = (edges[:-1] + edges[1:]) / 2
     place = np.searchsorted(window.edges[:, 0], middle, side="right") - 1
-    seen = (place >= 0) & (middle < window.edges[np.maximum(place, 0), 1])
-    integrals = consecutive_integrals(shape, (edges - one.peak_s) / one.half_width_s)
-    light = one.amplitude * one.half_width_s * integrals + _floor(middle, one) * np.diff(edges)
-    return middle[~seen], light[~seen]
+    observed = (place >= 0) & (middle < window.edges[np.maximum(place, 0), 1])
+    integrals = consecutive_integrals(shape, (edges - flare.peak_s) / flare.half_width_s)
+    light = flare.amplitude * flare.half_width_s * integrals + _floor(middle, flare) * np.diff(edges)
+    return middle[~observed], light[~observed]

@@ -17,23 +17,24 @@ from mauvecl.schema.fields import DAY_S
 
 #: Standard deviation of a normal distribution in units of its median absolute deviation.
 PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
-#: Smallest distance of a frame without light of the star, below, and of a single bright frame, above.
+#: Distance from the level, in standard deviations, beyond which a frame below it lacks the light of the star, and a
+#: single frame above it is a spike.
 FAR = 5.0
-#: Largest distance of the neighbours of a single bright frame.
+#: Largest distance of the neighbours of a spike.
 NEAR = 3.0
-#: Rise in robust standard deviations from which a first guess of the flares begins, and the frames that it takes.
+#: A guessed flare begins with a rise of this many robust standard deviations, within one of these numbers of frames.
 JUMP, JUMP_FRAMES = 8.0, (1, 2, 3)
 #: A guessed flare ends at this share of its rise, or within this number of standard deviations of the level before it.
 DECAYED, WITHIN = 0.02, 3.0
 #: Largest share of the frames in guessed flares.
 MOST_GUESSED = 0.8
-#: Frames in which the end of a guessed flare is looked for first; the next pieces are longer.
+#: Number of frames in which the end of a guessed flare is sought first; further pieces are longer.
 FIRST_PIECE = 256
 #: Largest mean of counts in a frame whose noise is treated as Poisson noise rather than as normal noise.
 MAX_COUNTS = 100.0
 #: Factor by which the noise of frames without weight exceeds the standard deviation of the process.
 NO_WEIGHT = 1e4
-#: Largest share of frames far below the level that are left out; more of them are part of the light of the star.
+#: Largest share of frames far below the level that are left out; more of them are light of the star.
 MOST_BELOW = 0.03
 #: Smallest variance of the noise of a frame relative to the typical one.
 LEAST_VARIANCE = 0.1
@@ -65,7 +66,7 @@ class QuiescentLevel:
         """Return the level of light that was divided by one which changes in steps, shape (n_frame,)."""
         places = np.flatnonzero(np.diff(relative)) + 1
         changes = tuple((int(place), float(relative[place] / relative[place - 1] - 1)) for place in places)
-        level, level_error, error = (each * relative for each in (self.level, self.level_error, self.error))
+        level, level_error, error = (values * relative for values in (self.level, self.level_error, self.error))
         return replace(self, level=level, level_error=level_error, error=error, changes=changes)
 
     @property
@@ -87,9 +88,9 @@ def counts_per_unit(frames: Frames) -> float | None:
     for factor in (1.0, exposure):
         counts = flux[finite] * factor
         # Fluxes such as 1e-15 are near zero, but are no counts.
-        whole = np.abs(counts - np.rint(counts)) <= 1e-6 * counts
+        integer = np.abs(counts - np.rint(counts)) <= 1e-6 * counts
         # Half of the frames may have no count at all.
-        if whole.all() and np.ptp(counts) > 0 and float(np.quantile(counts, 0.75)) < MAX_COUNTS:
+        if integer.all() and np.ptp(counts) > 0 and float(np.quantile(counts, 0.75)) < MAX_COUNTS:
             return factor
     return None
 
@@ -106,28 +107,28 @@ def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) ->
     `least` is the least standard deviation of a frame, since most of few counts are equal.
     """
     inside = np.zeros(flux.size, np.bool_)
-    rises: list[tuple[float, int, int]] = []
+    rises: list[tuple[float, int]] = []
     noise = max(noise_of_steps(numbers, flux), least)
     for lag in JUMP_FRAMES:
         rise = np.where(numbers[lag:] - numbers[:-lag] <= 2 * lag, flux[lag:] - flux[:-lag], 0.0)
         limit = JUMP * max(PER_MAD * float(np.median(np.abs(rise))), np.sqrt(2.0) * least)
-        rises += [(float(rise[k]), int(k), lag) for k in np.flatnonzero(rise > max(limit, 1e-300))]
+        rises += [(float(rise[k]), int(k)) for k in np.flatnonzero(rise > max(limit, 1e-300))]
     n_inside = 0
-    for rise_of, start, _ in sorted(rises, reverse=True):
+    for rise_of_flare, start in sorted(rises, reverse=True):
         if inside[start]:
             continue
         # The first frames belong to the rise; it ends at the first of two faint frames in a row.
-        faint = float(flux[start]) + max(WITHIN * noise, DECAYED * rise_of)
+        faint = float(flux[start]) + max(WITHIN * noise, DECAYED * rise_of_flare)
         first, size, last = start + 4, FIRST_PIECE, flux.size
         while first + 1 < last:
             below = flux[first : first + size + 1] < faint
             ends = np.flatnonzero(below[:-1] & below[1:])
             last = first + int(ends[0]) if ends.size else last
             first, size = first + size, 2 * size
-        more = int(np.count_nonzero(~inside[start + 1 : last + 1]))
-        if n_inside + more <= MOST_GUESSED * flux.size:
+        added = int(np.count_nonzero(~inside[start + 1 : last + 1]))
+        if n_inside + added <= MOST_GUESSED * flux.size:
             inside[start + 1 : last + 1] = True
-            n_inside += more
+            n_inside += added
     return inside
 
 
@@ -137,11 +138,11 @@ def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tupl
     Stated errors often follow the counts of the frame, of which the difference from the level is taken away.
     """
     squared = error**2
-    apart = (flux - level)[quiet]
-    spread = float(apart @ apart)
+    difference = (flux - level)[quiet]
+    spread = float(difference @ difference)
     slope = 0.0
     if spread > 0:
-        slope = max(float(apart @ (squared[quiet] - squared[quiet].mean())) / spread, 0.0)
+        slope = max(float(difference @ (squared[quiet] - squared[quiet].mean())) / spread, 0.0)
     typical = float(np.median(squared[quiet]))
     return np.maximum(squared - slope * (flux - level), LEAST_VARIANCE * typical), slope
 
@@ -193,9 +194,10 @@ class LevelGiven:
         mean = weights[quiet] @ columns[quiet] / weights.sum()
         if not self.process.terms:
             return np.asarray(np.broadcast_to(mean, columns.shape)).reshape(values.shape)
-        held = np.where(quiet[:, None], columns - mean, 0.0)
+        residual = np.where(quiet[:, None], columns - mean, 0.0)
         # The mean of the process at a value is the value less its noise.
-        return np.asarray(held - self._noise[:, None] * self._covariance.solve(held) + mean).reshape(values.shape)
+        process = residual - self._noise[:, None] * self._covariance.solve(residual)
+        return np.asarray(process + mean).reshape(values.shape)
 
 
 def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, seed: int, steps: Steps) -> Float:
@@ -204,33 +206,33 @@ def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, s
     It is the scatter of differences between simulated processes and their means given noisy values (Matheron's rule),
     with that of the constant level. `steps` reports each of these.
     """
-    given = LevelGiven(process, time_s, variance, quiet)
+    level = LevelGiven(process, time_s, variance, quiet)
     if not process.terms:
-        return np.full(time_s.size, (1.0 / float(given.weights.sum())) ** 0.5)
+        return np.full(time_s.size, (1.0 / float(level.weights.sum())) ** 0.5)
     noise = variance * process.excess**2
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, LEVEL_KEY]))
     tiny = np.full(time_s.size, 1e-9 * (process.sd**2 + float(np.median(noise))))
     simulated = process.covariance(time_s, tiny)
     total = np.zeros(time_s.size)
     draws = int(np.clip(LEVEL_VALUES // time_s.size, *LEVEL_DRAWS))
-    for _ in steps.each(range(draws), draws):
+    for _ in steps.track(range(draws), draws):
         truth = simulated.coloured(rng.standard_normal(time_s.size))
-        seen = truth + np.sqrt(noise) * rng.standard_normal(time_s.size)
-        total += (given.of(seen) - truth) ** 2
+        noisy = truth + np.sqrt(noise) * rng.standard_normal(time_s.size)
+        total += (level.of(noisy) - truth) ** 2
     return np.sqrt(total / draws)
 
 
-def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool:
+def single_frames(numbers: NDArray[np.int64], sigmas: Float, usable: Bool) -> Bool:
     """Return single frames far above the level, by `sigmas`, whose neighbours on both sides are not.
 
-    A flare that is shorter than a frame cannot be distinguished from a cosmic ray. Frames without a fault are `fine`.
+    A flare that is shorter than a frame cannot be distinguished from a cosmic ray. Frames without a fault are `usable`.
     """
-    at = np.flatnonzero(fine)
+    frames = np.flatnonzero(usable)
     single = np.zeros(sigmas.size, np.bool_)
-    here, before, after = at[1:-1], at[:-2], at[2:]
+    middle, before, after = frames[1:-1], frames[:-2], frames[2:]
     adjacent = (numbers[after] - numbers[before]) == 2
     low = (np.abs(sigmas[before]) < NEAR) & (np.abs(sigmas[after]) < NEAR)
-    single[here] = adjacent & low & (sigmas[here] > FAR)
+    single[middle] = adjacent & low & (sigmas[middle] > FAR)
     return single
 
 
@@ -240,7 +242,7 @@ BINS = (1, 2, 4, 8, 16, 32, 64, 128)
 MIN_BINS = 8
 #: Largest lag of correlations in frames.
 MAX_LAG = 40
-#: Correlation of the residuals from which the process does not describe them, if it is also as many standard errors.
+#: Correlation of the residuals above which the process does not describe them, if it also has this significance.
 CORRELATED, SIGNIFICANT = 0.12, 5.0
 
 
@@ -268,15 +270,14 @@ def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
     scaled = np.clip(residual, -4.0, 4.0)
     scaled = (scaled - scaled.mean(axis=0)) / np.maximum(scaled.std(axis=0), 1e-300)
     lags = np.arange(1, max(2, min(MAX_LAG, len(numbers) // 4) + 1))
-    found, errors = np.zeros((residual.shape[1], lags.size)), np.ones(lags.size)
+    correlations, errors = np.zeros((residual.shape[1], lags.size)), np.ones(lags.size)
     for k, lag in enumerate(lags):
         # Frames that are a lag apart, with any number of others between them.
         _, first, second = np.intersect1d(numbers, numbers - lag, assume_unique=True, return_indices=True)
         if first.size > 10:
-            found[:, k] = (scaled[first] * scaled[second]).mean(axis=0)
+            correlations[:, k] = (scaled[first] * scaled[second]).mean(axis=0)
             errors[k] = first.size**-0.5
-    each = [Likeness(one, errors) for one in found]
-    return max(each, key=lambda one: float(one.excess.max()))
+    return max((Likeness(row, errors) for row in correlations), key=lambda likeness: float(likeness.excess.max()))
 
 
 @dataclass(frozen=True)
@@ -298,26 +299,27 @@ class Scatter:
 
 def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]:
     """Measure the scatter of means of consecutive frames without gaps, in units of the noise of a frame."""
-    found = []
+    scatter = []
     # Place of each frame among consecutive ones, and their number.
     first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 2) != 1)
     lengths = np.diff(np.append(first, numbers.size))
     place, length = np.arange(numbers.size) - np.repeat(first, lengths), np.repeat(lengths, lengths)
     for size in BINS:
         # Bins do not overlap, and begin with the first frame after a gap.
-        kept = np.flatnonzero((place % size == 0) & (place + size <= length))
-        if len(kept) < MIN_BINS:
+        starts = np.flatnonzero((place % size == 0) & (place + size <= length))
+        if len(starts) < MIN_BINS:
             break
-        means = residual[kept[:, None] + np.arange(size)].mean(axis=1)
-        dof = len(kept) - 1
-        low, high = (float(np.sqrt(scipy.stats.chi2.ppf(p, dof) / dof / size)) for p in (0.025, 0.975))
-        found.append(Scatter(size, len(kept), float(means.std(ddof=1)), size**-0.5, low, high))
-    return found
+        means = residual[starts[:, None] + np.arange(size)].mean(axis=1)
+        dof = len(starts) - 1
+        low, high = np.sqrt(scipy.stats.chi2.ppf([0.025, 0.975], dof) / dof / size).tolist()
+        scatter.append(Scatter(size, len(starts), float(means.std(ddof=1)), size**-0.5, low, high))
+    return scatter
 
 
 Places = NDArray[np.intp]
 
-#: Frames on each side whose parabolas are compared, and their usual deviations from which it may be a step (assumed).
+#: Numbers of frames on each side whose parabolas are compared, and the difference, relative to its usual size, above
+#: which it may be a step (assumed).
 SIDES, SUDDEN = (12, 40), 8.0
 #: Largest number of steps (assumed).
 MOST_STEPS = 30
@@ -340,7 +342,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
     """
     constant = np.ones(flux.size)
     values = flux / Binned(time_s, flux, constant, frame_s).noise
-    places, sizes = _sudden_changes(time_s, values)
+    places, sizes = _find_sudden_changes(time_s, values)
     typical = float(np.median(values))
     process: Process | None = None
     if not places.size or not typical > 0:
@@ -350,37 +352,36 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         return Binned.of(time_s[quiet], light[quiet], np.ones(int(quiet.sum())), frame_s, MAX_TRIED)
 
     for _ in range(ROUNDS):
-        left = values - np.cumsum(np.bincount(places, sizes, values.size))
-        quiet = ~guess_flares(numbers, left)
-        process = fit_process(binned(left), process)
-        change, error = _fitted_steps(process, time_s, left, quiet, places, frame_s)
+        without_steps = values - np.cumsum(np.bincount(places, sizes, values.size))
+        quiet = ~guess_flares(numbers, without_steps)
+        process = fit_process(binned(without_steps), process)
+        change, error = _fit_steps(process, time_s, without_steps, quiet, places, frame_s)
         # A flare may shine after each rise.
         rises = [(time_s >= start) & (time_s < start + FLARE_S) for start in time_s[places[sizes > 0]]]
         no_flare = quiet & ~np.any(rises, axis=0)
-        apart, error_apart = _fitted_steps(process, time_s, left, no_flare, places, frame_s)
-        before, sizes = sizes, sizes + change
-        kept = (np.abs(sizes) > SIGNIFICANT * error) & ((before + apart) / np.sign(sizes) > AFTER_FLARE * error_apart)
-        settled = kept.all() and (np.abs(change) < error).all()
-        places, sizes = places[kept], sizes[kept]
+        later_change, later_error = _fit_steps(process, time_s, without_steps, no_flare, places, frame_s)
+        later_sizes, sizes = sizes + later_change, sizes + change
+        steps = (np.abs(sizes) > SIGNIFICANT * error) & (later_sizes / np.sign(sizes) > AFTER_FLARE * later_error)
+        settled = steps.all() and (np.abs(change) < error).all()
+        places, sizes = places[steps], sizes[steps]
         if settled or not places.size:
             break
     if not places.size:
         return constant
     added = np.cumsum(np.bincount(places, sizes, values.size))
     costs = []
-    for light, each, n_steps in ((values - added, process, places.size), (values, None, 0)):
+    for light, start, n_steps in ((values - added, process, places.size), (values, None, 0)):
         data = binned(light)
-        fitted = fit_process(data, each)
         size = float(np.log(data.values.size))
-        costs.append(2 * n_steps * size + criterion_of_process(fitted, data, size))
+        costs.append(2 * n_steps * size + criterion_of_process(fit_process(data, start), data, size))
     level = 1.0 + added / typical
     level = level / np.median(level)
     return level if costs[0] < costs[1] and level.min() > 1 / LARGEST and level.max() < LARGEST else constant
 
 
-def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
+def _find_sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
     """Return the first frames after sudden changes that last, in order of time, and the changes of the flux."""
-    found: dict[int, tuple[float, float]] = {}
+    changes: dict[int, tuple[float, float]] = {}
     for side in SIDES:
         if flux.size < 4 * side:
             continue
@@ -389,12 +390,12 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
         before = np.convolve(flux, weights[::-1], mode="valid")[:-side]
         change = np.convolve(flux, weights, mode="valid")[side:] - before
         usual = max(PER_MAD * float(np.median(np.abs(change))), 1e-300)
-        for k in np.flatnonzero(np.abs(change) > SUDDEN * usual):
+        for k in np.flatnonzero(np.abs(change) > SUDDEN * usual).tolist():
             largest = np.abs(change[max(0, k - side) : k + side + 1]).max()
-            if np.abs(change[k]) >= largest and not any(abs(k + side - one) <= side for one in found):
-                found[int(k + side)] = (float(np.abs(change[k])) / usual, float(change[k]))
+            if np.abs(change[k]) >= largest and not any(abs(k + side - place) <= side for place in changes):
+                changes[k + side] = (float(np.abs(change[k])) / usual, float(change[k]))
     lasting = set()
-    for (place, (_, size)), length_s in product(found.items(), LENGTHS_S):
+    for (place, (_, size)), length_s in product(changes.items(), LENGTHS_S):
         # The median of the light differs days later too, as not after flares, losses and rotation.
         ends = time_s[place] + np.array([-length_s, FLARE_S, FLARE_S + length_s])
         first, later, last = np.searchsorted(time_s, ends)
@@ -403,11 +404,11 @@ def _sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
             share = float(np.median(after) - np.median(before)) / size
             if 1 / LASTS < share < LASTS:
                 lasting.add(place)
-    places = np.array(sorted(sorted(lasting, key=lambda one: found[one], reverse=True)[:MOST_STEPS]), np.intp)
-    return places, np.array([found[int(one)][1] for one in places])
+    places = sorted(sorted(lasting, key=lambda place: changes[place], reverse=True)[:MOST_STEPS])
+    return np.array(places, np.intp), np.array([changes[place][1] for place in places])
 
 
-def _fitted_steps(
+def _fit_steps(
     process: Process, time_s: Float, flux: Float, quiet: Bool, places: Places, frame_s: float
 ) -> tuple[Float, Float]:
     """Return the steps of a light curve by generalised least squares, and their standard errors, (n_step,) each."""

@@ -37,7 +37,7 @@ from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, cri
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 
-#: Statistic of events whose frames take no part in fits of the process.
+#: Statistic above which the frames of an event are left out of fits of the process.
 PROVISIONAL = 5.0
 #: Largest number of alternations of process and events.
 ALTERNATIONS = 12
@@ -60,19 +60,20 @@ def fit_quiet_light(
     A bright, slow flare resembles a process that is seen once. There, the fit with the events in independent noise is
     compared by the Bayesian information criterion, with the flares among the parameters. For arguments see `alternate`.
     """
-    fitted, taken = alternate(survey, guessed, before, steps)
+    fitted, in_events = alternate(survey, guessed, before, steps)
     if not _seen_once(fitted):
-        return fitted, taken
+        return fitted, in_events
     noise = tuple(Process((), process.excess) for process in fitted.processes)
-    found, others = detect_events(replace(survey, processes=noise), PROVISIONAL)
-    if len(found) > MAX_COMPARED or not (others & ~taken).any():
-        return fitted, taken
-    other, others = alternate(survey, others, None, steps)
-    if float((others ^ taken).mean()) <= SETTLED:
-        return fitted, taken
-    light = light_of_events(fitted, taken)
-    first, second = criterion(fitted, light, taken), criterion(other, light_of_events(other, others), others, light)
-    return (other, others) if second < first else (fitted, taken)
+    events, guessed = detect_events(replace(survey, processes=noise), PROVISIONAL)
+    if len(events) > MAX_COMPARED or not (guessed & ~in_events).any():
+        return fitted, in_events
+    other, in_others = alternate(survey, guessed, None, steps)
+    if float((in_others ^ in_events).mean()) <= SETTLED:
+        return fitted, in_events
+    light = light_of_events(fitted, in_events)
+    cost = criterion(fitted, light, in_events)
+    other_cost = criterion(other, light_of_events(other, in_others), in_others, light)
+    return (other, in_others) if other_cost < cost else (fitted, in_events)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +87,16 @@ class EventLight:
     n_flares: int
 
 
-def light_of_events(survey: SeriesSurvey, taken: Bool) -> list[EventLight]:
+def light_of_events(survey: SeriesSurvey, in_events: Bool) -> list[EventLight]:
     """Return the light of the events above `PROVISIONAL`."""
     fits = []
     for event in detect_events(survey, PROVISIONAL)[0]:
-        flares, scale, photon = flares_of(survey, taken, event)
+        flares, scale, photon = flares_of(survey, in_events, event)
         total = np.zeros(survey.stare.n_frames)
-        every = [light_of_flare(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
-        for rows, flux in every:
+        lights = [light_of_flare(survey, flare.peak_s, flare.half_width_s, flare.amplitude) for flare in flares]
+        for rows, flux in lights:
             total[rows] += flux
-        rows = slice(min(rows.start for rows, _ in every), max(rows.stop for rows, _ in every))
+        rows = slice(min(rows.start for rows, _ in lights), max(rows.stop for rows, _ in lights))
         fits.append(EventLight(event, rows, scale * total[rows], photon * total[rows], len(flares)))
     return fits
 
@@ -103,7 +104,7 @@ def light_of_events(survey: SeriesSurvey, taken: Bool) -> list[EventLight]:
 def criterion(
     survey: SeriesSurvey,
     fits: Sequence[EventLight],
-    taken: Bool,
+    in_events: Bool,
     further: Sequence[EventLight] = (),
     *,
     shapeless: bool = False,
@@ -114,30 +115,33 @@ def criterion(
     `shapeless`, or in independent noise, the light of an event may have any smooth shape, or depart from that of its
     flares, or of `further` ones, by a process.
     """
-    size = float(np.log(survey.stare.n_frames))
-    every = np.ones(survey.stare.n_frames, np.bool_)
-    total = min(_criterion_of(survey, fits, every, epsilon) for epsilon in DEPARTURES)
+    all_frames = np.ones(survey.stare.n_frames, np.bool_)
+    total = min(_criterion_of(survey, fits, all_frames, epsilon) for epsilon in DEPARTURES)
     shapeless = shapeless or not any(process.terms for process in survey.processes)
     if fits and shapeless and survey.sums.shape[1] == 1:
-        alone = []
-        for event in (fit.event for fit in fits):
-            rows, added = slice(event.first, event.last + 1), [(1, *_added(survey, [], 0.0))]
-            for others in (fits, further):
-                near = (fit for fit in others if event.first <= fit.event.last and fit.event.first <= event.last)
-                if number := sum(fit.n_flares for fit in near):
-                    added += [(number, *_added(survey, others, epsilon)) for epsilon in DEPARTURES]
-            costs = []
-            for n_flares, light, extra in added:
-                values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
-                data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
-                process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
-                costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
-            alone.append(min(costs))
-        total = min(total, _criterion_of(survey, [], ~taken, 0.0) + sum(alone))
+        in_fits = sum(_shapeless_cost(survey, fit.event, (fits, further)) for fit in fits)
+        total = min(total, _criterion_of(survey, [], ~in_events, 0.0) + in_fits)
     return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
 
 
-def _added(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> tuple[Float, Float]:
+def _shapeless_cost(survey: SeriesSurvey, event: DetectedEvent, light: Sequence[Sequence[EventLight]]) -> float:
+    """Return the criterion of an event whose light is a process, alone or in addition to that of fitted flares."""
+    size = float(np.log(survey.stare.n_frames))
+    rows, added = slice(event.first, event.last + 1), [(1, *_add_light(survey, [], 0.0))]
+    for fits in light:
+        near = (fit for fit in fits if event.first <= fit.event.last and fit.event.first <= event.last)
+        if number := sum(fit.n_flares for fit in near):
+            added += [(number, *_add_light(survey, fits, epsilon)) for epsilon in DEPARTURES]
+    costs = []
+    for n_flares, flux, extra in added:
+        values, variance = survey.sums[rows, 0] - flux[rows, 0], survey.variance[rows] + extra[rows]
+        data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
+        process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
+        costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
+    return min(costs)
+
+
+def _add_light(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> tuple[Float, Float]:
     """Return the light of flares in the sums, (n_frame, n_sum), and the variance of flares that depart by a share."""
     light, variance = np.zeros_like(survey.sums), np.zeros(survey.stare.n_frames)
     for fit in fits:
@@ -146,16 +150,16 @@ def _added(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> 
     return light, variance
 
 
-def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, epsilon: float) -> float:
+def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], chosen: Bool, epsilon: float) -> float:
     """Return the criterion of some frames, with flares that depart by a share from their shape."""
-    start, size = survey.stare.start_s[kept], float(np.log(survey.stare.n_frames))
-    light, extra = _added(survey, fits, epsilon)
+    start, size = survey.stare.start_s[chosen], float(np.log(survey.stare.n_frames))
+    light, extra = _add_light(survey, fits, epsilon)
     total = PARAMETERS * size * sum(fit.n_flares for fit in fits)
-    for process, column in zip(survey.processes, (survey.sums - light)[kept].T, strict=True):
-        noise = (survey.variance * process.excess**2 + extra)[kept]
+    for process, column in zip(survey.processes, (survey.sums - light)[chosen].T, strict=True):
+        noise = (survey.variance * process.excess**2 + extra)[chosen]
         if fits and not process.terms:
             # Frames without events in the tail of a flare have more scatter than noise.
-            noise = (survey.variance + extra)[kept]
+            noise = (survey.variance + extra)[chosen]
             process = fit_process(Binned(start, column, noise, survey.stare.frame_s), process)
             noise = noise * process.excess**2
         # The excess is in the noise already.
@@ -179,27 +183,32 @@ def alternate(
 
     The terms of `before`, a survey of nearly the same frames, are kept as long as the events hardly change.
     """
-    taken, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
+    in_events, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
     for _ in range(ALTERNATIONS):
         # Rounds may come back to the same frames.
-        key = taken.tobytes(), before
+        key = in_events.tobytes(), before
         if key not in rounds:
-            # The flux of a light curve is its only sum.
-            columns, fits = [*survey.sums.T, *([survey.flux] if survey.weighted else [])], list[Process]()
-            befores = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
-            for column, start in zip(columns, befores, strict=False):
-                time, values, variance = (each[~taken] for each in (survey.stare.start_s, column, survey.variance))
-                fits.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), start, steps))
-            fitted = replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
+            fitted = _fit_processes(survey, ~in_events, before, steps)
             rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
-        fitted, now = rounds[key]
-        changed = float((now ^ taken).mean())
-        taken = now
+        fitted, detected = rounds[key]
+        changed = float((detected ^ in_events).mean())
+        in_events = detected
         if changed <= SETTLED:
             break
         # Terms are chosen again as long as many frames change.
         before = fitted if changed < 10 * SETTLED else None
-    return fitted, taken
+    return fitted, in_events
+
+
+def _fit_processes(survey: SeriesSurvey, quiet: Bool, before: SeriesSurvey | None, steps: Steps) -> SeriesSurvey:
+    """Fit the processes of a survey to its quiescent frames, from those of a survey of nearly the same frames."""
+    # The flux of a light curve is its only sum.
+    columns, fits = [*survey.sums.T, *([survey.flux] if survey.weighted else [])], list[Process]()
+    starts = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
+    for column, start in zip(columns, starts, strict=False):
+        time, values, variance = survey.stare.start_s[quiet], column[quiet], survey.variance[quiet]
+        fits.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), start, steps))
+    return replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
 
 
 #: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
@@ -247,13 +256,13 @@ class Loss(Shape):
         return np.clip(1.0 - np.asarray(tau, np.float64), 0.0, 2.0)
 
 
-def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps: Steps) -> Bool:
+def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, steps: Steps) -> Bool:
     """Return the frames in which light is lost, if losses explain a light curve better than flares do.
 
     Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Otherwise the light
-    curve, `survey`, is searched upside down, and the criterion of `fitted` and its events, `taken`, is compared.
+    curve, `survey`, is searched upside down, and the criterion of `fitted` and its events is compared.
     """
-    none, process = np.zeros_like(taken), fitted.flux_process
+    lost, process = np.zeros_like(in_events), fitted.flux_process
     rotates = any(term.rotates for term in process.terms)
     slow_s = min(survey.stare.duration_s / 3, SLOW_S)
     noise = process.excess * float(np.sqrt(np.median(fitted.variance)))
@@ -263,12 +272,12 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
         and term.sd * np.sqrt(term.scale_s / survey.stare.frame_s) > LEAST_LOSS * noise
         for term in process.terms
     )
-    active = taken.mean() > MOST_ACTIVE
-    many = active or (taken.mean() > MOST_FLARING and not rotates)
+    active = in_events.mean() > MOST_ACTIVE
+    many = active or (in_events.mean() > MOST_FLARING and not rotates)
     if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
-        return none
-    dark = ~_bright(survey)
-    survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
+        return lost
+    dark = ~_bright_frames(survey)
+    survey, fitted, in_events = survey.frames(dark), fitted.frames(dark), in_events[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
     guessed = detect_events(down, PROVISIONAL, steps)[1]
@@ -276,52 +285,49 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     @cache
     def usual() -> float:
         """Return the criterion of flares without losses."""
-        return criterion(fitted, light_of_events(fitted, taken), taken)
+        return criterion(fitted, light_of_events(fitted, in_events), in_events)
 
     # Those of a star that varies are most of its frames; eclipses repeat.
-    if active and guessed.mean() >= MOST_LOST:
-        lost = _eclipses(survey, usual)
-        if lost.any():
-            none[dark] = lost
-            return none
+    if active and guessed.mean() >= MOST_LOST and (eclipses := _find_eclipses(survey, usual)).any():
+        lost[dark] = eclipses
+        return lost
     other, losses = alternate(down, guessed, None, steps)
     # The star is constant between losses, or before and after one; not only before or after a step.
     returns = np.count_nonzero(np.diff(true_runs(~losses)) > END_FRAMES) > 1
     constant = returns and not other.flux_process.terms and other.flux_process.excess < MOST_EXCESS
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
-        simpler = constant and losses.mean() < taken.mean() and process.excess > MOST_EXCESS
+        simpler = constant and losses.mean() < in_events.mean() and process.excess > MOST_EXCESS
         light = light_of_events(other, losses)
         if simpler or criterion(other, light, losses, shapeless=True) < usual():
-            none[dark] = losses
-    return none
+            lost[dark] = losses
+    return lost
 
 
-def _eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
+def _find_eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     """Return the frames in periodic losses if these lower the criterion, which is `usual()` without them."""
     guessed = guess_eclipses(survey)
-    none = np.zeros_like(guessed)
+    lost = np.zeros_like(guessed)
     if not 0 < guessed.mean() < MOST_LOST:
-        return none
-    part = survey.frames(~guessed)
-    fitted, taken = fit_quiet_light(part, guess_flares(part.stare.numbers, part.flux))
+        return lost
+    bright, dim = survey.frames(~guessed), survey.frames(guessed)
+    fitted, in_events = fit_quiet_light(bright, guess_flares(bright.stare.numbers, bright.flux))
     # The light in eclipses may have any smooth shape.
-    dim = survey.frames(guessed)
     data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
     size = float(np.log(guessed.size))
     cost = EPHEMERIS * size + criterion_of_process(fit_process(data), data, size)
-    if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual():
-        return none
+    if criterion(fitted, light_of_events(fitted, in_events), in_events) + cost >= usual():
+        return lost
     quiet = ~guessed
-    quiet[quiet] = ~taken
-    whole = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
-    sigma = uniform_filter1d(whole.along(0, quiet), END_FRAMES)
+    quiet[quiet] = ~in_events
+    survey = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
+    sigma = uniform_filter1d(survey.along(0, quiet), END_FRAMES)
     # Frames at the ends of the guess that are as bright as the star are searched.
     for first, end in true_runs(guessed):
         faint = first + np.flatnonzero(sigma[first:end] < -FAINT)
         if faint.size:
-            none[max(first, faint[0] - END_FRAMES) : min(end, faint[-1] + END_FRAMES + 1)] = True
-    return none
+            lost[max(first, faint[0] - END_FRAMES) : min(end, faint[-1] + END_FRAMES + 1)] = True
+    return lost
 
 
 def guess_eclipses(survey: SeriesSurvey) -> Bool:
@@ -346,26 +352,26 @@ def guess_eclipses(survey: SeriesSurvey) -> Bool:
         return inside
     values = data.values
     for _ in range(2):
-        kept = ~inside[np.searchsorted(time, data.time_s)]
-        search = BoxLeastSquares(data.time_s[kept], values[kept])
-        found = [search.power(grid, ECLIPSES * grid.min()) for grid in grids]
-        best = max(found, key=lambda one: float(one.power.max()))
+        outside = ~inside[np.searchsorted(time, data.time_s)]
+        search = BoxLeastSquares(data.time_s[outside], values[outside])
+        periodograms = [search.power(grid, ECLIPSES * grid.min()) for grid in grids]
+        best = max(periodograms, key=lambda periodogram: float(periodogram.power.max()))
         k = int(np.argmax(best.power))
-        period, middle, length = (float(one[k]) for one in (best.period, best.transit_time, best.duration))
+        period, middle, length = float(best.period[k]), float(best.transit_time[k]), float(best.duration[k])
         size = max(3, round(AROUND * period / data.step_s))
-        turn, apart = _turns(data.time_s, period, middle)
-        dim = (apart < length / 2) & kept
+        turn, distance = _turns(data.time_s, period, middle)
+        dim = (distance < length / 2) & outside
         around = data.values - median_filter(data.values, size, mode="nearest")
-        depths = np.array([np.median(around[dim & (turn == one)]) for one in np.unique(turn[dim])])
+        depths = np.array([np.median(around[dim & (turn == number)]) for number in np.unique(turn[dim])])
         # Losses that are seen once or twice, or that differ in depth, are no eclipses.
         if depths.size < LEAST_ECLIPSES or np.mean(depths < 0.5 * np.median(depths)) < ALIKE or np.median(depths) >= 0:
             break
         inside |= _turns(time, period, middle)[1] < WIDENED * length / 2
         grids = [np.array([period])]
         # The star may vary by more than the shallower eclipse.
-        kept = ~inside[np.searchsorted(time, data.time_s)]
+        outside = ~inside[np.searchsorted(time, data.time_s)]
         values = data.values.copy()
-        values[kept] -= median_filter(values[kept], size, mode="nearest")
+        values[outside] -= median_filter(values[outside], size, mode="nearest")
     return inside
 
 
@@ -375,7 +381,7 @@ def _turns(time: Float, period: float, middle: float) -> tuple[Float, Float]:
     return turn, np.abs(time - middle - turn * period)
 
 
-def _bright(survey: SeriesSurvey) -> Bool:
+def _bright_frames(survey: SeriesSurvey) -> Bool:
     """Return frames far above the level that most frames have, and those after them, as long as flares decay."""
     sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.variance)
     bright = np.zeros(sigmas.size, np.bool_)
@@ -386,7 +392,7 @@ def _bright(survey: SeriesSurvey) -> Bool:
 
 #: Number of frames whose median is the level around a single bright frame.
 SPIKE_FRAMES = 9
-#: Largest number of times that single frames are left out and the rest is fitted again.
+#: Largest number of times that single frames are left out and the others are fitted again.
 ROUNDS = 3
 
 
@@ -398,7 +404,7 @@ def survey_light_curve(
     Frames of few counts are returned with a remark and without errors. `steps` reports fits, searches and draws.
     """
     fits = steps.part(0.0, 0.9)
-    frames, counts, reasons, steps_of_level = _prepared(frames)
+    frames, counts, reasons, steps_of_level = _prepare(frames)
     used = reasons == 0
     flux, error = frames.white_light
     flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
@@ -415,16 +421,16 @@ def survey_light_curve(
         variance, photon = noise_of_frames(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
-        survey, taken = fit_quiet_light(new, guessed[used], survey, fits)
-        if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken, fits)).any():
+        survey, in_events = fit_quiet_light(new, guessed[used], survey, fits)
+        if number == 0 and counts is None and (lost := sudden_losses(new, survey, in_events, fits)).any():
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
             continue
-        level = np.interp(frames.time_s, frames.time_s[used], survey.flux_level(~taken) * survey.scale)
+        level = np.interp(frames.time_s, frames.time_s[used], survey.flux_level(~in_events) * survey.scale)
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)
-        guessed[used] = taken
-        flagged = _single(frames, flux, level, sd, used, guessed, counts)
+        guessed[used] = in_events
+        flagged = _flag_single_frames(frames, flux, level, sd, used, guessed, counts)
         if not flagged[used].any():
             break
         reasons = np.where(used, reasons | flagged, reasons)
@@ -436,7 +442,7 @@ def survey_light_curve(
     return survey, light.times(steps_of_level), frames
 
 
-def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], Float]:
+def _prepare(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], Float]:
     """Return frames, counts in a unit of their flux, why some are not searched, and the level relative to the typical.
 
     Frames of few counts have no errors; for others, counts are None. Raises InputError if too few frames are usable.
@@ -449,17 +455,17 @@ def _prepared(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], 
     check_usable(frames, reasons)
     if counts is None:
         # Single frames far above the frames around them, as the level is not known yet.
-        fine, sigmas = reasons == 0, np.zeros(flux.size)
-        scatter = noise_of_steps(frames.numbers[fine], flux[fine])
-        sd = np.full(int(fine.sum()), scatter) if error is None else np.maximum(error[fine], scatter)
-        above = flux[fine] - median_filter(flux[fine], size=SPIKE_FRAMES, mode="nearest")
-        sigmas[fine] = np.divide(above, sd, out=np.zeros(sd.size), where=sd > 0)
-        reasons[single_frames(frames.numbers, sigmas, fine)] |= Reason.SPIKE
+        usable, sigmas = reasons == 0, np.zeros(flux.size)
+        scatter = noise_of_steps(frames.numbers[usable], flux[usable])
+        sd = np.full(int(usable.sum()), scatter) if error is None else np.maximum(error[usable], scatter)
+        above = flux[usable] - median_filter(flux[usable], size=SPIKE_FRAMES, mode="nearest")
+        sigmas[usable] = np.divide(above, sd, out=np.zeros(sd.size), where=sd > 0)
+        reasons[single_frames(frames.numbers, sigmas, usable)] |= Reason.SPIKE
         if np.ptp(frames.time_s) > LONG_S:
-            at = np.flatnonzero(reasons == 0)
-            relative = relative_level(frames.time_s[at], frames.numbers[at], flux[at], frames.cadence_s)
+            rows = np.flatnonzero(reasons == 0)
+            relative = relative_level(frames.time_s[rows], frames.numbers[rows], flux[rows], frames.cadence_s)
             # Frames that are not searched have the level of the next one that is.
-            level = relative[np.clip(np.searchsorted(at, np.arange(flux.size)), 0, at.size - 1)]
+            level = relative[np.clip(np.searchsorted(rows, np.arange(flux.size)), 0, rows.size - 1)]
     return frames, counts, reasons, level
 
 
@@ -473,7 +479,7 @@ def _mean(name: str, flux: Float, least: float) -> float:
     return mean
 
 
-def _single(
+def _flag_single_frames(
     frames: Frames, flux: Float, level: Float, sd: Float, used: Bool, events: Bool, counts: float | None
 ) -> NDArray[np.int64]:
     """Return the reasons not to search single frames: far below the level, or alone far above it."""

@@ -8,11 +8,11 @@ information criterion (Schwarz 1978, doi 10.1214/aos/1176344136).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
+from operator import itemgetter
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -36,9 +36,9 @@ NOISE_PRIOR = 0.3
 PERIODIC = 1e-3
 #: Smallest period in steps between values, and largest as a share of the length of the light curve.
 SHORTEST, LONGEST = 4.0, 1.0
-#: Frequencies of a periodogram in the width of a peak, and in all, approximately.
+#: Approximate numbers of frequencies of a periodogram: in the width of a peak, and in total.
 PER_PEAK, MOST_FREQUENCIES = 5, 2**17
-#: Period as a share of the length above which rotation is also searched in what a polynomial of a degree leaves.
+#: Period, as a share of the length, above which rotation is also searched in the residuals of a polynomial of a degree.
 FEW_TURNS, DEGREE = 0.2, 8
 #: Range of standard deviations of a term, in standard deviations of the noise of a value.
 AMPLITUDES = (1e-2, 1e5)
@@ -50,7 +50,7 @@ SMOOTH_QUALITY = 2**-0.5
 ITERATIONS, CONVERGED = 80, 1e-3
 #: Step of a parameter for the derivatives of a fit.
 DIFFERENCE = 1e-8
-#: Largest number of fits one after the other, and the change of log likelihood below which the last one is the best.
+#: Largest number of consecutive fits, and the change of log likelihood below which no further one follows.
 STARTS, SAME = 4, 0.5
 #: Largest change of the logarithm of a period in a fit, and bounds of the parameters beyond the first two.
 NEAR_PERIOD = 0.4
@@ -60,12 +60,12 @@ BOUNDS: dict[Kind, tuple[tuple[float, float], ...]] = {
 }  # fmt: skip
 #: Number of harmonics of sharp rotation, and their first standard deviation over that of the harmonic before.
 HARMONICS, EACH_HARMONIC = 6, 0.5
-#: What these harmonics cost beyond their parameters, so that only very strong evidence prefers them to two (Kass &
-#: Raftery 1995, doi 10.1080/01621459.1995.10476572).
+#: Penalty on these harmonics in addition to that on their parameters, so that only very strong evidence prefers them to
+#: two harmonics (Kass & Raftery 1995, doi 10.1080/01621459.1995.10476572).
 STRONG = 10.0
 #: Largest number of values to which these harmonics are fitted before they replace two in a longer light curve.
 MAX_TRIED = 5000
-#: Share of the rest of an analysis that a step counts as, where the number of steps is not known.
+#: Share of the remaining analysis that a step counts as, where the number of steps is not known.
 EACH = 0.07
 
 
@@ -89,15 +89,15 @@ class Steps:
         if self._report is not None:
             self._report(self._first + self._done * (self._last - self._first))
 
-    def each(self, items: Iterable[Item], total: int) -> Iterator[Item]:
+    def track(self, items: Iterable[Item], total: int) -> Iterator[Item]:
         """Yield items, and report after the work on each."""
-        for done, item in enumerate(items, 1):
+        for number, item in enumerate(items, 1):
             yield item
-            self.step(min(done / total, 1.0))
+            self.step(min(number / total, 1.0))
         self.step(1.0)
 
 
-#: Steps of work whose progress nobody follows.
+#: Steps of work whose progress is not reported.
 UNREPORTED = Steps()
 
 
@@ -130,37 +130,24 @@ class ProcessTerm:
         """True if the term is periodic."""
         return self.kind in ("rotation", "sharp rotation")
 
-    def coefficients(self) -> tuple[list[tuple[float, float]], list[tuple[float, float, float, float]]]:
-        """Return a and c of each exponential, and a, b, c and d of each underdamped oscillator, as celerite names them.
+    def kernel(self) -> Any:
+        """Return the covariance function as a term of celerite2."""
+        from celerite2 import terms
 
-        They are those of celerite2's terms to the last bit, in a fraction of their time.
-        """
-        values = np.exp(self.parameters).tolist()
+        size, scale, *shape = np.exp(self.parameters)
         if self.kind == "correlated":
-            return [(values[0] ** 2, 1.0 / values[1])], []
+            return terms.RealTerm(a=size**2, c=1.0 / scale)
         if self.kind == "smooth":
-            return [], [_oscillator(values[0] ** 2, 2 * np.pi / values[1], SMOOTH_QUALITY)]
+            return terms.SHOTerm(sigma=size, rho=scale, Q=SMOOTH_QUALITY)
         if self.kind == "rotation":
-            sigma, period, quality, difference, share = values
-            first, second = 0.5 + quality + difference, 0.5 + quality
-            size = sigma**2 / (1 + share)
-            return [], [
-                _oscillator(size, 4 * np.pi * first / (period * math.sqrt(4 * first**2 - 1)), first),
-                _oscillator(share * size, 8 * np.pi * second / (period * math.sqrt(4 * second**2 - 1)), second),
-            ]
-        sigma, period, quality, ratio = values
+            return terms.RotationTerm(sigma=size, period=scale, **dict(zip(("Q0", "dQ", "f"), shape, strict=True)))
+        quality, ratio = shape
         sizes = ratio ** np.arange(float(HARMONICS))
-        sizes *= sigma / np.linalg.norm(sizes)
-        return [], [
-            _oscillator(size**2, 2 * np.pi / (period / k), k * quality) for k, size in enumerate(sizes.tolist(), 1)
-        ]
-
-
-def _oscillator(variance: float, frequency: float, quality: float) -> tuple[float, float, float, float]:
-    """Return the coefficients of a stochastically driven oscillator of a quality above 1/2."""
-    ratio = math.sqrt(max(4.0 * quality**2 - 1.0, 1e-5))
-    a, c = variance / (frequency * quality) * frequency * quality, 0.5 * frequency / quality
-    return a, a / ratio, c, c * ratio
+        sizes *= size / np.linalg.norm(sizes)
+        oscillators = (
+            terms.SHOTerm(sigma=sd, rho=scale / harmonic, Q=harmonic * quality) for harmonic, sd in enumerate(sizes, 1)
+        )
+        return terms.TermSum(*oscillators)
 
 
 @dataclass(frozen=True)
@@ -186,14 +173,7 @@ class Process:
         except ImportError as error:
             fault = "celerite2, which models the light of stars, is not installed; use pip install celerite2"
             raise InputError(fault, key="celerite2") from error
-        return terms.OriginalCeleriteTerm(self)
-
-    def get_all_coefficients(self) -> tuple[Float, ...]:
-        """Return the coefficients of the terms, as celerite2 asks for them."""
-        parts = [term.coefficients() for term in self.terms] or [([(0.0, 1.0)], [])]
-        decays = np.array([one for part, _ in parts for one in part]).reshape(-1, 2)
-        oscillators = np.array([one for _, part in parts for one in part]).reshape(-1, 4)
-        return tuple(np.ascontiguousarray(one) for one in (*decays.T, *oscillators.T))
+        return terms.TermSum(*(term.kernel() for term in self.terms)) if self.terms else terms.RealTerm(a=0.0, c=1.0)
 
     @property
     def shortest_s(self) -> float:
@@ -214,12 +194,12 @@ class Process:
     def describe(self, unit: float) -> str:
         """Return a description of the terms; `unit` is the light of the star, to which standard deviations relate."""
         words = {"correlated": "correlated noise", "smooth": "smooth variability"}
-        parts = [
+        descriptions = [
             f"{words.get(term.kind, term.kind)} ({'period' if term.rotates else 'time scale'} {_time(term.scale_s)}, "
             f"{100 * term.sd / unit:.2g} % in the process)"
             for term in self.terms
         ]
-        return ", ".join(parts) if parts else "constant light"
+        return ", ".join(descriptions) or "constant light"
 
     def at(self, lags_s: Float) -> Float:
         """Return the covariance at time lags, shape of `lags_s`."""
@@ -235,7 +215,7 @@ class Process:
 
 
 def _time(seconds: float) -> str:
-    """Return a time in a unit that suits it."""
+    """Format a time in a suitable unit."""
     for unit, size in (("d", 86_400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
@@ -261,7 +241,6 @@ class Covariance:
         if not (self._d > 0).all():
             raise np.linalg.LinAlgError("the covariance is not positive definite")
         self.log_determinant = float(np.log(self._d).sum())
-        self._forms: dict[tuple[int, int], Float] = {}
 
     def _solved_lower(self, values: Float) -> Float:
         out = np.array(values.reshape(len(values), -1), np.float64, order="C")
@@ -285,27 +264,25 @@ class Covariance:
         process has. Those more than `after` times later are neglected.
         """
         last = first + len(columns)
-        rows, rest = slice(first, last), slice(last, last + after)
+        rows, later = slice(first, last), slice(last, last + after)
         time, rates, solve = self._time, self._rates, self._driver.solve_lower
         innovations = solve(time[rows], rates, self._u[rows], self._w[rows], columns, columns)
         total = 0.0
         if last < time.size:
-            if (last, after) not in self._forms:
-                # Innovations of each unit state.
-                units = -self._u[rest] * np.exp((time[last] - time[rest, None]) * rates)
-                units = solve(time[rest], rates, self._u[rest], self._w[rest], units, units)
-                self._forms[last, after] = (units / self._d[rest, None]).T @ units
+            # Innovations of each unit state.
+            units = -self._u[later] * np.exp((time[last] - time[later, None]) * rates)
+            units = solve(time[later], rates, self._u[later], self._w[later], units, units)
             decay = np.exp((time[rows, None] - time[last]) * rates)
             state = (decay * self._w[rows]).T @ innovations
-            total = np.einsum("jo,jo->o", state, self._forms[last, after] @ state)
+            total = np.einsum("jo,jo->o", state, (units / self._d[later, None]).T @ units @ state)
         return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations) + total)
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""
         out = np.array(white.reshape(len(white), -1), np.float64, order="C") * np.sqrt(self._d)[:, None]
         product = np.array(out)
-        made = self._driver.matmul_lower(self._time, self._rates, self._u, self._w, out, product)
-        return np.asarray(made).reshape(np.shape(white))
+        values = self._driver.matmul_lower(self._time, self._rates, self._u, self._w, out, product)
+        return np.asarray(values).reshape(np.shape(white))
 
 
 def level_fit(covariance: Covariance, values: Float) -> tuple[float, float, Float]:
@@ -313,13 +290,12 @@ def level_fit(covariance: Covariance, values: Float) -> tuple[float, float, Floa
 
     The likelihood is integrated over a flat prior of the mean.
     """
-    both = np.ones((values.size, 2))
-    both[:, 0] = values
-    both = covariance.whitened(both)
-    information = float(both[:, 1] @ both[:, 1])
-    mean = float(both[:, 0] @ both[:, 1]) / information
-    left = both[:, 0] - mean * both[:, 1]
-    return mean, -0.5 * (float(left @ left) + covariance.log_determinant + np.log(information)), left
+    values, constant = covariance.whitened(np.column_stack([values, np.ones(values.size)])).T
+    information = float(constant @ constant)
+    mean = float(values @ constant) / information
+    residual = values - mean * constant
+    log_likelihood = -0.5 * (float(residual @ residual) + covariance.log_determinant + np.log(information))
+    return mean, log_likelihood, residual
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,8 +335,8 @@ class Binned:
         _, first, count = np.unique(number, return_index=True, return_counts=True)
         full = count >= factor / 2
 
-        def total(each: Float) -> Float:
-            return np.asarray(np.add.reduceat(each, first)[full])
+        def total(column: Float) -> Float:
+            return np.asarray(np.add.reduceat(column, first)[full])
 
         count = count[full]
         return cls(total(time_s) / count, total(values) / count, total(variance) / count**2, factor * step_s)
@@ -378,43 +354,43 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREP
     `steps` reports each combination of terms.
     """
     if start is not None:
-        return replace(_fitted(data, start.terms, float(np.log(start.excess)))[0], bic=start.bic)
-    best, value = _fitted(data, (), data.log_excess)
+        return replace(_fit_terms(data, start.terms, float(np.log(start.excess)))[0], bic=start.bic)
+    best, value = _fit_terms(data, (), data.log_excess)
     tried = {best.name: value}
     while len(best.terms) < MAX_TERMS:
         size, options = best.n_parameters, []
-        for terms in _starts(data, best):
+        for terms in _starting_terms(data, best):
             if (size + sum(len(term.parameters) for term in terms)) * VALUES_PER_PARAMETER <= data.values.size:
-                one, bic = _fitted(data, (*best.terms, *terms), data.log_excess)
-                options.append((one, bic))
+                process, bic = _fit_terms(data, (*best.terms, *terms), data.log_excess)
+                options.append((process, bic))
                 # A combination has several starting points.
-                tried[one.name] = min(bic, tried.get(one.name, np.inf))
+                tried[process.name] = min(bic, tried.get(process.name, np.inf))
                 steps.step()
-        other, lowest = min(options, key=lambda pair: pair[1], default=(best, np.inf))
+        better, lowest = min(options, key=itemgetter(1), default=(best, np.inf))
         if not lowest < value:
             break
-        best, value = other, lowest
-        if best.terms[-1].kind == "rotation" and (sharp := _sharper(data, best)) is not None:
+        best, value = better, lowest
+        if best.terms[-1].kind == "rotation" and (sharp := _sharpen(data, best)) is not None:
             tried[sharp[0].name] = sharp[1]
-            best, value = min((best, value), sharp, key=lambda pair: pair[1])
+            best, value = min((best, value), sharp, key=itemgetter(1))
     return replace(best, bic=tuple((name, bic - value) for name, bic in tried.items()))
 
 
-def _sharper(data: Binned, process: Process) -> tuple[Process, float] | None:
-    """Return a process whose last term, rotation, has more harmonics, and its BIC; None if these are not seen."""
+def _sharpen(data: Binned, process: Process) -> tuple[Process, float] | None:
+    """Return a process whose last term, rotation, has more harmonics, and its BIC; None if they do not fit better."""
     size, period, quality, *_ = process.terms[-1].parameters
     sharp = ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
     terms, log_excess = (*process.terms[:-1], sharp), float(np.log(process.excess))
     coarse = Binned.of(data.time_s, data.values, data.variance, data.step_s, MAX_TRIED)
-    fitted, bic = _fitted(coarse, terms, log_excess)
+    fitted, bic = _fit_terms(coarse, terms, log_excess)
     if coarse.step_s != data.step_s:
-        if bic + STRONG >= _fitted(coarse, process.terms, log_excess)[1]:
+        if bic + STRONG >= _fit_terms(coarse, process.terms, log_excess)[1]:
             return None
-        fitted, bic = _fitted(data, fitted.terms, log_excess)
+        fitted, bic = _fit_terms(data, fitted.terms, log_excess)
     return fitted, bic + STRONG
 
 
-def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
+def _starting_terms(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
     """Yield starting points of a further term, or of rotation with a slower change of the light."""
     covariance = best.covariance(data.time_s, data.variance * best.excess**2)
     spread = max(float(np.std(data.values - level_fit(covariance, data.values)[0])), data.noise)
@@ -427,26 +403,26 @@ def _starts(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
         return
     smooth = ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
     yield (smooth,)
-    if (period := _period(data, data.values, LONGEST)) is None:
+    if (period := _find_period(data, data.values, LONGEST)) is None:
         return
     for factor in (1.0, 2.0):
         yield (_rotation(spread, factor * period),)
     if not best.terms and period > FEW_TURNS * data.span_s:
         # Beside changes as long as the light curve, rotation is not the highest peak.
         slow = np.polynomial.Polynomial.fit(data.time_s, data.values, DEGREE)(data.time_s)
-        if (faster := _period(data, data.values - slow, FEW_TURNS)) is not None:
+        if (faster := _find_period(data, data.values - slow, FEW_TURNS)) is not None:
             yield smooth, _rotation(spread, faster)
 
 
 def _rotation(size: float, period: float) -> ProcessTerm:
     """Return the starting point of rotation."""
-    return ProcessTerm("rotation", tuple(float(np.log(one)) for one in (size, period, 10.0, 1.0, 0.3)))
+    return ProcessTerm("rotation", tuple(np.log([size, period, 10.0, 1.0, 0.3]).tolist()))
 
 
-def _period(data: Binned, values: Float, share: float) -> float | None:
+def _find_period(data: Binned, values: Float, share: float) -> float | None:
     """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
 
-    The values may be what is left of the data; `share` is the longest period over the length of the data.
+    The values may be residuals of the data; `share` is the longest period over the length of the data.
     """
     from astropy.timeseries import LombScargle
 
@@ -466,7 +442,7 @@ def _period(data: Binned, values: Float, share: float) -> float | None:
     return float(1.0 / frequency[best]) if chance < PERIODIC else None
 
 
-def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
+def _fit_terms(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
     """Return the process of some terms that fits best, and its BIC."""
     expected = data.log_excess
     start = np.array([log_excess, *(value for term in terms for value in term.parameters)])
@@ -479,13 +455,13 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
     low, high = np.array(bounds).T
     places = [*pairwise(accumulate([1, *(len(term.parameters) for term in terms)]))]
 
-    def made(x: Float) -> Process:
+    def process_of(x: Float) -> Process:
         values = x.tolist()
-        parts = [ProcessTerm(term.kind, tuple(values[i:j])) for term, (i, j) in zip(terms, places, strict=True)]
-        return Process(tuple(parts), float(np.exp(x[0])))
+        fitted = [ProcessTerm(term.kind, tuple(values[i:j])) for term, (i, j) in zip(terms, places, strict=True)]
+        return Process(tuple(fitted), float(np.exp(x[0])))
 
     def cost(x: Float) -> float:
-        process = made(x)
+        process = process_of(x)
         try:
             covariance = process.covariance(data.time_s, data.variance * process.excess**2)
         except (np.linalg.LinAlgError, RuntimeError, ValueError):
@@ -493,34 +469,19 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
         value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values)[1]
         return value if np.isfinite(value) else 1e25
 
-    known: dict[bytes, tuple[float, Float]] = {}
-
-    def slopes(x: Float) -> tuple[float, Float]:
-        # Fits begin where others end.
-        if x.tobytes() not in known:
-            known[x.tobytes()] = _with_slopes(cost, x, high)
-        return known[x.tobytes()]
+    def cost_and_slopes(x: Float) -> tuple[float, Float]:
+        # Differences forwards, or backwards at an upper bound, as scipy's, whose checks take as long as a cost.
+        value, moved = cost(x), x + np.diag(np.where(x + DIFFERENCE <= high, DIFFERENCE, -DIFFERENCE))
+        return value, (np.array([cost(row) for row in moved]) - value) / (np.diag(moved) - x)
 
     x, value = np.clip(start, low, high), np.inf
-    tolerance = CONVERGED / max(abs(slopes(x)[0]), 1.0)
+    options: Any = {"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(x)), 1.0)}
     # The estimate of the curvature may mislead a fit, which another one from its end on shows.
     for _ in range(STARTS):
-        options: Any = {"maxiter": ITERATIONS, "ftol": tolerance}
-        found = scipy.optimize.minimize(slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-        x, before, value = found.x, value, float(found.fun)
+        result = scipy.optimize.minimize(
+            cost_and_slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        )
+        x, before, value = result.x, value, float(result.fun)
         if before - value < SAME:
             break
-    return made(x), 2 * value + start.size * float(np.log(data.values.size))
-
-
-def _with_slopes(cost: Callable[[Float], float], x: Float, high: Float) -> tuple[float, Float]:
-    """Return a cost and its derivatives by forward differences, or backward ones at an upper bound.
-
-    These are those of scipy, which takes as long for its checks as a cost takes.
-    """
-    value, gradient = cost(x), np.empty(x.size)
-    for k, at in enumerate(x.tolist()):
-        there = np.array(x)
-        there[k] = at + DIFFERENCE if at + DIFFERENCE <= high[k] else at - DIFFERENCE
-        gradient[k] = (cost(there) - value) / (there[k] - at)
-    return value, gradient
+    return process_of(x), 2 * value + start.size * float(np.log(data.values.size))

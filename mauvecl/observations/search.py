@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from mauvecl.flares.stare import Stare, select_frames
-from mauvecl.host.arrays import Bool, Float, map_in_threads
+from mauvecl.host.arrays import Bool, Float, array_cache, map_in_threads
 from mauvecl.observations.level import LevelGiven
 from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
 from mauvecl.schema.fields import DAY_S
@@ -38,59 +38,32 @@ if TYPE_CHECKING:
     from mauvecl.observations.process import Covariance
 
 
-#: Flux of a template relative to its peak below which it is neglected.
+#: Flux of a template, relative to its peak, below which it is neglected.
 NEGLECTED = 1e-4
 #: Frames around a template from which its denominator follows: a multiple of its length, smallest and largest number.
 MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 1024, 4096
 #: Share of a denominator in frames next to gaps or with other noise from which it is solved exactly.
 IRREGULAR = 1e-4
-#: The same for frames that are taken away, next to ends and gaps, too, where they matter more than `squares` say.
-CHANGED = 1e-2
 #: Relative change of the variance of a frame that is treated exactly.
 OTHER_NOISE = 0.5
-#: Number of frames, unless a template is longer, and largest number of templates in one solution.
+#: Largest numbers of frames (unless a template is longer) and of templates that are solved together.
 CHUNK_FRAMES, CHUNK_TEMPLATES = 256, 512
-#: Number of values of light curves below which templates are searched one after another.
-FEW_VALUES = 2**15
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedNorms:
-    """Values of s^T C^-1 s of a template at all onsets."""
-
-    norm: Float  # shape (n_onset,)
-    unit: float  # without gaps and with constant noise
-    diagonal: float  # of C^-1 without gaps and with constant noise
-    squares: Float  # squared solution C^-1 s without gaps, from `margin` frames before the template to as many after it
-    margin: int
-    unsolved: Bool  # shape (n_onset,); whether the norm of an onset is still that without gaps
-
-    @property
-    def irregular(self) -> Float:
-        """Sum of `squares` in irregular frames above which a norm is solved exactly, shape (n_onset,).
-
-        A single frame contributes its square over the diagonal of C^-1.
-        """
-        return IRREGULAR * self.diagonal * np.maximum(self.norm, IRREGULAR * self.unit)
 
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """Templates of one half-width and phase at all onsets, with the norms of each sum."""
+    """Templates of one half-width and phase at all onsets, with the norm s^T C^-1 s of each sum."""
 
     template: Template
     phase: int
     shape: Float  # flux of the template above `NEGLECTED`, shape (n,)
     first: int  # its first frame, relative to the frame of the peak
     peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
-    norms: tuple[SolvedNorms, ...]  # of each sum; they are solved when they are needed
+    norms: Float  # shape (n_sum, n_onset)
+    unsolved: Bool  # shape (n_sum, n_onset); whether a norm must be solved exactly before it is used
     lost: Float  # shape (n_sum, n_onset); what the unknown level takes from the norms
     weights: Float  # shape (n_direction, n_sum); squared directions of the bank
-
-    @property
-    def without_gaps(self) -> Float:
-        """Squared denominator along each direction without gaps, shape (n_direction, 1)."""
-        return np.asarray(self.weights @ np.array([[one.unit] for one in self.norms]))
+    without_gaps: Float  # shape (n_direction, 1); squared denominator without gaps and with constant noise
 
     @property
     def per_amplitude(self) -> Float:
@@ -98,40 +71,31 @@ class Filter:
 
         It is zero where the template is not searched, and where its norm is not solved.
         """
-        norm = self.weights @ np.maximum(np.array([one.norm for one in self.norms]) - self.lost, 0.0)
-        tried = (norm >= LEAST_SHARE * self.without_gaps) & ~np.any([one.unsolved for one in self.norms], axis=0)
-        return np.sqrt(np.where(tried, norm, 0.0))
+        squared = self.weights @ np.maximum(self.norms - self.lost, 0.0)
+        searched = (squared >= LEAST_SHARE * self.without_gaps) & ~self.unsolved.any(axis=0)
+        return np.sqrt(np.where(searched, squared, 0.0))
 
 
 class ProcessSearch:
     """Search of light curves for flares; each frame has independent sums, with a process each.
 
-    The variance is that of the noise of each frame's sums. `before` is a search of the same frames and further ones:
-    denominators are solved anew only where the further frames contribute to them.
+    The variance is that of the noise of each frame's sums.
     """
 
-    def __init__(
-        self, bank: Bank, stare: Stare, processes: tuple[Process, ...], variance: Float,
-        before: ProcessSearch | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, bank: Bank, stare: Stare, processes: tuple[Process, ...], variance: Float) -> None:
         self.bank, self.stare, self.processes, self.variance = bank, stare, processes, variance
         numbers = stare.numbers
-        if before is None:
-            # Gaps are no longer than two templates, since none reaches over them and their frames only take memory.
-            longest = 2 * max(abs(one.first) + one.shapes.shape[1] for one in bank.templates)
-            steps = np.diff(numbers)
-            long = np.flatnonzero(steps > longest)
-            lacking = np.concatenate([[0], np.cumsum(steps[long] - longest)])
-            # Middles of shortened gaps, shape (n_gap,), and frames that all gaps before each part of the grid lack.
-            gaps = numbers[long] + longest // 2 - lacking[:-1], lacking
-        else:
-            gaps = before._gaps
-        self._gaps: tuple[NDArray[np.int64], NDArray[np.int64]] = gaps
-        middle, lacking = gaps
-        self.frames = numbers - lacking[np.searchsorted(middle + lacking[:-1], numbers, side="right")]
+        # Gaps are no longer than two templates, since none reaches over them and their frames only take memory.
+        longest = 2 * max(abs(template.first) + template.shapes.shape[1] for template in bank.templates)
+        steps = np.diff(numbers)
+        long = np.flatnonzero(steps > longest)
+        # Frames that all gaps before each part of the grid lack, and middles of the shortened gaps, shape (n_gap,).
+        self._lacking = np.concatenate([[0], np.cumsum(steps[long] - longest)])
+        self._middles = numbers[long] + longest // 2 - self._lacking[:-1]
+        after = np.searchsorted(self._middles + self._lacking[:-1], numbers, side="right")
+        self.frames = numbers - self._lacking[after]
         self.at = self.frames - self.frames[0]
         self.n_grid = int(self.at[-1]) + 1
-        self._before = before
 
     @cached_property
     def covariances(self) -> tuple[Covariance, ...]:
@@ -143,25 +107,20 @@ class ProcessSearch:
     @cached_property
     def _levels(self) -> tuple[Float, ...]:
         """C^-1 1 of each sum, shape (n_frame,)."""
-        return tuple(one.solve(np.ones(self.stare.n_frames)) for one in self.covariances)
+        return tuple(covariance.solve(np.ones(self.stare.n_frames)) for covariance in self.covariances)
 
     @cached_property
     def filters(self) -> list[Filter]:
         """Templates with the denominators that were solved by now."""
         _ = self._levels
-        templates = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
-        earlier = self._before.filters if self._before is not None else [None] * len(templates)
-        pairs = list(zip(templates, earlier, strict=True))
-        threads = 1 if self.n_grid < FEW_VALUES else None
-        filters = list(map_in_threads(lambda pair: self._filter(*pair[0], pair[1]), pairs, threads))
-        self._before = None
-        return filters
+        pairs = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
+        return list(map_in_threads(lambda pair: self._prepare_filter(*pair), pairs))
 
     @cached_property
     def rows(self) -> list[Filter]:
         """Templates of which all denominators are solved."""
-        for one in self.filters:
-            self._solve(one, np.ones(one.peaks.size, np.bool_))
+        for row in self.filters:
+            self._solve(row, np.ones(row.peaks.size, np.bool_))
         return self.filters
 
     def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[Filter, Float]]:
@@ -177,22 +136,22 @@ class ProcessSearch:
             values = np.asarray(sums[:, :, k], np.float64)
             mean = (values @ level) / level.sum()
             scores[:, k, self.at] = covariance.solve(values.T).T - mean[:, None] * level
-        correlations = Correlations(scores, max(max(one.shape.size, abs(one.first)) for one in filters))
+        correlations = Correlations(scores, max(max(row.shape.size, abs(row.first)) for row in filters))
 
-        def searched(one: Filter) -> tuple[Filter, Float]:
-            correlated = correlations.of(one.shape, one.first)[..., one.peaks]
+        def search_row(row: Filter) -> tuple[Filter, Float]:
+            correlated = correlations.of(row.shape, row.first)[..., row.peaks]
             rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
             if above is not None:
                 # A template of which a smaller share lies in frames is not searched.
-                least = np.sqrt(LEAST_SHARE * one.without_gaps)
-                self._solve(one, (rho[0] > above * least).any(axis=0))
-            per_amplitude = one.per_amplitude
-            tried = per_amplitude > 0
-            np.divide(rho, per_amplitude, out=rho, where=tried)
-            rho[:, ~tried] = -np.inf
-            return one, rho
+                least = np.sqrt(LEAST_SHARE * row.without_gaps)
+                self._solve(row, (rho[0] > above * least).any(axis=0))
+            per_amplitude = row.per_amplitude
+            searched = per_amplitude > 0
+            np.divide(rho, per_amplitude, out=rho, where=searched)
+            rho[:, ~searched] = -np.inf
+            return row, rho
 
-        yield from map_in_threads(searched, filters, 1 if scores.size < FEW_VALUES else None)
+        yield from map_in_threads(search_row, filters)
 
     def largest(self, sums: NDArray[Any]) -> Float:
         """Return the largest value of each light curve, shape (n_stare,)."""
@@ -200,104 +159,99 @@ class ProcessSearch:
 
     def peaks_s(self, row: Filter) -> Float:
         """Return the times of the peaks of a row's templates, from the start of the stare, shape (n_onset,)."""
-        (middle, lacking), places = self._gaps, self.frames[0] + row.peaks
+        places = self.frames[0] + row.peaks
         # A gap belongs to the frames next to each of its halves.
-        numbers = places + lacking[np.searchsorted(middle, places, side="right")]
+        numbers = places + self._lacking[np.searchsorted(self._middles, places, side="right")]
         return np.asarray((numbers + row.template.phases[row.phase]) * self.bank.frame_s)
 
-    def _filter(self, template: Template, phase: int, earlier: Filter | None) -> Filter:
-        """Prepare the templates of a half-width and phase, from those of the search `before`, if there is one."""
-        whole = template.shapes[phase]
-        bright = np.flatnonzero(whole > NEGLECTED * whole.max())
-        shape = whole[bright[0] : bright[-1] + 1]
+    def _prepare_filter(self, template: Template, phase: int) -> Filter:
+        """Prepare the templates of a half-width and phase, with norms that are not solved next to gaps and ends."""
+        flux = template.shapes[phase]
+        bright = np.flatnonzero(flux > NEGLECTED * flux.max())
+        shape = flux[bright[0] : bright[-1] + 1]
         first = template.first + int(bright[0])
         peaks = np.arange(-int(self.frames[0]) % template.stride, self.n_grid, template.stride)
-        norms, lost = list[SolvedNorms](), np.zeros((len(self.processes), peaks.size))
-        held = np.zeros(self.n_grid)
-        before = self._before
-        if before is not None and earlier is not None:
-            # Frames that are missing now, on the grid of the search before.
-            gone, origin = np.zeros(before.n_grid), int(self.frames[0] - before.frames[0])
-            gone[before.at], gone[origin + self.at] = 1.0, 0.0
-            part = np.searchsorted(earlier.peaks, origin + peaks)
-        for k, level in enumerate(self._levels):
-            if not self.processes[k].terms:
-                # Independent noise.
-                variance = self.variance * self.processes[k].excess ** 2
-                held[self.at] = 1.0 / variance
-                norm, typical = _correlated(held, shape**2, first)[peaks], float(np.median(variance))
-                unit, solved = float((shape**2).sum() / typical), np.zeros(peaks.size, np.bool_)
-                norms.append(SolvedNorms(norm, unit, 1.0 / typical, (shape / typical) ** 2, 0, solved))
-            elif before is None or earlier is None:
-                norms.append(self._norms(k, shape, first, peaks))
+        norms, lost = np.zeros((2, len(self.processes), peaks.size))
+        unsolved, units = np.zeros(norms.shape, np.bool_), np.zeros((len(self.processes), 1))
+        on_grid = np.zeros(self.n_grid)
+        for k, (process, level) in enumerate(zip(self.processes, self._levels, strict=True)):
+            if process.terms:
+                norms[k], unsolved[k], units[k] = self._approximate_norms(k, shape, first, peaks)
             else:
-                # Norms are solved anew where missing frames contribute to them.
-                old = earlier.norms[k]
-                one = replace(old, norm=old.norm[part], unsolved=old.unsolved[part])
-                share = _correlated(gone, old.squares, earlier.first - old.margin)[origin + peaks]
-                norms.append(replace(one, unsolved=one.unsolved | (share > CHANGED * one.irregular)))
-            held[self.at] = level
-            lost[k] = _correlated(held, shape, first)[peaks] ** 2 / level.sum()
-        return Filter(template, phase, shape, first, peaks, tuple(norms), lost, self.bank.directions**2)
+                # Independent noise.
+                variance = self.variance * process.excess**2
+                on_grid[self.at] = 1.0 / variance
+                norms[k] = _correlate(on_grid, shape**2, first)[peaks]
+                units[k] = (shape**2).sum() / np.median(variance)
+            on_grid[self.at] = level
+            lost[k] = _correlate(on_grid, shape, first)[peaks] ** 2 / level.sum()
+        weights = self.bank.directions**2
+        return Filter(template, phase, shape, first, peaks, norms, unsolved, lost, weights, weights @ units)
 
-    def _norms(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
-        """Compute s^T C^-1 s of a sum at peaks that are not next to gaps or ends."""
+    def _approximate_norms(
+        self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]
+    ) -> tuple[Float, Bool, float]:
+        """Return s^T C^-1 s of a sum at peaks, whether it must be solved there, and its value without gaps."""
         process = self.processes[k]
         variance = self.variance * process.excess**2
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
-        typical, frame_s = float(np.median(variance)), self.bank.frame_s
-        size = shape.size + 2 * margin
-        whole = process.covariance(np.arange(size, dtype=np.float64) * frame_s, np.full(size, typical))
-        both = np.zeros((size, 2))
-        both[margin : margin + shape.size, 0] = shape
-        both[size // 2, 1] = 1.0
-        solved = whole.solve(both)
-        response, unit = solved[:, 0], float(solved[margin : margin + shape.size, 0] @ shape)
-        centre = float(solved[size // 2, 1])
-        squares = response**2
+        typical, size = float(np.median(variance)), shape.size + 2 * margin
+        response, inverse = _regular_solution(process, typical, self.bank.frame_s, np.pad(shape, margin)).T
+        # The norm and the diagonal of C^-1, without gaps and with constant noise.
+        unit, diagonal = float(response[margin : margin + shape.size] @ shape), float(inverse[size // 2])
         # Frames at which the solution differs: gaps and ends, other noise; single missing frames are exact.
         present = np.zeros(self.n_grid + 2, np.bool_)
         present[1 + self.at] = True
         single = ~present[1:-1] & present[:-2] & present[2:]
-        bad = ~present[1:-1] & ~single
+        irregular = ~present[1:-1] & ~single
         change = variance / typical - 1.0
-        bad[self.at[np.abs(change) > OTHER_NOISE]] = True
+        irregular[self.at[np.abs(change) > OTHER_NOISE]] = True
         moved = np.zeros(self.n_grid)
         moved[self.at] = np.where(np.abs(change) > OTHER_NOISE, 0.0, change * typical)
-        start = first - margin
-        share = _correlated(np.pad(bad, size, constant_values=True).astype(np.float64), squares, start)
-        missing = _correlated(single.astype(np.float64), squares, start)[peaks] / centre
-        norm = np.maximum(unit - missing, 0.0)
-        norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[peaks] / unit, 0.1)
-        one = SolvedNorms(norm, unit, centre, squares, margin, np.zeros(peaks.size, np.bool_))
-        return replace(one, unsolved=share[size + peaks] > one.irregular)
+        signals = np.pad([irregular, single, moved], [(0, 0), (size, size)])
+        # The frames beyond the ends are irregular.
+        signals[0, :size] = signals[0, -size:] = 1.0
+        share, missing, noise = _correlate(signals, response**2, first - margin)[:, size + peaks]
+        norm = np.maximum(unit - missing / diagonal, 0.0) / np.maximum(1.0 + noise / unit, 0.1)
+        # A single frame contributes its squared response over the diagonal of C^-1.
+        return norm, share > IRREGULAR * diagonal * np.maximum(norm, IRREGULAR * unit), unit
 
-    def _solve(self, one: Filter, chosen: Bool) -> None:
+    def _solve(self, row: Filter, chosen: Bool) -> None:
         """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved.
 
         Innovations of a template are neglected `MOST_MARGIN` frames after it.
         """
-        padded = np.pad(one.shape, 1)
-        for k, norms in enumerate(one.norms):
-            left = np.flatnonzero(chosen & norms.unsolved)
-            norms.unsolved[left] = False
-            starts = one.peaks[left] + one.first
-            while left.size:
-                stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, one.shape.size), side="right"))
+        padded, size = np.pad(row.shape, 1), row.shape.size
+        for covariance, norms, unsolved in zip(self.covariances, row.norms, row.unsolved, strict=True):
+            onsets = np.flatnonzero(unsolved & chosen)
+            unsolved[onsets] = False
+            starts = row.peaks[onsets] + row.first
+            while onsets.size:
+                stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, size), side="right"))
                 stop = min(stop, CHUNK_TEMPLATES)
-                begin, end = np.searchsorted(self.at, [starts[0], starts[stop - 1] + one.shape.size])
-                norms.norm[left[:stop]] = 0.0
+                begin, end = np.searchsorted(self.at, [starts[0], starts[stop - 1] + size])
+                norms[onsets[:stop]] = 0.0
                 if end > begin:
-                    # Many shapes end before the same frame, so that what follows it is solved once.
-                    end = min(-(-end // CHUNK_FRAMES) * CHUNK_FRAMES, self.at.size)
                     place = self.at[begin:end, None] - starts[:stop] + 1
-                    columns = padded[np.clip(place, 0, one.shape.size + 1, out=place)]
-                    norms.norm[left[:stop]] = self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
-                left, starts = left[stop:], starts[stop:]
+                    columns = padded[np.clip(place, 0, size + 1, out=place)]
+                    norms[onsets[:stop]] = covariance.squared_norms(columns, int(begin), MOST_MARGIN)
+                onsets, starts = onsets[stop:], starts[stop:]
+
+
+@array_cache(maxsize=64)
+def _regular_solution(process: Process, variance: float, frame_s: float, shape: Float) -> Float:
+    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, shape (n, 2).
+
+    Searches of a light curve after each event ask for the same solutions.
+    """
+    single = np.zeros(shape.size)
+    single[shape.size // 2] = 1.0
+    covariance = process.covariance(np.arange(float(shape.size)) * frame_s, np.full(shape.size, variance))
+    return covariance.solve(np.column_stack([shape, single]))
 
 
 class Correlations:
-    """Correlations of light curves with kernels of some largest reach, which share the transform of the light curves.
+    """Correlations of light curves with kernels up to a largest reach, which share the transform of the light curves.
 
     Values beyond the ends of the last axis are zero.
     """
@@ -310,11 +264,11 @@ class Correlations:
     def of(self, kernel: Float, first: int) -> Float:
         """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis."""
         start = self._reach + first
-        found = irfft(self._spectrum * rfft(kernel, self._size).conj(), self._size)
-        return found[..., start : start + self.values.shape[-1]]
+        correlated = irfft(self._spectrum * rfft(kernel, self._size).conj(), self._size)
+        return correlated[..., start : start + self.values.shape[-1]]
 
 
-def _correlated(values: Float, kernel: Float, first: int) -> Float:
+def _correlate(values: Float, kernel: Float, first: int) -> Float:
     """Return the correlation of values with a single kernel; see `Correlations`."""
     return Correlations(values, max(abs(first), kernel.size)).of(kernel, first)
 
@@ -372,12 +326,12 @@ class SeriesSurvey:
     ) -> SeriesSurvey:  # fmt: skip
         """Prepare the frames that can be searched, `used`, without a process; see the attributes.
 
-        What is searched is the flux, or sums of spectra, given `weighted` with their templates.
+        The flux is searched, or sums of spectra, which are given by `weighted` with their templates.
         """
         stare = stare_of(frames, used)
         scale = float(np.sqrt(np.median(variance[used])))
         typical = abs(level)
-        net, part = flux[used] / scale, variance[used] / scale**2
+        net, relative_variance = flux[used] / scale, variance[used] / scale**2
         if weighted is None:
             size, noise, directions, sums = typical / scale, photon * typical / scale**2, np.ones((1, 1)), net[:, None]
             templates = Templates(
@@ -388,8 +342,8 @@ class SeriesSurvey:
             directions = templates.directions[list(templates.chosen)]
         return cls(
             stare, bank_of(stare, directions, shape), templates, sums,
-            variance=part, processes=(WHITE,) * sums.shape[1], flux=net, flux_process=WHITE, scale=scale, level=typical,
-            photon=photon, time_s=frames.time_s[used], counts=counts, weighted=weighted is not None,
+            variance=relative_variance, processes=(WHITE,) * sums.shape[1], flux=net, flux_process=WHITE, scale=scale,
+            level=typical, photon=photon, time_s=frames.time_s[used], counts=counts, weighted=weighted is not None,
         )  # fmt: skip
 
     @cached_property
@@ -423,18 +377,18 @@ class SeriesSurvey:
         """Return the survey upside down: losses of light become flares."""
         return replace(self, sums=-self.sums, flux=-self.flux)
 
-    def frames(self, kept: Bool) -> SeriesSurvey:
+    def frames(self, chosen: Bool) -> SeriesSurvey:
         """Return the survey of some of the frames."""
-        parts = {name: getattr(self, name)[kept] for name in ("sums", "variance", "flux", "time_s")}
-        return replace(self, stare=select_frames(self.stare, kept), **parts)
+        arrays = {name: getattr(self, name)[chosen] for name in ("sums", "variance", "flux", "time_s")}
+        return replace(self, stare=select_frames(self.stare, chosen), **arrays)
 
 
 def stare_of(frames: Frames, used: Bool) -> Stare:
-    """Return the frames that are searched as a stare on the regular grid of the cadence."""
+    """Return the searched frames as a stare on the regular grid of the cadence."""
     numbers = frames.numbers[used]
-    ones = np.ones(numbers.size)
+    unit = np.ones(numbers.size)
     return Stare(
-        np.asarray((numbers - numbers[0]) * frames.cadence_s, np.float64), frames.cadence_s, ones, ones, ones,
+        np.asarray((numbers - numbers[0]) * frames.cadence_s, np.float64), frames.cadence_s, unit, unit, unit,
         np.zeros(numbers.size),
     )  # fmt: skip
 
@@ -520,22 +474,23 @@ def simulated_rates(
     `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
     """
     residual = innovations(survey, quiet)
-    part = survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
-    n, n_sum = part.sums.shape
-    days = part.stare.observed_s / DAY_S
+    beginning = survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
+    n, n_sum = beginning.sums.shape
+    days = beginning.stare.observed_s / DAY_S
     most = max(MIN_SIMULATED, MAX_VALUES // (n * n_sum))
     count = int(np.clip(MIN_ALARMS / (rate * days), MIN_SIMULATED, min(MAX_SIMULATED, most)))
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, SIMULATION_KEY]))
     length = max(block_length(column) for column in residual.T)
-    covariances = part.search.covariances
+    search = beginning.search
     counts = np.maximum(survey.levels(quiet)[:n, 0] * survey.scale * survey.counts, 0.0) if survey.counts else None
 
     def coloured(white: Float) -> Float:
-        return np.stack([one.coloured(white[:, :, k].T).T for k, one in enumerate(covariances)], axis=2)
+        columns = [covariance.coloured(white[:, :, k].T).T for k, covariance in enumerate(search.covariances)]
+        return np.stack(columns, axis=2)
 
     modelled, measured = list[Float](), list[Float]()
     batch = max(1, BATCH // (n * n_sum))
-    for first in steps.each(range(0, count, batch), -(-count // batch)):
+    for first in steps.track(range(0, count, batch), -(-count // batch)):
         size = min(batch, count - first)
         starts = rng.integers(0, len(residual), (size, -(-n // length)))
         rows = (starts[:, :, None] + np.arange(length)) % len(residual)
@@ -544,8 +499,8 @@ def simulated_rates(
             drawn = coloured(drawn)
         else:
             drawn = rng.poisson(counts, (size, n))[:, :, None] / survey.counts / survey.scale
-        modelled.append(part.search.largest(drawn))
-        measured.append(part.search.largest(coloured(residual[rows.reshape(size, -1)[:, :n]])))
+        modelled.append(search.largest(drawn))
+        measured.append(search.largest(coloured(residual[rows.reshape(size, -1)[:, :n]])))
     of_model, of_residuals = (np.sort(np.concatenate(values)) for values in (modelled, measured))
     return SimulatedRate(of_model, days, bool(survey.counts)), SimulatedRate(of_residuals, days, True)
 

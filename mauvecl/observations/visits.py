@@ -62,8 +62,8 @@ def visit_times_d(windows: Windows, visits: int, exposure_s: float, seed: int) -
         raise InputError.of("observation.exposure_s", exposure_s, expected, unit="s")
     ends = np.cumsum(room)
     at = np.sort(np.random.default_rng(seed).uniform(0.0, ends[-1], visits))
-    which = np.searchsorted(ends, at, side="right")
-    start = windows.start_s[which] + at - (ends[which] - room[which])
+    window = np.searchsorted(ends, at, side="right")
+    start = windows.start_s[window] + at - (ends[window] - room[window])
     return np.asarray((start + exposure_s / 2) / 86_400.0)
 
 
@@ -120,12 +120,12 @@ def recover_periods(
     for amplitude in amplitudes:
         row = []
         for period in periods_d:
-            found = 0
+            recoveries = 0
             for phase in generator.uniform(0, 2 * np.pi, trials):
                 values = amplitude * np.sin(2 * np.pi * time / period + phase) + generator.standard_normal(time.size)
                 power, at = peak(values)
-                found += power > threshold and abs(at - 1 / period) < 0.5 / base
-            row.append(clopper_pearson(found, trials))
+                recoveries += power > threshold and abs(at - 1 / period) < 0.5 / base
+            row.append(clopper_pearson(recoveries, trials))
         recovered.append(row)
     return Recovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
 
@@ -141,7 +141,7 @@ def _frequencies(base: float, low: float, high: float) -> Float:
     return np.asarray(max(low - 0.5 / base, step) + step * np.arange(count))
 
 
-#: Share of the information on a change that must be left by what is unknown; less is rounding.
+#: Smallest share of the information on a change that unknowns may leave; a smaller one is a rounding error.
 LEAST_KEPT = 1e-10
 #: Share of the largest change of a pixel above which a change concerns a pixel.
 LEAST_LIGHT = 1e-3
@@ -179,16 +179,16 @@ def smallest_change(
     """
     dof = visits - 1
     cut = float(scipy.stats.chi2.isf(fap, dof))
-    rest = float(scipy.stats.chi2.isf(power, dof))
     if power <= fap:
         return Smallest(0.0, 0.0)
     # Non-centrality with which the test exceeds its threshold with this probability.
     centre = scipy.special.chndtrinc(cut, dof, 1.0 - power)
-    return Smallest(float(error * np.sqrt(centre * visits / dof)), float(error * np.sqrt(cut / rest - 1.0)))
+    ratio = cut / float(scipy.stats.chi2.isf(power, dof))
+    return Smallest(float(error * np.sqrt(centre * visits / dof)), float(error * np.sqrt(ratio - 1.0)))
 
 
 def pixels_of(counts_dn: Float, quiet: Expectation) -> tuple[int, int]:
-    """Return how many of the pixels that a change of the light concerns are near saturation, and how many these are."""
+    """Return the number of pixels near saturation among those that a change of the light concerns, and of all these."""
     concerned = np.abs(counts_dn) > LEAST_LIGHT * np.abs(counts_dn).max(initial=0.0)
     return int((concerned & ~variance_of(quiet)[1]).sum()), int(concerned.sum())
 
@@ -205,10 +205,10 @@ def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | N
         return float("nan")
     delta = np.where(used, counts_dn, 0.0)
     weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
-    information = whole = float(weights @ delta)
+    information = without_unknowns = float(weights @ delta)
     if unknown:
         information -= float(np.sum((unknown.rows(variance * used, unknown.spectra * used) @ delta) ** 2))
-    return information**-0.5 if information > LEAST_KEPT * whole > 0 else float("inf")
+    return information**-0.5 if information > LEAST_KEPT * without_unknowns > 0 else float("inf")
 
 
 def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
@@ -232,7 +232,7 @@ def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None
 #: assumption; definitions of Mg II indices differ between experiments, and none for stars at this resolution was found.
 MG_II_NM = (278.5, 281.5)
 MG_II_CONTINUUM_NM = ((275.5, 278.0), (282.0, 284.5))
-#: Smallest number of pixels of the continuum, for a straight line and a sign of its scatter.
+#: Smallest number of pixels of the continuum, from which a straight line and its scatter follow.
 MIN_CONTINUUM = 3
 
 
@@ -318,12 +318,13 @@ def line_index(
     good = np.isfinite(light) & np.isfinite(sd) & (sd > 0)
     if not good[..., inside].all():
         raise InputError("every pixel in the band needs a finite flux and an error above 0", key="flux")
-    left = good & np.any([(nm >= start) & (nm <= end) for start, end in continuum_nm], axis=0)
-    if (count := int(left.sum(axis=-1).min(initial=nm.size))) < MIN_CONTINUUM:
+    in_continuum = good & np.any([(nm >= start) & (nm <= end) for start, end in continuum_nm], axis=0)
+    count = int(in_continuum.sum(axis=-1).min(initial=nm.size))
+    if count < MIN_CONTINUUM:
         raise InputError(f"the continuum needs {MIN_CONTINUUM} usable pixels or more, not {count}", key="continuum_nm")
-    weight = np.where(left, 1.0 / np.where(left, sd, 1.0) ** 2, 0.0)
+    weight = np.where(in_continuum, 1.0 / np.where(in_continuum, sd, 1.0) ** 2, 0.0)
     continuum = _integral_of_line(nm - (low + high) / 2, weight, share)
-    light, sd = (np.where(left | inside, each, 0.0) for each in (light, sd))
+    light, sd = (np.where(in_continuum | inside, values, 0.0) for values in (light, sd))
     level = (continuum * light).sum(axis=-1)
     index = (share * light).sum(axis=-1) - level
     variance = ((share - continuum) ** 2 * sd**2).sum(axis=-1)
@@ -354,8 +355,8 @@ class Index:
 #: The published windows of Ca II and H alpha were compared with the table of ACTIN 2, that of H beta with lists of Lick
 #: indices, that of Mg II with the public code of the Mg II index of SUIT; the papers themselves were not read.
 INDICES = {
-    one.name: one
-    for one in (
+    index.name: index
+    for index in (
         Index("Mg II", (272.0, 288.0), ((258.0, 270.0), (290.0, 302.0)),
               "solar index: 4/3 of the sum at 279.8, 280.0 and 280.2 nm over that at 276.6, 276.8, 283.2 and 283.4 nm "
               "(Heath & Schlesinger 1986, J. Geophys. Res. 91, 8672)"),
@@ -396,35 +397,38 @@ class Change:
         which is measured in `band`.
         """
         nm, unit = GRID_NM, ""
-        own = np.interp(nm, star.wavelength_nm, star.flux_flam, left=0.0, right=0.0)
+        starlight = np.interp(nm, star.wavelength_nm, star.flux_flam, left=0.0, right=0.0)
         words = name.strip().casefold()
         if words == "balmer jump":
-            flux, meaning = own * _below(BALMER_EDGE_NM), "relative change of the light below the Balmer edge"
+            flux = starlight * _share_below(BALMER_EDGE_NM)
+            meaning = "relative change of the light below the Balmer edge"
         elif words == "colour":
-            flux, unit = LOG_PER_MAG * own * _below(COLOUR_NM), "mag"
+            flux, unit = LOG_PER_MAG * starlight * _share_below(COLOUR_NM), "mag"
             meaning = f"brightening of the light below {COLOUR_NM:g} nm against that above"
         elif words == "spectrum":
             if file is None:
                 raise InputError("the change 'spectrum' needs a file; give `change.file`", key="change.file")
-            of_star, of_file = (photons(one.wavelength_nm, one.flux_flam, band) for one in (star, file))
+            of_star, of_file = (photons(source.wavelength_nm, source.flux_flam, band) for source in (star, file))
             nm, flux = file.wavelength_nm, of_star / of_file * file.flux_flam
             meaning = f"light of {file.name} over that of the star in {band}"
-        elif (limits := _band(name)) is not None:
-            flux = own * (_below(limits[1]) - _below(limits[0]))
+        elif (limits := _parse_band(name)) is not None:
+            flux = starlight * (_share_below(limits[1]) - _share_below(limits[0]))
             meaning = f"relative change of the light in {limits[0]:g}-{limits[1]:g} nm"
         else:
             try:
                 line = EmissionLine.named(name)
             except InputError:
-                known = f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum"
-                raise InputError.of("change.of", shortened(name), known) from None
+                expected = (
+                    f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum"
+                )
+                raise InputError.of("change.of", shortened(name), expected) from None
             nm = np.unique(np.concatenate([nm, line.nodes_nm]))
             flux, unit, meaning = line.profile(nm), "erg / (s cm2)", f"flux of {line.name}"
         rate = electrons_per_second(instrument, nm, flux, order)
         return cls(name.strip(), unit, meaning, rate * _exposure_dn_per_electron(quiet, instrument))
 
 
-def _below(edge_nm: float) -> Float:
+def _share_below(edge_nm: float) -> Float:
     """Return factors at `GRID_NM` of light that ends at a wavelength, with the sum and mean of a sharp edge.
 
     The flux is linear between the wavelengths, and the factor of each is the share of its triangle below the edge.
@@ -433,9 +437,9 @@ def _below(edge_nm: float) -> Float:
     return np.asarray(np.where(distance < 0.0, (1.0 + distance) ** 2, 2.0 - (1.0 - distance) ** 2) / 2.0)
 
 
-def _band(name: str) -> tuple[float, float] | None:
+def _parse_band(name: str) -> tuple[float, float] | None:
     try:
-        low, high = (float(part) for part in name.split("-"))
+        low, high = map(float, name.split("-"))
     except ValueError:
         return None
     if not 0 < low < high:

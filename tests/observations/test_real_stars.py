@@ -83,7 +83,7 @@ def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
     if taken:
         left = ((number < n // 2) | (number > n // 2 + 40)) & ((number > 10) | (number == number[0]))
         number, variance = number[left], variance[left]
-        search = searches.ProcessSearch(bank, searches.stare_of(frames, left), (process,), variance, search)
+        search = searches.ProcessSearch(bank, searches.stare_of(frames, left), (process,), variance)
     time = number * 120.0
     dense = np.linalg.inv(process.at(time[:, None] - time) + np.diag(variance))
     ones = dense.sum(axis=1)
@@ -104,22 +104,17 @@ def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold
     rng = np.random.default_rng(402)
     number = np.flatnonzero((rng.random(2500) > 0.03) & (np.abs(np.arange(2500) - 900) > 20))
     frames = Frames.of(number * 120.0, np.ones(number.size), exposure_s=120.0)
-    stare = searches.stare_of(frames, np.ones(number.size, np.bool_))
-    bank = searches.bank_of(stare, np.ones((1, 1)), DAVENPORT)
     left = np.abs(number - 1500) > 40
+    stare = searches.stare_of(frames, left)
+    bank = searches.bank_of(stare, np.ones((1, 1)), DAVENPORT)
     unsolved = 0
-    made = []
-    for above in (None, threshold):
-        whole = searches.ProcessSearch(bank, stare, (ROTATOR,), np.ones(number.size))
-        list(whole.values(np.zeros((1, number.size, 1)), above))
-        made.append(
-            searches.ProcessSearch(bank, searches.stare_of(frames, left), (ROTATOR,), np.ones(left.sum()), whole)
-        )
     sums = rng.standard_normal((2, int(left.sum()), 1))
-    exact, quick = (list(one.values(sums, above)) for one, above in zip(made, (None, threshold), strict=True))
+    exact, quick = (
+        list(searches.ProcessSearch(bank, stare, (ROTATOR,), np.ones(left.sum())).values(sums, above))
+        for above in (None, threshold)
+    )
     for (_, values), (_, found) in zip(exact, quick, strict=True):
         higher = values[0] > threshold
-        # Denominators are kept where frames that are taken away hardly contribute: exact to `IRREGULAR`.
         np.testing.assert_allclose(found[:, higher], values[:, higher], rtol=1e-4)
         assert (found[0][~higher] <= threshold).all()
         unsolved += int(np.count_nonzero(np.isinf(found[0]) & np.isfinite(values[0])))

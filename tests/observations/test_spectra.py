@@ -234,7 +234,7 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
     added = flare(1800.0, 90.0, size) if not spectrum else size * np.outer(shape, model().unknowns(light())[spectrum])
     frames = drawn(np.random.default_rng(305), added)
     analysis = analyse(Study(star=STAR, search=OFTEN | {"frame": {"light": 1e-6}}), frames=frames).analysis
-    event, found = max(zip(analysis.events, analysis.found, strict=True), key=lambda pair: pair[0].value)
+    event, found = max(zip(analysis.events, analysis.event_spectra, strict=True), key=lambda pair: pair[0].value)
     assert abs(analysis.survey.time_s[event.brightest] - 1800.0) < 60
     assert (event.kind, found.cause) == (kind, kind)
     assert (found.reason == "") == (kind == "flare")
