@@ -104,11 +104,12 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - more, missed + more, 1.0 - tail)))
     # Correlation of the crossings of the threshold without and with a flare.
     p, cut = float(special.ndtr(middle)), float(special.ndtri(1.0 - fap))
-    both = _orthant(cut, float(special.ndtri(1.0 - p)), min(max(correlation, 0.0), 1.0))
-    shared = float((both - fap * p) / np.sqrt(fap * (1.0 - fap) * p * (1.0 - p)))
+    joint = _orthant(cut, float(special.ndtri(1.0 - p)), min(max(correlation, 0.0), 1.0))
+    shared = float((joint - fap * p) / np.sqrt(fap * (1.0 - fap) * p * (1.0 - p)))
 
-    def combined(sd: float, other: float) -> float:
-        return float(np.sqrt(max(sd**2 + other**2 - 2.0 * shared * sd * other, 0.0)))
+    def combined(sd: float, sd_of_threshold: float) -> float:
+        covariance = shared * sd * sd_of_threshold
+        return float(np.sqrt(max(sd**2 + sd_of_threshold**2 - 2.0 * covariance, 0.0)))
 
     below = combined(middle - low, middle - lower) if above_cut else np.inf
     beyond = combined(high - middle, upper - middle) if missed else np.inf
@@ -220,8 +221,10 @@ class _Tails:
             values, member = np.unique(form.weight / unit, return_inverse=True)
             distinct.append((values, np.bincount(member), np.bincount(member, form.shift**2)))
         size = max(values.size for values, *_ in distinct)
-        padded = np.array([[np.pad(part, (0, size - part.size)) for part in parts] for parts in distinct], np.float64)
-        self.weight, self.count, self.push = padded.transpose(1, 0, 2)
+        padded = np.zeros((3, len(distinct), size))
+        for row, arrays in enumerate(distinct):
+            padded[:, row, : arrays[0].size] = arrays
+        self.weight, self.count, self.push = padded
 
     def above(self, value: float) -> Float:
         """Return the probabilities of exceeding a value, shape (n_form,)."""
@@ -251,7 +254,7 @@ class _Tails:
 
     def _integrals(self, x: Float, upper: NDArray[np.bool_], path: tuple[Float, Float, Float], top: Float) -> Float:
         """Integrate the probabilities divided by exp(top); NaN if the integrand grows on the contour."""
-        gap, bend, scale = (each[:, None] for each in path)
+        gap, bend, scale = (values[:, None] for values in path)
 
         def summed(first: float, step: float) -> Float:
             """Sum the integrands over points first, first + step, ... until they are negligible."""
@@ -284,18 +287,18 @@ class _Tails:
 
     def _exponent(self, gap: NDArray[Any], x: Float, upper: NDArray[np.bool_]) -> NDArray[np.complex128]:
         """Return K(s) - s x - log(+-s), shape of the gap."""
-        left, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
+        factors, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
         # Real logarithms and angles are several times faster than complex ones.
-        square = left.real**2 + left.imag**2
-        log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(left.imag, left.real) @ count)
-        turn = (left.real / square) @ push - push.sum(axis=1, keepdims=True) - 1j * ((left.imag / square) @ push)
+        square = factors.real**2 + factors.imag**2
+        log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(factors.imag, factors.real) @ count)
+        turn = (factors.real / square) @ push - push.sum(axis=1, keepdims=True) - 1j * ((factors.imag / square) @ push)
         sign = np.where(upper, 1.0, -1.0)[:, None]
         return np.asarray((0.5 * (turn - log))[..., 0] - s * x[:, None] - np.log(sign * s))
 
     def _derivative(self, gap: Float, order: int) -> Float:
         """Return a derivative of K of order 1 to 3, shape (n_form,)."""
-        left = self._factors(gap[:, None])[:, 0]
-        terms = (self.weight / left) ** order * (self.count + order * self.push / left)
+        factors = self._factors(gap[:, None])[:, 0]
+        terms = (self.weight / factors) ** order * (self.count + order * self.push / factors)
         return np.asarray((0.0, 1.0, 2.0, 8.0)[order] * terms.sum(axis=1))
 
     def _saddles(self, x: Float, upper: NDArray[np.bool_]) -> Float:

@@ -29,38 +29,42 @@ LARGEST_TILE = 2**16
 
 @dataclass(frozen=True)
 class Tile:
-    """Range of realisations computed in one launch."""
+    """Range of requested realisations that one launch computes, in whole vectors of `width` realisations."""
 
-    first: int  # a multiple of the vector width
-    size: int
-    start: int  # the requested realisations are [start, stop), relative to first
-    stop: int
+    begin: int  # first requested realisation
+    count: int  # number of requested realisations
+    width: int
 
     @property
-    def wanted(self) -> int:
-        """Number of requested realisations."""
-        return self.stop - self.start
+    def start(self) -> int:
+        """Number of realisations that are computed before the requested ones."""
+        return self.begin % self.width
+
+    @property
+    def stop(self) -> int:
+        """One past the last requested realisation, relative to the first computed one."""
+        return self.start + self.count
+
+    @property
+    def size(self) -> int:
+        """Number of computed realisations."""
+        return -(-self.stop // self.width) * self.width
 
     def address(self) -> tuple[np.uint32, np.uint32]:
-        """Return both words of the first index."""
-        return np.uint32(self.first & 0xFFFFFFFF), np.uint32(self.first >> 32)
+        """Return both words of the number of the first computed realisation."""
+        first = self.begin - self.start
+        return np.uint32(first & 0xFFFFFFFF), np.uint32(first >> 32)
 
     def rows(self) -> tuple[np.uint32, np.uint32]:
-        """Return the requested range, relative to the first realisation."""
+        """Return the requested range, relative to the first computed realisation."""
         return np.uint32(self.start), np.uint32(self.stop)
 
-    def narrow(self, width: int) -> Tile:
-        """Return the tile of the same requested realisations with the fewest vectors of this width."""
-        skip = self.start - self.start % width
-        return Tile(self.first + skip, -(-self.stop // width) * width - skip, self.start - skip, self.stop - skip)
-
     def pieces(self, size: int) -> Iterator[Tile]:
-        """Yield tiles of at most `size` realisations, a multiple of those per work-item."""
-        for begin in range(0, self.size, size):
-            length = min(size, self.size - begin)
-            start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
-            if start < stop:
-                yield Tile(self.first + begin, length, start, stop)
+        """Yield tiles of at most `size` realisations, which are divided at the multiples of `size`."""
+        end = self.begin + self.count
+        for multiple in range(self.begin - self.begin % size, end, size):
+            begin = max(multiple, self.begin)
+            yield Tile(begin, min(multiple + size, end) - begin, self.width)
 
 
 class Tiles:
@@ -102,14 +106,12 @@ class Tiles:
                     ) from error
                 size //= 2
                 continue
-            done += tile.wanted
+            done += tile.count
             report(before + done, total or count)
 
-    def at(self, index: int, left: int, size: int) -> Tile:
+    def at(self, index: int, count: int, size: int) -> Tile:
         """Return the tile from `index` to a multiple of `size`, so that no tile crosses a multiple of 2**32."""
-        first = index - index % size
-        # A short tile computes only the vectors that it needs.
-        return Tile(first, size, index - first, min(index - first + left, size)).narrow(self._step)
+        return Tile(index, min(size - index % size, count), self._step)
 
 
 #: Realisations times frames counted on the device before its 32-bit bins and 64-bit sums are moved to the host.
@@ -204,11 +206,11 @@ class Launches:
         self._device.kernel(kernel_files, self.variant, name)(self._queue, items, local, *arguments)
 
     def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
-        """Draw the raw spectra of a tile into `out`, of uint16 or int32 and shape (tile.wanted, n_pixel).
+        """Draw the raw spectra of a tile into `out`, of uint16 or int32 and shape (tile.count, n_pixel).
 
-        Return the number of samples (pixels times frames) clipped at zero or saturation, shape (tile.wanted,).
+        Return the number of samples (pixels times frames) clipped at zero or saturation, shape (tile.count,).
         """
-        clipped = np.empty(tile.wanted, np.uint32)
+        clipped = np.empty(tile.count, np.uint32)
         counts, items = self._scratch("clipped", clipped.nbytes), (tile.size // self.variant.width,)
         with self._output("rows", out) as rows:
             self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
@@ -226,15 +228,15 @@ class Launches:
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Add each pixel's DN and each element's S/N of a tile to the device's histograms."""
         n_element = len(self._observed[1])
-        items = (n_element,) if self.variant.width > 1 else (n_element, min(tile.wanted, ITEMS))
+        items = (n_element,) if self.variant.width > 1 else (n_element, min(tile.count, ITEMS))
         observed = (*self._arguments, *tile.address(), *tile.rows(), *self._observing, *self._histograms)
         self._launch("histogram", items, *observed)
         self._queue.finish()
-        self._counted += tile.wanted
+        self._counted += tile.count
         outside = np.flatnonzero(self._take(self._histograms[-1], self._shapes[-1]))
         # The host counts values outside the device's bins, from the raw spectra of the same realisations.
         for piece in tile.pieces(RAW_BATCH) if outside.size else ():
-            raw = np.empty((piece.wanted, self._scene.n_pixel), np.int32)
+            raw = np.empty((piece.count, self._scene.n_pixel), np.int32)
             self.realise(piece, raw)
             base = self._scene.n_draws * self._scene.base_dn[0]
             counts.add_far(np.ascontiguousarray(raw.T) - base[:, None], *self._observed, outside)
@@ -267,7 +269,9 @@ class Launches:
         self._weighing = [*map(self.upload, (constants, weights, plan.linear_end, plan.pixels_end))]
         if self.variant.compared:
             more = map(self.upload, (padded(scene.estimates), bands, finished, plan.scales, plan.scale_end))
-            self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(plan.scales.shape[1])]
+            # All scenarios are compared with the first.
+            references = self.upload(np.zeros(len(scene.levels), np.uint32))
+            self._weighing = [references, *self._weighing, *more, np.uint32(plan.scales.shape[1])]
         if plan.subtractions.size:
             self._subtractions = [np.uint32(plan.subtractions.shape[1]), *map(self.upload, plan.subtractions)]
 
@@ -282,8 +286,8 @@ class Launches:
             self._launch("marginalise", items, *self._subtractions, np.uint32(tile.size), values)
 
     def channel(self, tile: Tile, number: int) -> NDArray[np.float32]:
-        """Return one channel of the last computed tile, shape (tile.wanted,)."""
-        host = np.empty(tile.wanted, np.float32)
+        """Return one channel of the last computed tile, shape (tile.count,)."""
+        host = np.empty(tile.count, np.float32)
         offset = 4 * (number * tile.size + tile.start)
         self._cl.enqueue_copy(self._queue, host, self._named["values"], src_offset=offset)
         return host
@@ -300,7 +304,7 @@ class Launches:
         buffers = (self._named[name] for name in ("values", "grids", "histogram", "sums", "outside"))
         self._launch("tally", (count,) if items == 1 else (count, items), *tile.rows(), np.uint32(tile.size), *buffers)
         self._queue.finish()
-        self._counted += tile.wanted
+        self._counted += tile.count
         # The host counts values outside the device's bins.
         outside = self._take(self._named["outside"], (count,))
         for index in np.flatnonzero(outside).tolist():

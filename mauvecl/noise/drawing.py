@@ -60,9 +60,10 @@ class Cumulants:
         photons = each * x.light_electrons
         poisson = x.photon_noise == "poisson"
         # A stack of n rounded frames has a rounding variance of n/12; the rounding of the draw adds the last 1/12.
-        other = each * x.read_noise_dn**2 + (each - 1) / 12
+        read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
         return Cumulants(
-            mean=each * x.mean_raw_dn, gaussian=other if poisson else other + gain**2 * photons, photons=photons,
+            mean=each * x.mean_raw_dn, photons=photons,
+            gaussian=read_variance if poisson else read_variance + gain**2 * photons,
             photon_step=gain if poisson else np.zeros_like(gain), dark_step=x.dark_step_dn, dark_dn=each * x.dark_dn,
             light_dn=gain * photons, light_variance=gain**2 * photons,
         )  # fmt: skip
@@ -325,10 +326,10 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
     factors = Factors.of(drawing.processes, quiet.conditions)
     if quiet.wavelength_nm.size > MAX_PIXELS:
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
-    for other, name in product(scenarios[1:], OF_DETECTOR):
-        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
+    for x, name in product(scenarios[1:], OF_DETECTOR):
+        if not np.array_equal(getattr(quiet, name), getattr(x, name)):
             raise InputError(
-                f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "
+                f"scenarios of one study must share instrument and exposure, but {name} of {x.name} differs from "
                 f"that of {quiet.name}",
                 key=name,
             )
@@ -416,7 +417,7 @@ def _draw_frames(
 def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
     ends, middle = factors.ends, factors.median_on_light(x)
-    least, most = (factor_on_light(*both, x) for both in zip(ends["light"], ends["sky"], strict=True))
+    least, most = (factor_on_light(light, sky, x) for light, sky in zip(ends["light"], ends["sky"], strict=True))
     light = np.maximum(most - middle, middle - least)
     dark = max(ends["dark"][1] - factors.medians["dark"], factors.medians["dark"] - ends["dark"][0])
     variance = c.variance + most * c.light_variance + ends["dark"][1] * c.dark_variance

@@ -227,17 +227,17 @@ def alias_table_of(probability: Float, low: int = 0) -> AliasTable:
     words: NDArray[np.int64] = np.floor(exact).astype(np.int64)
     words[np.argsort(words - exact, kind="stable")[: int(2**WORD_BITS - words.sum())]] += 1
     shift = WORD_BITS - bits
-    share, left = 1 << shift, words.tolist()
+    share, remaining = 1 << shift, words.tolist()
     # A full column is its own alias, with threshold 0.
     entries = [column << shift for column in range(1 << bits)]
-    small = [c for c, n in enumerate(left) if n < share]
-    large = [c for c, n in enumerate(left) if n > share]
+    small = [c for c, n in enumerate(remaining) if n < share]
+    large = [c for c, n in enumerate(remaining) if n > share]
     while small:
         poor, rich = small.pop(), large[-1]
-        entries[poor] = rich << shift | left[poor]
-        left[rich] -= share - left[poor]
-        if left[rich] <= share:
+        entries[poor] = rich << shift | remaining[poor]
+        remaining[rich] -= share - remaining[poor]
+        if remaining[rich] <= share:
             large.pop()
-            if left[rich] < share:
+            if remaining[rich] < share:
                 small.append(rich)
     return AliasTable(low, bits, np.array(entries, dtype=np.uint32))

@@ -90,9 +90,9 @@ def fma(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Floats:
 
 
 def _horner(name: str, x: Floats) -> Floats:
-    *rest, value = _POLYNOMIALS[name]
-    result: Floats = np.full_like(x, value)
-    for coefficient in reversed(rest):
+    *lower, highest = _POLYNOMIALS[name]
+    result: Floats = np.full_like(x, highest)
+    for coefficient in reversed(lower):
         result = fma(result, x, coefficient)
     return result
 
@@ -233,9 +233,8 @@ def analogue(
             light = combine_factors(light, sky * response["sky_share"], fma)
         v = _responding(response, level["c0"], z, light, dark, fma, quartic=scene.quartic)
     elif scene.joint:
-        first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
-        v = np.broadcast_to(level[first], z.shape)
-        for name in rest:
+        v = np.broadcast_to(level["c4" if scene.quartic else "c3"], z.shape)
+        for name in ("c3", "c2", "c1", "c0") if scene.quartic else ("c2", "c1", "c0"):
             v = fma(z, v, level[name])
     else:
         assert drawn.dark is not None
@@ -346,11 +345,11 @@ def pointing_drifts(
     begin = np.zeros((len(numbers), 1))
     index, n, stream = np.asarray(numbers, np.uint64)[:, None], 0, "stare_pointing"
     while not parts or not (parts[-1][0][:, -1] >= end_s).all():
-        which = np.arange(n, n + DRIFTS_AT_ONCE)[None]
+        drift = np.arange(n, n + DRIFTS_AT_ONCE)[None]
         # Half the sum of two squared normals is exponential, and has the same bits on every machine.
-        a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, which, stream, 0, seed)))
+        a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, drift, stream, 0, seed)))
         wait, lasts = (a * a + b * b) / 2 * (3600.0 / process.rate_per_h), (c * c + d * d) / 2 * process.duration_s
-        share = (words_at(index, which, stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
+        share = (words_at(index, drift, stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
         ends = begin + np.cumsum(wait + lasts, axis=1)
         parts.append((ends - lasts, lasts, share * process.depth))
         begin, n = ends[:, -1:], n + DRIFTS_AT_ONCE
@@ -444,8 +443,8 @@ def _split(
         counted = poisson_counts(drawn.photon, scene.photon_counts[0], scene.tables)[:n]
         photon = gain * (np.rint(each * x.light_electrons[:, None]) + counted) - source - sky - neighbours
     else:
-        both = photon_variance + read_variance
-        share = np.divide(photon_variance, both, out=np.zeros_like(both), where=both > 0)
+        variance = photon_variance + read_variance
+        share = np.divide(photon_variance, variance, out=np.zeros_like(variance), where=variance > 0)
         score = _per_pixel(four_normals(words_at(index, frames, "split", groups, seed)))[:n]
         photon = (total - dark) * share + np.sqrt(read_variance * share) * score
     parts = {"source": source, "sky": sky, "neighbours": neighbours, "photon_noise": photon, "dark": dark}

@@ -316,12 +316,9 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
-        every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
-        update = {
-            name: process.with_particles(rate_per_cm2_s)
-            for name, process in every.items()
-            if process.particles_per_cm2_s is not None
-        }
+        processes = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
+        caused = {name: process for name, process in processes.items() if process.particles_per_cm2_s is not None}
+        update = {name: process.with_particles(rate_per_cm2_s) for name, process in caused.items()}
         return cast("Self", self.model_copy(update=update))
 
 
