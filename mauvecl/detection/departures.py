@@ -93,14 +93,15 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
         added = statistic.added_variance(setting)
         for template in range(len(detection.flares) if statistic.shaped else 1):
             null, flare = detection.closed_form(name, template=template), detection.shape(name, template)
-            threshold, rounding, both = null.isf(fap), 0.0, 0.0
+            threshold, rounding, with_ends = null.isf(fap), 0.0, 0.0
             for shift, variance in digital:
-                seen = Differences(np.where(scene.used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
-                form = statistic.integrate_drawn(setting, detection.quiet, seen, flare)
-                rounding, both = both, form.sf(threshold) / fap - 1.0
+                mean = np.where(scene.used, (1.0 - (added > 0)) * shift, 0.0)
+                recorded = Differences(mean, (1.0 + added) * variance)
+                form = statistic.integrate_drawn(setting, detection.quiet, recorded, flare)
+                rounding, with_ends = with_ends, form.sf(threshold) / fap - 1.0
             simulated = detection.false_alarm_probability(threshold, name, template=template)
             skew = _skewed_fap(detection, statistic, flare, null, threshold) / fap - 1.0
-            effects = skew, rounding, both - rounding, tuple(unpredicted)
+            effects = skew, rounding, with_ends - rounding, tuple(unpredicted)
             rows.append(Departure(name, template, threshold, fap, simulated, *effects, detection.realisations))
     return rows
 

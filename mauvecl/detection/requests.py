@@ -185,6 +185,8 @@ Key = tuple[str, Role, int]
 class ChannelPlan:
     """Channels that a launch computes for a batch of flares."""
 
+    hypotheses: Hypotheses
+    scene: Scene  # the quiescent star and the flares of the batch
     weights: NDArray[np.float32]  # shape (n_linear, n_padded)
     linear_end: NDArray[np.uint32]  # one past the last linear statistic of each scenario, shape (n_scenario,)
     # One past the last linear statistic with weights per pixel, shape (n_scenario,). Later ones have weights per
@@ -213,7 +215,7 @@ Rows = dict[tuple[str, int, int], Float]
 
 
 def _rows(
-    hypotheses: Hypotheses, statistics: Sequence[Statistic], batch: Sequence[int]
+    hypotheses: Hypotheses, statistics: Sequence[Statistic], batch: range
 ) -> tuple[Rows, Rows, NDArray[np.uint32]]:
     """Return the weights of sums, and the scales of the paper's statistic, in the kernel's order, and ends of rows.
 
@@ -240,10 +242,10 @@ def _rows(
     return weighted, smoothed, np.array(ends, np.uint32).T.copy()
 
 
-def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
+def plan_channels(hypotheses: Hypotheses, batch: range) -> ChannelPlan:
     """Plan the channels of a batch of flares; scenario 0 is always the quiescent one.
 
-    If `first`, the batch also counts the null distributions that all batches share.
+    The first batch also counts the null distributions that all batches share.
     """
     statistics = [hypotheses.statistic(name) for name in hypotheses.statistics]
     weighted, smoothed, (linear_end, pixels_end, scale_end) = _rows(hypotheses, statistics, batch)
@@ -264,7 +266,7 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     counted: list[tuple[Key, int, Form]] = []
     for statistic in statistics:
         name = statistic.name
-        if first and not statistic.shaped:
+        if batch.start == 0 and not statistic.shaped:
             counted.append(((name, "null", 0), channel_of(statistic, 0, 0), hypotheses.closed_form(name)))
         for i, flare in enumerate(batch):
             null = hypotheses.closed_form(name, template=flare)
@@ -274,12 +276,12 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
             counted.append(((name, "flare_on_null_grid", flare), channel, null))
             counted.append(((name, "flare", flare), channel, hypotheses.closed_form(name, flare)))
     keys, of_grids, forms = zip(*counted, strict=True)
-    scene = hypotheses.scene
+    scene = hypotheses.scene.part([0, *(k + 1 for k in batch)])
     weights = np.zeros((len(weighted), len(scene.pixels)), np.float32)
     weights[:, : scene.n_pixel] = np.reshape([*weighted.values()], (len(weighted), scene.n_pixel))
     scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
     return ChannelPlan(
-        weights, linear_end, pixels_end, scales, scale_end,
+        hypotheses, scene, weights, linear_end, pixels_end, scales, scale_end,
         grids=grids_of(of_grids, [form.mean for form in forms], [form.std for form in forms]), keys=[*keys],
         subtractions=np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T,
     )  # fmt: skip
@@ -371,15 +373,11 @@ class DetectRequest(Countable):
         return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=self.nuisances)
 
     @cached_property
-    def plans(self) -> list[tuple[ChannelPlan, Scene]]:
-        """Channels and scene of each part, with as many flares as a launch can process."""
-        scene, count = self.hypotheses.scene, len(self.flares)
-        size = BATCH[scene.frames] - 1
+    def plans(self) -> list[ChannelPlan]:
+        """Channels of each part, with as many flares as a launch can process."""
+        count, size = len(self.flares), BATCH[self.hypotheses.scene.frames] - 1
         batches = [range(i, min(i + size, count)) for i in range(0, max(count, 1), size)]
-        return [
-            (plan_channels(self.hypotheses, batch, first=not batch.start), scene.part([0, *(k + 1 for k in batch)]))
-            for batch in batches
-        ]
+        return [plan_channels(self.hypotheses, batch) for batch in batches]
 
     @property
     def parts(self) -> int:
@@ -387,7 +385,7 @@ class DetectRequest(Countable):
 
     @property
     def work(self) -> int:
-        return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
+        return self.hypotheses.scene.n_pixel * max(len(plan.scene.levels) for plan in self.plans)
 
 
 @validated

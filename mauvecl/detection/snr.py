@@ -250,6 +250,6 @@ def counts_of(request: SnrRequest) -> Counts:
 def detection_of(request: DetectRequest, tallies: Iterable[Tally]) -> Detection:
     """Return the result of a request from the tallies of its parts."""
     detection = Detection.of(request.hypotheses, request.realisations, request.tails, request.seed)
-    for (plan, _), tally in zip(request.plans, tallies, strict=True):
+    for plan, tally in zip(request.plans, tallies, strict=True):
         detection.collect(plan, tally, tally.tails)
     return detection

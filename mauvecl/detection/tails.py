@@ -47,7 +47,7 @@ MIN_BEYOND = 100
 
 @dataclass(frozen=True)
 class CampaignRisk:
-    """Probability of any false alarm in a campaign, or the one of each test that gives a wanted one of the campaign."""
+    """Probability of any false alarm in a campaign, or that per test for a wanted probability of the campaign."""
 
     tests: int
     bound: float  # for any dependence of the tests (Bonferroni)
@@ -56,10 +56,10 @@ class CampaignRisk:
 
 
 def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> CampaignRisk:
-    """Return the false-alarm probability per test for a wanted one of the campaign; the inverse of `campaign`.
+    """Return the false-alarm probability per test that gives the wanted one of a campaign; the inverse of `campaign`.
 
-    The bound suffices for any dependence of the tests, and the probability for independent ones also for overlapping
-    stacks of a linear statistic. Too few simulated maxima beyond a threshold give no probability for overlapping ones.
+    The bound suffices for any dependence of the tests, and the probability for independent tests also for overlapping
+    stacks of a linear statistic. `overlapping` is None if too few simulated maxima lie beyond the threshold.
 
     Examples
     --------

@@ -272,7 +272,9 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     cache = drivers.kernel_cache()
     # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
     # store, and the installation, since PoCL compiles a program of another installation again at every start.
-    level = str(drivers.choose_processor_level(device, lambda: [handle for handle, _ in _handles_and_records()]))
+    pointers = [handle.int_ptr for handle, _ in _handles_and_records()]
+    number = pointers.index(device.int_ptr) if device.int_ptr in pointers else None
+    level = str(drivers.choose_processor_level(device, number))
     target = (device.name, device.version, device.driver_version, level, sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = cache.restore(key)

@@ -42,7 +42,7 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -393,23 +393,23 @@ settled: dict[int, str | None] = {}
 _one_at_a_time = threading.Lock()
 
 
-def choose_processor_level(device: Any, devices: Callable[[], Sequence[Any]]) -> str | None:
+def choose_processor_level(device: Any, number: int | None) -> str | None:
     """Set the highest processor level at which the driver works, and return its name; None if the driver chooses.
 
-    `devices` returns all devices in the order in which another process finds them. Raises
-    DeviceError if the driver works at no level.
+    `number` is that of the device in another process, or None if it has none. Raises DeviceError if the driver works at
+    no level.
     """
     place = int(device.int_ptr)
     with _one_at_a_time:
         if place not in settled:
-            name = _working_level(device, names(device), devices)
+            name = _working_level(device, names(device), number)
             if name is not None:
                 set_processor_name(device, name)
             settled[place] = name
     return settled[place]
 
 
-def _working_level(device: Any, names: tuple[str | None, ...], devices: Callable[[], Sequence[Any]]) -> str | None:
+def _working_level(device: Any, names: tuple[str | None, ...], number: int | None) -> str | None:
     """Return the level that an earlier process has found, or try levels until a first build succeeds."""
     setting = os.environ.get(LIMIT, "")
     try:
@@ -418,7 +418,6 @@ def _working_level(device: Any, names: tuple[str | None, ...], devices: Callable
         limit_s = -1.0
     if not 0 <= limit_s <= 86400:
         raise InputError.of(LIMIT, setting, "between 1 and 86400 seconds of processor time, or 0 for no limit")
-    number = next((i for i, handle in enumerate(devices()) if handle.int_ptr == device.int_ptr), None)
     if limit_s == 0 or number is None or not sys.executable:
         return names[0]
     # The level's key in the cache is unique for driver, processor and installation.

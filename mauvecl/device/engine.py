@@ -279,9 +279,9 @@ class Engine:
     def _detection(
         self, request: requests.DetectRequest, shard: requests.Shard, *, before: int = 0, total: int | None = None
     ) -> Tally:
-        plan, scene = request.plans[shard.part]
+        plan = request.plans[shard.part]
         tally = plan.tally()
-        with detection_launches(self.open_device, scene, request.seed, plan, request.hypotheses) as launches:
+        with detection_launches(self.open_device, plan, request.seed) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
@@ -325,14 +325,12 @@ class Engine:
         options = (start, Drawing(**drawing), comparison, "counted", nuisances)
         # The request validates the arguments and turns a single flare into a sequence.
         request = requests.DetectRequest(quiet, flares, count, seed, statistics, *options)  # type: ignore[arg-type]
-        hypotheses, n_flares = request.hypotheses, len(request.flares)
-        scene = hypotheses.scene
-        if n_flares >= BATCH[scene.frames]:
-            raise InputError.of("flares", n_flares, f"at most {BATCH[scene.frames] - 1} in one launch")
-        plan = requests.plan_channels(hypotheses, range(n_flares), first=True)
+        if request.parts > 1:
+            most = BATCH[request.hypotheses.scene.frames] - 1
+            raise InputError.of("flares", len(request.flares), f"at most {most} in one launch")
+        plan = request.plans[0]
         out = np.empty((plan.n_rows, count), np.float32)
-
-        with detection_launches(self.open_device, scene, seed, plan, hypotheses) as launches:
+        with detection_launches(self.open_device, plan, seed) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.chi2 import Paper
 from mauvecl.detection.counts import Tally
-from mauvecl.detection.requests import ChannelPlan, Hypotheses
+from mauvecl.detection.requests import ChannelPlan
 from mauvecl.detection.snr import Counts
 from mauvecl.device.build import VECTORS, Device, Variant, out_of_memory
 from mauvecl.device.drivers import DeviceError
@@ -370,17 +370,18 @@ def scene_launches(
     return Launches(device, scene, replace(variant, vectors=1 if single else many), seed)
 
 
-def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPlan, hypotheses: Hypotheses) -> Launches:
-    """Return the launches of a scene, with the weights and scales of all statistics of a detection."""
+def detection_launches(device: Device, plan: ChannelPlan, seed: int) -> Launches:
+    """Return the launches of a batch of flares, with the weights and scales of all statistics of a detection."""
+    statistics, setting = plan.hypotheses.statistics, plan.hypotheses.setting
     bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
     if len(plan.scales):
-        bands, finished = Paper().smoothing(hypotheses.setting).bands(len(scene.pixels), device.variant.chunk)
+        bands, finished = Paper().smoothing(setting).bands(len(plan.scene.pixels), device.variant.chunk)
     launches = scene_launches(
         device,
-        scene,
+        plan.scene,
         seed,
-        pair="chi2_pair" in hypotheses.statistics,
-        elements="chi2_element" in hypotheses.statistics,
+        pair="chi2_pair" in statistics,
+        elements="chi2_element" in statistics,
         linears=len(plan.weights),
         smooths=len(plan.scales),
         slots=bands.shape[1],

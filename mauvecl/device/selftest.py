@@ -132,8 +132,8 @@ DEVICE_COLUMNS = (
 def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
     """List all devices with their promise and, if `measure` is true, their speed.
 
-    Each has the fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason of a failure, or
-    "").
+    Each has the fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason for a failure,
+    or "").
     """
     rates = []
     for number, record in enumerate(devices()):
@@ -148,7 +148,7 @@ def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
 
 
 def child(request: dict[str, Any]) -> None:
-    """Draw a small scene within the limits; print the reason of a failure and exit with code 1."""
+    """Draw a small scene within the limits; print the reason for a failure and exit with code 1."""
     limit(request)
     name, number = request["name"], str(request["number"])
     try:

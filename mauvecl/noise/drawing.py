@@ -54,18 +54,18 @@ class Cumulants:
     light_variance: Float  # variance of the light, Gaussian or Poisson
 
     @staticmethod
-    def of(x: Expectation, each: int) -> Cumulants:
-        """Compute the cumulants of a draw of `each` frames."""
+    def of(x: Expectation, n_frames: int) -> Cumulants:
+        """Compute the cumulants of a draw of `n_frames` frames."""
         gain = x.gain_dn_per_electron
-        photons = each * x.light_electrons
+        photons = n_frames * x.light_electrons
         poisson = x.photon_noise == "poisson"
         # A stack of n rounded frames has a rounding variance of n/12; the rounding of the draw adds the last 1/12.
-        read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
+        read_variance = n_frames * x.read_noise_dn**2 + (n_frames - 1) / 12
         return Cumulants(
-            mean=each * x.mean_raw_dn, photons=photons,
+            mean=n_frames * x.mean_raw_dn, photons=photons,
             gaussian=read_variance if poisson else read_variance + gain**2 * photons,
-            photon_step=gain if poisson else np.zeros_like(gain), dark_step=x.dark_step_dn, dark_dn=each * x.dark_dn,
-            light_dn=gain * photons, light_variance=gain**2 * photons,
+            photon_step=gain if poisson else np.zeros_like(gain), dark_step=x.dark_step_dn,
+            dark_dn=n_frames * x.dark_dn, light_dn=gain * photons, light_variance=gain**2 * photons,
         )  # fmt: skip
 
     def photon_cumulant(self, order: int) -> Float:
@@ -315,7 +315,7 @@ class DrawMethod:
     joint: bool
     quartic: bool
     photons: bool
-    each: int  # frames per draw
+    frames_per_draw: int
     cumulants: list[Cumulants]  # of one draw of each scenario
     tables: list[layout.AliasTable] = field(default_factory=list)  # of the scene, filled as its arrays are
 
@@ -337,8 +337,8 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
     corners = [*product(*(grid.tolist() for grid in grids))]
     frames = _draw_frames(scenarios, drawing, factors, corners)
-    each = 1 if frames else quiet.n_frames
-    cumulants = [Cumulants.of(x, each) for x in scenarios]
+    frames_per_draw = 1 if frames else quiet.n_frames
+    cumulants = [Cumulants.of(x, frames_per_draw) for x in scenarios]
     varied = [(x, c.scaled(x, *at)) for (x, c), at in product(zip(scenarios, cumulants, strict=True), corners)]
     joint = _joint(varied, drawing.recipe)
     if modulations and not joint:
@@ -351,7 +351,8 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
         is_noticeable(truncation_distance(c.over_sd(), fourth_power=False, varying=bool(modulations)), c.variance).any()
         for _, c in varied
     )
-    return DrawMethod(factors, frames, joint, quartic, not joint and quiet.photon_noise == "poisson", each, cumulants)
+    photons = not joint and quiet.photon_noise == "poisson"
+    return DrawMethod(factors, frames, joint, quartic, photons, frames_per_draw, cumulants)
 
 
 def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray[np.bool_]:

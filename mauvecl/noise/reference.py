@@ -250,8 +250,8 @@ def analogue(
 def _responding(
     r: NDArray[np.void], c0: Floats, z: Floats, light_change: Floats, dark_change: Floats, fma: Fma, *, quartic: bool
 ) -> Floats:
-    one = np.float32(1.0)
-    light, dark = light_change + one, dark_change + one
+    unity = np.float32(1.0)
+    light, dark = light_change + unity, dark_change + unity
     variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))
     third = fma(light, r["light_third"], dark * r["dark_third"])
     fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
@@ -420,19 +420,19 @@ def _split(
     light, warm, glow = (
         (1.0 + change.astype(np.float64)) * middle for change, middle in zip(changes, scene.medians, strict=True)
     )
-    drawn, n, each = draws(scene, index, frames, seed), scene.n_pixel, x.n_frames // scene.n_draws
+    drawn, n, frames_per_draw = draws(scene, index, frames, seed), scene.n_pixel, x.n_frames // scene.n_draws
     v = analogue(scene, drawn, 0, *changes)
     gain, step = x.gain_dn_per_electron[:, None], x.dark_step_dn[:, None]
-    source = each * light * gain * x.source_electrons[:, None]
-    sky = each * light * glow * gain * x.sky_electrons[:, None]
-    neighbours = each * light * gain * x.neighbour_electrons[:, None]
+    source = frames_per_draw * light * gain * x.source_electrons[:, None]
+    sky = frames_per_draw * light * glow * gain * x.sky_electrons[:, None]
+    neighbours = frames_per_draw * light * gain * x.neighbour_electrons[:, None]
     photon_variance = gain * (source + sky + neighbours)
-    read_variance = each * x.read_noise_dn[:, None] ** 2 + (each - 1) / 12
-    mean_dark = each * warm * x.dark_dn[:, None]
+    read_variance = frames_per_draw * x.read_noise_dn[:, None] ** 2 + (frames_per_draw - 1) / 12
+    mean_dark = frames_per_draw * warm * x.dark_dn[:, None]
     added = {name: (scene.pixels["electron_gain"][:, None] * charge)[:n] for name, charge in drawn.added.items()}
     # All random parts: photon noise + read noise + dark counts.
     total = scene.base_dn[0][:, None] + v[:n].astype(np.float64) - sum(added.values())
-    total = total - source - sky - neighbours - each * x.bias_dn[:, None]
+    total = total - source - sky - neighbours - frames_per_draw * x.bias_dn[:, None]
     groups = np.arange(len(scene.pixels) // 4)[:, None]
     if drawn.dark is None:
         chance = _per_pixel(words_at(index, frames, "split_dark", groups, seed))[:n].astype(np.float64) + 0.5
@@ -441,7 +441,7 @@ def _split(
         dark = step * np.rint(mean_dark / step) + (scene.dark_counts["gain"][:, None] * drawn.dark)[:n]
     if drawn.photon is not None:
         counted = poisson_counts(drawn.photon, scene.photon_counts[0], scene.tables)[:n]
-        photon = gain * (np.rint(each * x.light_electrons[:, None]) + counted) - source - sky - neighbours
+        photon = gain * (np.rint(frames_per_draw * x.light_electrons[:, None]) + counted) - source - sky - neighbours
     else:
         variance = photon_variance + read_variance
         share = np.divide(photon_variance, variance, out=np.zeros_like(variance), where=variance > 0)

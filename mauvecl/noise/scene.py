@@ -286,7 +286,7 @@ def prepare(
     dark_dn, step, darks = np.zeros(used.size), quiet.dark_step_dn, np.zeros(padded(used.size), layout.POISSON)
     if not method.joint:
         # Separate dark counts are relative to integers.
-        mean = method.each * quiet.dark_dn / step
+        mean = method.frames_per_draw * quiet.dark_dn / step
         dark_dn = step * fill_poisson_counts(darks[: used.size], mean, step, method.tables)
     pixels = np.zeros(darks.size, layout.PIXEL)
     pixels["used"][: used.size], pixels["electron_gain"][: used.size] = used, quiet.gain_dn_per_electron
@@ -297,12 +297,12 @@ def prepare(
     arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
         _fill_draw(arrays, k, x, method, dark_dn)
-    _fill_comparison(arrays, method.each, quiet, comparison, used)
+    _fill_comparison(arrays, quiet, quiet.n_frames // method.frames_per_draw, comparison, used)
     job = _job(scenarios, drawing, method, comparison, first_group)
     tables = np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32)
     return Scene(
-        used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons, clip=method.each == 1,
-        processes=drawing.processes, job=job, pixels=pixels, dark_counts=darks,
+        used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons,
+        clip=method.frames_per_draw == 1, processes=drawing.processes, job=job, pixels=pixels, dark_counts=darks,
         tables=tables, priors=method.factors.tables, medians=tuple(method.factors.medians.values()),
         comparison=comparison, used=used, **arrays,
     )  # fmt: skip
@@ -344,8 +344,8 @@ def _fill_draw(arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, 
         photons = c.photons
         if method.photons:
             photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, method.tables)
-        mean = method.each * x.bias_dn + dark_dn + gain * photons
-    base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.each == 1 else np.inf)
+        mean = method.frames_per_draw * x.bias_dn + dark_dn + gain * photons
+    base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.frames_per_draw == 1 else np.inf)
     if arrays["responses"].size:
         fill_responses(arrays["responses"][k, :n_pixel], x, c, factors)
         check_reach(x, c, factors)
@@ -358,13 +358,13 @@ def _fill_draw(arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, 
 
 
 def _fill_comparison(
-    arrays: PerScenario, each: int, quiet: Expectation, comparison: Comparison, used: NDArray[np.bool_]
+    arrays: PerScenario, quiet: Expectation, n_draws: int, comparison: Comparison, used: NDArray[np.bool_]
 ) -> None:
-    """Fill the arrays for the comparison of all scenarios, in draws of `each` frames, with the quiescent star."""
+    """Fill the arrays for the comparison of all scenarios with the quiescent star."""
     base, n_pixel = arrays["base_dn"], used.size
     mean_sum = quiet.recorded_dn
     level, edge, fraction = (arrays[name][:, :n_pixel] for name in ("levels", "edges", "fraction"))
-    offset_dn = (quiet.n_frames // each) * base - np.rint(mean_sum)
+    offset_dn = n_draws * base - np.rint(mean_sum)
     if not comparison.exposures:
         fraction[:] = np.rint(mean_sum) - mean_sum
     level["shift"] = layout.MAGIC - offset_dn
@@ -402,7 +402,7 @@ def _job(
     job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
     job["pair_scale"] = (1.0 + comparison.added_variance) / 2.0
     for name, process in drawing.processes.additive.items():
-        table = alias_table_of(process.charge(method.each * quiet.frame_s))
+        table = alias_table_of(process.charge(method.frames_per_draw * quiet.frame_s))
         job[f"{name}_table"] = sum(t.entries.size for t in method.tables)
         job[f"{name}_bits"], job[f"{name}_low"] = table.bits, table.low
         method.tables.append(table)
