@@ -270,10 +270,10 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     cache = drivers.kernel_cache()
-    # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
-    # store, and the installation, since PoCL compiles a program of another installation again at every start.
     pointers = [handle.int_ptr for handle, _ in _handles_and_records()]
     number = pointers.index(device.int_ptr) if device.int_ptr in pointers else None
+    # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
+    # store, and the installation, since PoCL compiles a program of another installation again at every start.
     level = str(drivers.choose_processor_level(device, number))
     target = (device.name, device.version, device.driver_version, level, sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]

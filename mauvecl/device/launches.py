@@ -135,6 +135,8 @@ class Launches:
         self._cl, self._queue = device.cl, device.queue
         self._buffers: list[Any] = []
         self._named: dict[str, Any] = {}
+        # Buffers to which kernels add, and the zeros with which they begin.
+        self._sums: dict[str, tuple[Any, NDArray[Any]]] = {}
         self._counted = 0
         self._subtractions: list[Any] = []
         job = scene.job.copy()
@@ -219,21 +221,20 @@ class Launches:
 
     def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
         """Upload the observer's subtraction and variances, and the resolution elements."""
-        n_pixel, n_element = self._scene.n_pixel + PIXEL_BLOCK, len(elements)
+        n_pixel, n_element, bins = self._scene.n_pixel + PIXEL_BLOCK, len(elements), layout.OBSERVER_BINS
         self._observing = [self.upload(padded(observers)), self.upload(elements)]
-        self._shapes = ((n_pixel, layout.OBSERVER_BINS), (n_element, layout.OBSERVER_BINS), (n_pixel, 2), (n_element,))
-        self._histograms = [self.upload(np.zeros(shape, np.uint32)) for shape in self._shapes]
+        self._begin(pixels=(n_pixel, bins), elements=(n_element, bins), clipped=(n_pixel, 2), outside=(n_element,))
         self._observed = observers, elements
 
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Add each pixel's DN and each element's S/N of a tile to the device's histograms."""
         n_element = len(self._observed[1])
         items = (n_element,) if self.variant.width > 1 else (n_element, min(tile.count, ITEMS))
-        observed = (*self._arguments, *tile.address(), *tile.rows(), *self._observing, *self._histograms)
-        self._launch("histogram", items, *observed)
+        sums = (buffer for buffer, _ in self._sums.values())
+        self._launch("histogram", items, *self._arguments, *tile.address(), *tile.rows(), *self._observing, *sums)
         self._queue.finish()
         self._counted += tile.count
-        outside = np.flatnonzero(self._take(self._histograms[-1], self._shapes[-1]))
+        outside = np.flatnonzero(self._take("outside"))
         # The host counts values outside the device's bins, from the raw spectra of the same realisations.
         for piece in tile.pieces(RAW_BATCH) if outside.size else ():
             raw = np.empty((piece.count, self._scene.n_pixel), np.int32)
@@ -246,15 +247,20 @@ class Launches:
     def flush_counts(self, counts: Counts) -> None:
         """Move the device's histograms to the host."""
         n = self._scene.n_pixel
-        pixels, elements, clipped, _ = map(self._take, self._histograms, self._shapes)
-        counts.add(pixels[:n], elements, clipped[:n], self._counted)
+        counts.add(self._take("pixels")[:n], self._take("elements"), self._take("clipped")[:n], self._counted)
         self._counted = 0
 
-    def _take(self, buffer: Any, shape: tuple[int, ...], dtype: type = np.uint32) -> NDArray[Any]:
-        """Copy a buffer to the host and fill it with zeros."""
-        host: NDArray[Any] = np.empty(shape, dtype)
+    def _begin(self, dtype: type = np.uint32, **shapes: tuple[int, ...]) -> None:
+        """Make buffers of zeros to which kernels add."""
+        zeros = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
+        self._sums |= {name: (self.upload(array), array) for name, array in zeros.items()}
+
+    def _take(self, name: str) -> NDArray[Any]:
+        """Copy a buffer of sums to the host and fill it with zeros."""
+        buffer, zeros = self._sums[name]
+        host = np.empty_like(zeros)
         self._cl.enqueue_copy(self._queue, host, buffer)
-        self._cl.enqueue_copy(self._queue, buffer, np.zeros(shape, dtype))
+        self._cl.enqueue_copy(self._queue, buffer, zeros)
         return host
 
     def weigh(self, plan: ChannelPlan, bands: NDArray[np.float32], finished: NDArray[np.uint32]) -> None:
@@ -296,17 +302,17 @@ class Launches:
         """Add the channels of a tile to the histograms and integer sums on the device."""
         count = len(tally.grids)
         items = 1 if self.variant.width > 1 else ITEMS
-        if "grids" not in self._named:
+        if not self._sums:
             self._named["grids"] = self.upload(tally.grids)
-            self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
-            self._named["sums"] = self.upload(np.zeros((count, items, 2), np.int64))
-            self._named["outside"] = self.upload(np.zeros(count, np.uint32))
-        buffers = (self._named[name] for name in ("values", "grids", "histogram", "sums", "outside"))
+            self._begin(histogram=(count, layout.BINS))
+            self._begin(np.int64, sums=(count, items, 2))
+            self._begin(outside=(count,))
+        buffers = (self._named["values"], self._named["grids"], *(buffer for buffer, _ in self._sums.values()))
         self._launch("tally", (count,) if items == 1 else (count, items), *tile.rows(), np.uint32(tile.size), *buffers)
         self._queue.finish()
         self._counted += tile.count
         # The host counts values outside the device's bins.
-        outside = self._take(self._named["outside"], (count,))
+        outside = self._take("outside")
         for index in np.flatnonzero(outside).tolist():
             outlying = tally.add_far(index, self.channel(tile, int(tally.grids["channel"][index])))
             if outlying != outside[index]:
@@ -319,10 +325,7 @@ class Launches:
 
     def flush(self, tally: Tally) -> None:
         """Move the device's histograms and sums to the host."""
-        count = len(tally.grids)
-        histogram = self._take(self._named["histogram"], (count, layout.BINS))
-        sums = self._take(self._named["sums"], (count, self._named["sums"].size // (16 * count), 2), np.int64)
-        tally.add(histogram, sums.sum(axis=1), self._counted)
+        tally.add(self._take("histogram"), self._take("sums").sum(axis=1), self._counted)
         self._counted = 0
 
 

@@ -200,8 +200,6 @@ def alias_table(mean: float) -> AliasTable:
     Walker's method (1977, doi 10.1145/355744.355749) is applied to integers: the probabilities are rounded to multiples
     of 2**-32 that sum to one, which the table then represents exactly.
     """
-    if not 0.0 <= mean <= LARGEST_MEAN:
-        raise ValueError(f"Poisson mean must be 0 to {LARGEST_MEAN:g}, not {mean!r}")
     if mean == 0.0:
         return alias_table_of(np.ones(1))
     # All counts beyond this range have together less than half a word.
