@@ -330,21 +330,19 @@ class Distribution:
         at = int(np.searchsorted(upper, edge, side="right"))
         return int(counts[at:].sum()), int(counts[at - 1]) if at else 0
 
-    def quantile(self, probability: float | Float) -> Float:
-        """Return quantiles, interpolated linearly within bins."""
+    def quantile_interval(self, probability: float) -> Interval:
+        """Return a quantile, interpolated linearly within a bin, with the 95 % interval of order statistics.
+
+        The interval is rounded outwards to edges of bins.
+        """
+        check_probability("probability", probability)
         lower, upper, counts = self.bins
         edges = np.column_stack([lower, upper]).ravel()
-        return np.asarray(np.interp(probability, steps_of(counts) / self.n, edges))
-
-    def quantile_interval(self, probability: float) -> Interval:
-        """Return a quantile with the 95 % interval of order statistics, rounded outwards to edges of bins."""
-        check_probability("probability", probability)
         # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
         low, high = central_counts(self.n, probability)
-        lower, upper, counts = self.bins
         first, last = (int(np.searchsorted(counts.cumsum(), rank)) for rank in (low, high + 1))
         ends = float(lower[first]) if low else -np.inf, float(upper[last]) if high < self.n else np.inf
-        return Interval(float(self.quantile(probability)), *ends)
+        return Interval(float(np.interp(probability, steps_of(counts) / self.n, edges)), *ends)
 
     def histogram(self, bins: int = 200) -> tuple[Float, NDArray[np.int64]]:
         """Return edges, shape (m + 1,), and counts, shape (m,), in at most `bins` equal bins, for plots."""

@@ -314,10 +314,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         limit = self.closed_form(statistic, template=flare).isf(fap)
         # A weighted sum has no reduced value.
         reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
-        names = ("expected", "mean", "std", "reduced", "closed_form_probability")
-        of_flare = dict(zip(names, (theory.mean, d.mean, d.std, reduced, theory.sf(limit)), strict=True))
+        of_flare = {"expected": theory.mean, "mean": d.mean, "std": d.std, "reduced": reduced}
+        of_flare["closed_form_probability"] = theory.sf(limit)
         if flare in self.blinding:
-            of_flare = dict.fromkeys(names, np.nan)
+            of_flare = dict.fromkeys(of_flare, np.nan)
         return of_flare | vars(probability) | {
             "name": self.flares[flare].name, "statistic": statistic, "dof": dof, "probability": probability.value,
             "threshold": cut.value, "threshold_low": cut.low, "threshold_high": cut.high,

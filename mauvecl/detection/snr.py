@@ -147,7 +147,7 @@ class Counts:
         return dense
 
     def within(self, kind: str) -> NDArray[np.bool_]:
-        """Return which filled bins are among the device's."""
+        """Return the mask of the filled bins that are among the device's."""
         _, bins = self.bins[kind].places
         return (bins >= FIRST_BIN) & (bins <= LAST_BIN)
 

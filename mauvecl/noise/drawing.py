@@ -396,6 +396,7 @@ def _joint(varied: Sequence[tuple[Expectation, Cumulants]], recipe: Recipe) -> b
 def _draw_frames(
     scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors, corners: Sequence[tuple[float, float, float]]
 ) -> bool:
+    """Return whether frames are drawn one by one; raises InputError if they would have to be, but must be stacked."""
     if scenarios[0].n_frames == 1 or drawing.mode == "frames":
         # For a single frame, both modes give the same draws.
         return drawing.mode == "frames" and scenarios[0].n_frames > 1
