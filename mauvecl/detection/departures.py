@@ -161,9 +161,9 @@ def _skewed_fap(
     assert isinstance(statistic, Chi2 | Paper)
     # The square of a skewed variable has more variance and skew than that of a normal one.
     weights = statistic.square_weights(setting, flare)
-    more = weights**2 @ fourth, weights**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
+    changes = weights**2 @ fourth, weights**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
     # Shifted gamma distributions with the cumulants of normal and of skewed noise.
-    second, skewed = null.std**2 + np.array([0.0, more[0]]), null.third + np.array([0.0, more[1]])
+    second, skewed = null.std**2 + np.array([0.0, changes[0]]), null.third + np.array([0.0, changes[1]])
     shape = 4.0 * second**3 / skewed**2
     distance = (threshold - null.mean) / np.sqrt(second)
     above, above_skewed = special.gammaincc(shape, np.maximum(shape + distance * np.sqrt(shape), 0.0)).tolist()

@@ -298,8 +298,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             for statistic in self.statistics
         ]
         tails = "counted" if countable(fap, self.realisations) else "importance sampling"
-        about = {"realisations": self.realisations, "exposure_s": self.quiet.exposure_s, "tails": tails}
-        return table_of(COLUMNS, rows, fap=fap, **about)
+        metadata = {"realisations": self.realisations, "exposure_s": self.quiet.exposure_s, "tails": tails}
+        return table_of(COLUMNS, rows, fap=fap, **metadata)
 
     def _row(self, fap: float, statistic: str, flare: int, probability: Interval) -> dict[str, Any]:
         """Return the row of one flare and statistic, as `COLUMNS` have it."""

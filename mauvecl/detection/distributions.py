@@ -99,9 +99,9 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     middle, lower, upper = special.ndtri([(k + 0.5) / (trials + 1.0) for k in above]).tolist()
     above_cut, missed, tail = above[0], trials - above[0], (1.0 - CONFIDENCE) / 2.0
     # For small counts Jeffreys's interval undercovers; Clopper and Pearson's never does.
-    more = 0.5 if min(above_cut, missed) >= FEW else 0.0
-    low = float(special.ndtri(special.betaincinv(above_cut + more, missed + 1.0 - more, tail)))
-    high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - more, missed + more, 1.0 - tail)))
+    half = 0.5 if min(above_cut, missed) >= FEW else 0.0
+    low = float(special.ndtri(special.betaincinv(above_cut + half, missed + 1.0 - half, tail)))
+    high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - half, missed + half, 1.0 - tail)))
     # Correlation of the crossings of the threshold without and with a flare.
     p, cut = float(special.ndtr(middle)), float(special.ndtri(1.0 - fap))
     joint = _orthant(cut, float(special.ndtri(1.0 - p)), min(max(correlation, 0.0), 1.0))
@@ -144,19 +144,19 @@ BISECTIONS = 18
 TOGETHER = 16
 
 
-def _falling_root(off: Callable[[float], float], start: float, step: float) -> float:
+def _falling_root(function: Callable[[float], float], start: float, step: float) -> float:
     """Return the root of a falling function to 1e-8 of a step, searched outwards from `start` in growing steps."""
     from scipy.optimize import brentq
 
-    off = cache(off)
+    function = cache(function)
     low = high = start
     width = step
-    while off(low) < 0:
+    while function(low) < 0:
         low, high, width = low - width, low, 2 * width
     width = step
-    while off(high) > 0:
+    while function(high) > 0:
         low, high, width = high, high + width, 2 * width
-    return float(brentq(off, low, high, xtol=1e-8 * step)) if low < high else low
+    return float(brentq(function, low, high, xtol=1e-8 * step)) if low < high else low
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,11 +196,11 @@ class QuadraticForm:
         shape, scale = (self.mean / self.std) ** 2, self.std**2 / self.mean
         start = (special.gammainccinv if upper[0] else special.gammaincinv)(shape, tail)
 
-        def off(log_value: float) -> float:
-            more = float(self._tails.logarithms(float(np.exp(log_value)), upper)[0] - np.log(tail))
-            return more if upper[0] else -more
+        def excess(log_value: float) -> float:
+            log_ratio = float(self._tails.logarithms(float(np.exp(log_value)), upper)[0] - np.log(tail))
+            return log_ratio if upper[0] else -log_ratio
 
-        return float(np.exp(_falling_root(off, float(np.log(max(start * scale, 1e-300))), 1e-2)))
+        return float(np.exp(_falling_root(excess, float(np.log(max(start * scale, 1e-300))), 1e-2)))
 
     @cached_property
     def _tails(self) -> _Tails:
@@ -374,13 +374,13 @@ class Mixture:
         return [(np.array(chunk), _Tails([forms[place] for place in chunk])) for chunk in chunks]
 
     def isf(self, probability: float) -> float:
-        def off(value: float) -> float:
+        def excess(value: float) -> float:
             return float(np.log(max(self.sf(value), 1e-300) / probability))
 
         # From the quantile of a normal distribution with the same skewness (Cornish & Fisher 1938), outwards.
         z = -float(special.ndtri(probability))
         start = self.mean + self.std * z + (z**2 - 1.0) * self.third / (6.0 * self.std**2)
-        return _falling_root(off, start, 0.02 * self.std)
+        return _falling_root(excess, start, 0.02 * self.std)
 
 
 #: Closed form of a statistic's distribution.

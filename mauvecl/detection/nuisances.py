@@ -85,8 +85,8 @@ class Nuisances(ContentEquality):
                     key="own",
                 )
             if not spectrum.any():
-                fault = f"the unknown {name!r} must change pixels of {quiet.name}, but changes none"
-                raise InputError(fault, key="own")
+                message = f"the unknown {name!r} must change pixels of {quiet.name}, but changes none"
+                raise InputError(message, key="own")
             spectra[k] = spectrum
         return cls(tuple(sd), spectra, np.array(list(sd.values()), np.float64), of_flare)
 

@@ -238,8 +238,8 @@ class SnrResult(Drawable, ContentEquality):
         columns = np.column_stack([wavelength_nm, expected, np.array(rows)]).T
         values = dict(zip((column.name for column in COLUMNS), columns, strict=True)) | clipped
         x = self.expectation
-        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
-        return table_of((*COLUMNS, *CLIPPED_COLUMNS)[: len(values)], [values], realisations=self.counts.n, **about)
+        metadata = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
+        return table_of((*COLUMNS, *CLIPPED_COLUMNS)[: len(values)], [values], realisations=self.counts.n, **metadata)
 
 
 def counts_of(request: SnrRequest) -> Counts:

@@ -282,12 +282,12 @@ class _Tilt:
         """Return the change of differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
         along = difference @ self.directions.T
         if self.shift:
-            there = along + self.shift
-            return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * there[:, 0]
-        there = along * self.stretch
+            shifted = along + self.shift
+            return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * shifted[:, 0]
+        stretched = along * self.stretch
         # Ratio of standard normal densities to those of spread `stretch`.
-        logs = np.log(self.stretch).sum() - 0.5 * there**2 @ (1.0 - 1.0 / self.stretch**2)
-        return (there - along) @ self.directions, np.asarray(logs)
+        logs = np.log(self.stretch).sum() - 0.5 * stretched**2 @ (1.0 - 1.0 / self.stretch**2)
+        return (stretched - along) @ self.directions, np.asarray(logs)
 
 
 def _stretch(square: Float, goal: float) -> Float:
@@ -316,8 +316,8 @@ def _block(
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(z_references)) / root
     move, logs = tilt.apply(difference)
-    factors, more = _factors(scene, tilt.scores, seed, block)
-    excess, logs = _excess(scene, z + move / root, factors), logs + more
+    factors, log_ratios = _factors(scene, tilt.scores, seed, block)
+    excess, logs = _excess(scene, z + move / root, factors), logs + log_ratios
     # Exposures are subtracted only if no factors are drawn.
     subtracted = [_excess(scene, z_reference - added * move / root, factors) for z_reference in z_references]
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)

@@ -291,8 +291,8 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
                 "processor",
             ) from error
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
-        fault = f"a kernel did not compile on {device.name}"
-        raise drivers.DeviceError(f"{fault}\n{numbered}\n{error}", "kernel") from error
+        message = f"a kernel did not compile on {device.name}"
+        raise drivers.DeviceError(f"{message}\n{numbered}\n{error}", "kernel") from error
     return program
 
 

@@ -163,8 +163,8 @@ class KernelCache:
             with contextlib.suppress(OSError), os.scandir(self.store) as entries:
                 # A full store has a thousand archives, and is read twice for each program.
                 stored = ((entry.stat(), entry.path) for entry in entries)
-                for about, path in sorted(stored, key=lambda pair: -pair[0].st_mtime):
-                    total += about.st_size
+                for status, path in sorted(stored, key=lambda pair: -pair[0].st_mtime):
+                    total += status.st_size
                     if total > MAX_STORED:
                         os.unlink(path)
 
@@ -421,8 +421,8 @@ def _working_level(device: Any, names: tuple[str | None, ...], number: int | Non
     if limit_s == 0 or number is None or not sys.executable:
         return names[0]
     # The level's key in the cache is unique for driver, processor and installation.
-    about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
-    unique = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
+    target = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
+    unique = "\0".join((*map(str, target), *map(str, names), *sorted(flags())))
     cache, key = kernel_cache(), f"level-{hashlib.sha256(unique.encode()).hexdigest()[:32]}"
     level = cache.read_text(key)
     if level is not None:

@@ -277,10 +277,10 @@ class Launches:
         constants = scene.constants(plan.weights, plan.linear_end, plan.pixels_end)
         self._weighing = [*map(self.upload, (constants, weights, plan.linear_end, plan.pixels_end))]
         if self.variant.compared:
-            more = map(self.upload, (padded(scene.estimates), bands, finished, plan.scales, plan.scale_end))
+            compared = map(self.upload, (padded(scene.estimates), bands, finished, plan.scales, plan.scale_end))
             # All scenarios are compared with the first.
             references = self.upload(np.zeros(len(scene.levels), np.uint32))
-            self._weighing = [references, *self._weighing, *more, np.uint32(plan.scales.shape[1])]
+            self._weighing = [references, *self._weighing, *compared, np.uint32(plan.scales.shape[1])]
         if plan.subtractions.size:
             self._subtractions = [np.uint32(plan.subtractions.shape[1]), *map(self.upload, plan.subtractions)]
 
@@ -372,8 +372,8 @@ def scene_launches(
         **options,
     )
     single = device.width == 1 or scene.frames or variant.compared
-    many = VECTORS if not (variant.elements or variant.linears) else FEW_VECTORS
-    return Launches(device, scene, replace(variant, vectors=1 if single else many), seed)
+    vectors = FEW_VECTORS if variant.elements or variant.linears else VECTORS
+    return Launches(device, scene, replace(variant, vectors=1 if single else vectors), seed)
 
 
 def detection_launches(device: Device, plan: ChannelPlan, seed: int) -> Launches:

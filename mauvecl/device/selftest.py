@@ -183,8 +183,8 @@ def limit(request: dict[str, Any]) -> None:
 
 def _lower(kind: int, soft: int, hard: int) -> None:
     """Lower a resource limit, unless it is lower already."""
-    now = resource.getrlimit(kind)[1]
-    most = hard if now == resource.RLIM_INFINITY else min(hard, now)
+    present = resource.getrlimit(kind)[1]
+    most = hard if present == resource.RLIM_INFINITY else min(hard, present)
     # macOS defines some limits without enforcing them.
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(kind, (min(soft, most), most))
@@ -358,26 +358,26 @@ def check_results(engine: Engine) -> Iterator[Check]:
     """Compare every branch of every kernel, and every frame of some stares, with the known answers."""
     arrays = known_arrays()
     for name in (*CASES, *STARE_CASES):
-        ours = results(engine, name, COUNT)
-        theirs = {part: arrays[f"{name}: {part}"] for part in ours}
-        differ = [part for part in ours if ours[part].tobytes() != theirs[part].tobytes()]
+        computed = results(engine, name, COUNT)
+        expected = {part: arrays[f"{name}: {part}"] for part in computed}
+        differ = [part for part in computed if computed[part].tobytes() != expected[part].tobytes()]
         if name in STARE_CASES:
             # Zeros may have either sign.
-            differ = [part for part in differ if not np.array_equal(ours[part], theirs[part])]
+            differ = [part for part in differ if not np.array_equal(computed[part], expected[part])]
         if not differ:
-            digests = (hashlib.sha256(array.tobytes()).hexdigest()[:12] for array in ours.values())
+            digests = (hashlib.sha256(array.tobytes()).hexdigest()[:12] for array in computed.values())
             passed, text = True, f"digests {' '.join(digests)}"
         elif engine.device.promise == SAME_BITS:
             passed, text = False, f"{', '.join(differ)} differ from the reference's"
         else:
             # Fewer than 1 % of the counts differ, by 1 DN. Statistics differ by less than 0.2 of their standard
             # deviation, and noise factors of flares by less than 0.2.
-            off = np.abs(ours["raw"] - theirs["raw"]) if "raw" in ours else np.zeros(1, int)
+            off = np.abs(computed["raw"] - expected["raw"]) if "raw" in computed else np.zeros(1, int)
             share, apart = float(np.mean(off > 0)), 0.0
-            for part in ours.keys() & {*_CHANCE, "noise of flares"}:
-                scale = np.maximum(theirs[part].std(axis=_CHANCE[part]), 1e-3) if part in _CHANCE else 1.0
-                far = np.abs(ours[part] - theirs[part]).max(axis=_CHANCE.get(part))
-                apart = max(apart, float(np.max(far / scale)))
+            for part in computed.keys() & {*_CHANCE, "noise of flares"}:
+                scale = np.maximum(expected[part].std(axis=_CHANCE[part]), 1e-3) if part in _CHANCE else 1.0
+                largest = np.abs(computed[part] - expected[part]).max(axis=_CHANCE.get(part))
+                apart = max(apart, float(np.max(largest / scale)))
             passed = bool(off.max() <= 1 and share < 1e-2 and apart < 0.2)
             text = f"{share:.2g} of counts off, by {off.max()} DN at most; statistics by {apart:.2g} sigma"
             text = f"weaker promise: {text}"

@@ -365,9 +365,9 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
     ends = []
     for end_light, more_dark, sky in zip(*factors.ends.values(), strict=True):
         more_light = factor_on_light(end_light, sky, x)
-        there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
-        more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
-        ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
+        shifted = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
+        added_variance = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
+        ends.append((shifted, RAIL_SIGMA * np.sqrt(variance + np.maximum(added_variance, 0.0))))
     added = x.gain_dn_per_electron * sum(process.most_electrons(x.frame_s) for process in processes.additive.values())
     low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
     high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + added > x.highest_dn

@@ -408,8 +408,8 @@ def components(x: Expectation, *, realisation: int, seed: int, **drawing: Unpack
         del values["neighbours"]
     values["net"] = raw - x.n_frames * (x.bias_dn + x.dark_dn) - x.subtracted_dn
     columns = [column for column in COLUMNS if column.name in values]
-    about = {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
-    return table_of(columns, [values], **about)
+    metadata = {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
+    return table_of(columns, [values], **metadata)
 
 
 def _split(
