@@ -41,14 +41,9 @@ class Tile:
         return self.begin % self.width
 
     @property
-    def stop(self) -> int:
-        """One past the last requested realisation, relative to the first computed one."""
-        return self.start + self.count
-
-    @property
     def size(self) -> int:
         """Number of computed realisations."""
-        return -(-self.stop // self.width) * self.width
+        return -(-(self.start + self.count) // self.width) * self.width
 
     def address(self) -> tuple[np.uint32, np.uint32]:
         """Return both words of the number of the first computed realisation."""
@@ -57,7 +52,7 @@ class Tile:
 
     def rows(self) -> tuple[np.uint32, np.uint32]:
         """Return the requested range, relative to the first computed realisation."""
-        return np.uint32(self.start), np.uint32(self.stop)
+        return np.uint32(self.start), np.uint32(self.start + self.count)
 
     def pieces(self, size: int) -> Iterator[Tile]:
         """Yield tiles of at most `size` realisations, which are divided at the multiples of `size`."""

@@ -240,7 +240,7 @@ class StareLaunches(Launches):
             kernel(self._queue, items, self._local, *common, *arguments)
             host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
             self._cl.enqueue_copy(self._queue, host, values)
-            out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
+            out[..., begin : begin + size] = host[..., tile.start : tile.start + tile.count].transpose(1, 3, 2, 0)
 
     def glow(self, tile: Tile, out: Floats) -> None:
         """Compute what `Injections` need to add flares, into `out`, shape (1, n_stare, n_statistic + 1, n_padded)."""
