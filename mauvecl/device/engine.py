@@ -219,8 +219,8 @@ class Engine:
             case requests.SnrRequest():
                 return self._snr(request, shard).pack()
             case requests.RealiseRequest():
-                place = {"start": shard.start, "count": shard.count, "seed": request.seed}
-                return {"rows": self.realise(request.expectation, **place, out=out, **vars(request.drawing))}
+                x, seed, options = request.expectation, request.seed, vars(request.drawing)
+                return {"rows": self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **options)}
         # Exposures do not need the modules of stares.
         from mauvecl.device.stares import Stares
         from mauvecl.flares.stare_scene import StaresRequest

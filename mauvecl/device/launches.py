@@ -250,7 +250,7 @@ class Launches:
 
     def _begin(self, dtype: type = np.uint32, **shapes: tuple[int, ...]) -> None:
         """Make buffers of zeros to which kernels add."""
-        zeros = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
+        zeros: dict[str, NDArray[Any]] = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
         self._sums |= {name: (self.upload(array), array) for name, array in zeros.items()}
 
     def _take(self, name: str) -> NDArray[Any]:
