@@ -77,7 +77,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "a sky that follows no level": (
         "test_sky_follows_its_level[level0]",
-        ('factors.medians["light"] * factors.medians["sky"] * sky_share(x) / light', "0.0 * sky_share(x) / light"),
+        ("on_light * on_sky * sky_share(x) / light", "0.0 * sky_share(x) / light"),
     ),
     "photons of neighbours taken for noise": (
         "test_components_have_correct_sum_and_moments[mauve-apart]",

@@ -283,10 +283,6 @@ class Factors:
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
         return cls(tables, centre, ends)
 
-    def median_on_light(self, x: Expectation) -> Float:
-        """Return `factor_on_light` at the priors' medians."""
-        return factor_on_light(self.medians["light"], self.medians["sky"], x)
-
 
 def factor_on_light(light: float, sky: float, x: Expectation) -> Float:
     """Return the factor on each pixel's total light, which includes the sky's, shape (n_pixel,)."""
@@ -295,8 +291,6 @@ def factor_on_light(light: float, sky: float, x: Expectation) -> Float:
 
 #: Frames are drawn one by one if a pixel's mean is within this many standard deviations of a rail.
 RAIL_SIGMA = 8.0
-#: The device does not round counts correctly beyond this distance from their base.
-REACH_DN = 2.0**22
 #: Limit of the counter's 24 bits for groups of four pixels.
 MAX_PIXELS = 65_536
 
@@ -360,18 +354,12 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
 
     The limits include all values allowed by the priors and the largest charge of additive processes per frame.
     """
-    variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
-    mean = x.mean_raw_dn
-    ends = []
-    for end_light, more_dark, sky in zip(*factors.ends.values(), strict=True):
-        more_light = factor_on_light(end_light, sky, x)
-        shifted = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
-        added_variance = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
-        ends.append((shifted, RAIL_SIGMA * np.sqrt(variance + np.maximum(added_variance, 0.0))))
+    frame = Cumulants.of(x, 1)
+    faint, bright = (frame.scaled(x, *at_end) for at_end in zip(*factors.ends.values(), strict=True))
+    # Even the faint end scatters as the expectation does.
+    low, high = (RAIL_SIGMA * np.sqrt(np.maximum(end.variance, frame.variance) + 1 / 12) for end in (faint, bright))
     added = x.gain_dn_per_electron * sum(process.most_electrons(x.frame_s) for process in processes.additive.values())
-    low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
-    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + added > x.highest_dn
-    return low | high
+    return np.asarray((faint.mean < low) | (bright.mean + high + added > x.highest_dn))
 
 
 def _joint(varied: Sequence[tuple[Expectation, Cumulants]], recipe: Recipe) -> bool:
@@ -414,23 +402,6 @@ def _draw_frames(
             if pixels.any():
                 return True
     return False
-
-
-def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
-    """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
-    ends, middle = factors.ends, factors.median_on_light(x)
-    least, most = (factor_on_light(light, sky, x) for light, sky in zip(ends["light"], ends["sky"], strict=True))
-    light = np.maximum(most - middle, middle - least)
-    dark = max(ends["dark"][1] - factors.medians["dark"], factors.medians["dark"] - ends["dark"][0])
-    variance = c.variance + most * c.light_variance + ends["dark"][1] * c.dark_variance
-    reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
-    if (reach >= REACH_DN).any():
-        pixel = int(np.argmax(reach))
-        raise InputError(
-            f"the priors must move pixel {pixel} of {x.name} less than {REACH_DN:g} DN away from its mean, not "
-            f"{reach[pixel]:.3g}: shorten the exposure or draw frame by frame",
-            key="priors",
-        )
 
 
 def sky_share(x: Expectation) -> Float:

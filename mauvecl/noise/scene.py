@@ -14,7 +14,7 @@ from scipy import special
 
 from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
-from mauvecl.noise.drawing import Drawing, Factors, check_reach, choose_method, nodes, polynomial, sky_share
+from mauvecl.noise.drawing import Drawing, Factors, choose_method, factor_on_light, nodes, polynomial, sky_share
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table, alias_table_of
 from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
@@ -188,9 +188,10 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Fill `out` with a draw's response to factors on light, dark and sky, relative to the priors' medians."""
-    light, dark = factors.median_on_light(x), factors.medians["dark"]
+    on_light, dark, on_sky = factors.medians.values()
+    light = factor_on_light(on_light, on_sky, x)
     # The sky's light follows both factors.
-    out["sky_share"] = factors.medians["light"] * factors.medians["sky"] * sky_share(x) / light
+    out["sky_share"] = on_light * on_sky * sky_share(x) / light
     out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
     out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
     # A lower limit avoids 0 / 0 in pixels without noise.
@@ -198,6 +199,24 @@ def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors:
     for order, name in enumerate(layout.CUMULANTS[1:], 3):
         out[f"light_{name}"] = light * c.photon_cumulant(order)
         out[f"dark_{name}"] = dark * c.dark_cumulant(order)
+
+
+#: The device does not round counts correctly beyond this distance from their base.
+REACH_DN = 2.0**22
+
+
+def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
+    """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
+    faint, bright = (c.scaled(x, *at_end) for at_end in zip(*factors.ends.values(), strict=True))
+    middle = c.scaled(x, *factors.medians.values())
+    reach = np.maximum(bright.mean - middle.mean, middle.mean - faint.mean) + 8.0 * np.sqrt(bright.variance)
+    if (reach >= REACH_DN).any():
+        pixel = int(np.argmax(reach))
+        raise InputError(
+            f"the priors must move pixel {pixel} of {x.name} less than {REACH_DN:g} DN away from its mean, not "
+            f"{reach[pixel]:.3g}: shorten the exposure or draw frame by frame",
+            key="priors",
+        )
 
 
 #: Largest number of scenarios per launch for stacks, and frame by frame (True), which needs more registers.
@@ -338,22 +357,20 @@ def _fill_draw(arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, 
     level = arrays["levels"][k, :n_pixel]
     # The mean to which a draw is relative; separate Poisson counts are relative to integers.
     if method.joint:
-        light, dark = factors.median_on_light(x), factors.medians["dark"]
-        mean = c.mean + (light - 1.0) * c.light_dn + (dark - 1.0) * c.dark_dn
+        mean = c.scaled(x, *factors.medians.values()).mean
+        if arrays["responses"].size:
+            fill_responses(arrays["responses"][k, :n_pixel], x, c, factors)
+            _check_reach(x, c, factors)
+        else:
+            for power, coefficient in enumerate(polynomial(c)):
+                level[f"c{power}"] = coefficient
     else:
         photons = c.photons
         if method.photons:
             photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, method.tables)
         mean = method.frames_per_draw * x.bias_dn + dark_dn + gain * photons
-    base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.frames_per_draw == 1 else np.inf)
-    if arrays["responses"].size:
-        fill_responses(arrays["responses"][k, :n_pixel], x, c, factors)
-        check_reach(x, c, factors)
-    elif method.joint:
-        for power, coefficient in enumerate(polynomial(c)):
-            level[f"c{power}"] = coefficient
-    else:
         level["c1"] = np.sqrt(c.gaussian)
+    base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.frames_per_draw == 1 else np.inf)
     level["c0"] += mean - base
 
 
