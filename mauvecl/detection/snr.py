@@ -235,11 +235,12 @@ class SnrResult(Drawable, ContentEquality):
             edges = np.column_stack([snr(row, filled), snr(row, filled + 1)]).ravel()
             quantiles = np.interp(np.array(PERCENTAGES) / 100, steps_of(counts) / self.counts.n, edges)
             rows.append((mean, np.sqrt(counts @ (middle - mean) ** 2 / self.counts.n), *quantiles))
-        columns = np.column_stack([wavelength_nm, expected, np.array(rows)]).T
-        values = dict(zip((column.name for column in COLUMNS), columns, strict=True)) | clipped
+        arrays = np.column_stack([wavelength_nm, expected, np.array(rows)]).T
+        values = dict(zip((column.name for column in COLUMNS), arrays, strict=True)) | clipped
+        columns = (*COLUMNS, *CLIPPED_COLUMNS) if clipped else COLUMNS
         x = self.expectation
         metadata = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
-        return table_of((*COLUMNS, *CLIPPED_COLUMNS)[: len(values)], [values], realisations=self.counts.n, **metadata)
+        return table_of(columns, [values], realisations=self.counts.n, **metadata)
 
 
 def counts_of(request: SnrRequest) -> Counts:
