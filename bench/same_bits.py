@@ -10,6 +10,7 @@ is added if it is installed.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import shutil
@@ -21,7 +22,7 @@ from pathlib import Path
 from astropy.table import Table
 
 CHILD = """
-import json, sys
+import hashlib, json, sys
 from dataclasses import asdict
 from mauvecl.device import selftest
 from mauvecl.device.engine import Engine, devices
@@ -30,7 +31,7 @@ for number, record in enumerate(devices()):
     for width in (None, 1):
         engine = Engine(str(number), width=width)
         digests = {
-            f"{name}: {part}": selftest.digest(array)
+            f"{name}: {part}": hashlib.sha256(array.tobytes()).hexdigest()[:12]
             for name in selftest.CASES for part, array in selftest.results(engine, name, selftest.COUNT).items()
         }
         found = found or digests
@@ -56,7 +57,8 @@ def main() -> int:
     output = parser.parse_args().output
     from mauvecl.device import selftest
 
-    reference = {name: selftest.digest(array) for name, array in selftest.known_arrays().items()}
+    arrays = selftest.known_arrays()
+    reference = {name: hashlib.sha256(array.tobytes()).hexdigest()[:12] for name, array in arrays.items()}
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
             [sys.executable, "-c", CHILD], env=vendors(Path(folder)), stdout=subprocess.PIPE, text=True, check=True

@@ -88,7 +88,7 @@ def main() -> None:
         shard = engine.count(request, Shard(0, 0, size))
         bare = timed(lambda: engine.detect(quiet, flares, realisations=size, seed=1))[0]
         packing, sent = timed(lambda: pickle.dumps(shard))
-        plan = request.plans[0][0]
+        plan = request.plans[0]
         tally = plan.tally()
         adding = timed(lambda: tally.merge(pickle.loads(sent)))[0]
         body = io.BytesIO()

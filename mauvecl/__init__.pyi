@@ -20,8 +20,8 @@ from mauvecl.answers.signal import simulate as simulate
 from mauvecl.answers.signal import snr as snr
 from mauvecl.answers.stare import stare as stare
 from mauvecl.answers.visible import visible as visible
+from mauvecl.detection.departures import departures as departures
 from mauvecl.detection.detection import Detection as Detection
-from mauvecl.detection.detection import departures as departures
 from mauvecl.detection.nuisances import Nuisances as Nuisances
 from mauvecl.detection.statistics import Linear as Linear
 from mauvecl.device.engine import Engine as Engine

@@ -77,7 +77,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "a sky that follows no level": (
         "test_sky_follows_its_level[level0]",
-        ('factors.medians["light"] * factors.medians["sky"] * sky_share(x) / light', "0.0 * sky_share(x) / light"),
+        ("on_light * on_sky * sky_share(x) / light", "0.0 * sky_share(x) / light"),
     ),
     "photons of neighbours taken for noise": (
         "test_components_have_correct_sum_and_moments[mauve-apart]",
@@ -85,7 +85,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "estimated variances of less light": (
         "test_sampled_tail_agrees_with_brute_force[estimated from light]",
-        ('+ known["net_offset"] for one', '- known["net_offset"] for one'),
+        ('+ estimate["net_offset"] for dn', '- estimate["net_offset"] for dn'),
     ),
     "neighbours taken off the light of a stare": (
         "test_spectra_summed_over_frames_equal_exposures_of_the_engine",
@@ -127,7 +127,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "a shard's flares from the first": (
         "test_shards_of_stares_join_to_the_same_bits[None-cumulants]",
-        ("request.flares.part(first - request.start,", "request.flares.part(done,"),
+        ("request.flares.part(few.begin - request.start,", "request.flares.part(done,"),
     ),
     "a shard under another's name": (
         "test_interrupted_run_is_resumed_whatever_happens_to_its_files[misplaced]",
@@ -221,11 +221,11 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "carry of the index dropped between launches": (
         "test_draws_at_counter_boundaries_equal_reference",
-        ("np.uint32(self.first >> 32)", "np.uint32(0)"),
+        ("np.uint32(first >> 32)", "np.uint32(0)"),
     ),
     "carry of the index dropped within a launch": (
         "test_draws_at_counter_boundaries_equal_reference",
-        ("first = index - index % size", "first = index - index % self._step"),
+        ("min(size - index % size, count)", "min(size, count)"),
     ),
     "carry of the product dropped in odd lanes": (
         "test_philox_gives_the_known_answers",
@@ -236,7 +236,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "alias table off by one word": (
         "test_alias_table_has_the_probabilities_of_scipy",
-        ("rich << shift | left[poor]", "rich << shift | max(left[poor] - 1, 0)"),
+        ("rich << shift | remaining[poor]", "rich << shift | max(remaining[poor] - 1, 0)"),
     ),
     "alias table off by one count": (
         "test_pearson_of_raw_counts",
@@ -261,11 +261,11 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "reference of what is not recorded": (
         "test_closed_forms_follow_simulation",
-        ("mean_sum = reference.recorded_dn", "mean_sum = reference.n_frames * reference.mean_raw_dn"),
+        ("mean_sum = quiet.recorded_dn", "mean_sum = quiet.n_frames * quiet.mean_raw_dn"),
     ),
     "noise of what is subtracted forgotten": (
         "test_sampled_tail_agrees_with_brute_force[stack]",
-        ("variance = (1.0 + comparison.added_variance) * reference", "variance = reference"),
+        ("variance = (1.0 + comparison.added_variance) * quiet", "variance = quiet"),
         ("(1.0 + comparison.added_variance) / 2.0", "0.5"),
     ),
     "quiescent exposures with the observed draws": (
@@ -274,7 +274,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "closed forms that follow a temperature by their means alone": (
         "test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
-        (", seen.variance + each @ variances)", ", seen.variance)"),
+        (", seen.variance + amount @ variances)", ", seen.variance)"),
     ),
     "moved scores that count like others": (
         "test_sampled_tail_agrees_with_brute_force[half a degree]",

@@ -16,7 +16,8 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_in
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap, countable
 from mauvecl.detection.chi2 import Paper
-from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, DEPARTURE_COLUMNS, ROC_COLUMNS, ROC_ROWS, departure_table
+from mauvecl.detection.departures import DEPARTURE_COLUMNS, departure_table
+from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, ROC_COLUMNS, ROC_ROWS
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.nuisances import read_at_pixels
 from mauvecl.detection.statistics import Linear, Matched, Setting

@@ -65,22 +65,21 @@ class Chi2(Statistic):
         spectra, rows = setting.cached(f"projection of {self.name} on {pixels}", projection)
         drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
         ratio, moved = true / model, delta / scale
-        groups, rest = _span(np.vstack([spectra / scale, drawn, moved]), ratio)
+        groups, outside = _span(np.vstack([spectra / scale, drawn, moved]), ratio)
         # Components, covariance and quadratic form within the span; a group's basis is zero at other pixels.
-        every = np.vstack([rows, drawn, moved])
-        inside = np.hstack([every[:, members] @ basis for members, basis in groups])
-        taken, scattered, moved = np.split(inside, (len(rows), len(rows) + len(drawn)))
+        vectors = np.vstack([rows, drawn, moved])
+        inside = np.hstack([vectors[:, members] @ basis for members, basis in groups])
+        subtracted, scattered, moved = np.split(inside, (len(rows), len(rows) + len(drawn)))
         noise, end = scattered.T @ scattered, 0
         for members, basis in groups:
             start, end = end, end + basis.shape[1]
             noise[start:end, start:end] += basis.T @ (ratio[members, None] * basis)
         root = np.linalg.cholesky(noise)
-        weight, vectors = np.linalg.eigh(root.T @ root - (taken @ root).T @ (taken @ root))
+        weight, vectors = np.linalg.eigh(root.T @ root - (subtracted @ root).T @ (subtracted @ root))
         # Projected-out directions have no weight.
         large = weight > 1e-9 * weight[-1]
         shift = vectors.T @ solve_triangular(root, moved[0], lower=True)
-        weights, shifts = np.append(weight[large], rest), np.append(shift[large], np.zeros(rest.size))
-        return QuadraticForm(weights, shifts)
+        return QuadraticForm(np.append(weight[large], outside), np.append(shift[large], np.zeros(outside.size)))
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         x, variance = x * setting.used, variance * setting.used
@@ -138,14 +137,14 @@ def _span(vectors: Float, ratio: Float) -> tuple[list[tuple[NDArray[np.intp], Fl
     """
     group = np.floor(np.log(ratio / ratio.min()) / GROUP_WIDTH)
     order = np.argsort(group, kind="stable")
-    groups, rest = [], []
+    groups, outside = [], []
     for members in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
         basis = orth(vectors[:, members].T, rcond=1e-13)
         groups.append((members, basis))
-        left = members.size - basis.shape[1]
+        n_outside = members.size - basis.shape[1]
         total = float(ratio[members].sum() - ratio[members] @ np.sum(basis**2, axis=1))
-        rest.append(np.full(left, total / max(left, 1)))
-    return groups, np.concatenate(rest)
+        outside.append(np.full(n_outside, total / max(n_outside, 1)))
+    return groups, np.concatenate(outside)
 
 
 class Chi2Element(Chi2):
@@ -217,8 +216,8 @@ class Smoothing:
         for flare in flares or (x,):
             # Non-negative factors of the centres must reproduce the mean of the sum over all pixels.
             scale, squares = smoothing.scale(flare), rows.power(2) @ (used * flare.variance_dn2)
-            whole, ours = float(smoothing._inverse_flare(flare) @ squares), float(scale @ squares[centres])
-            if (scale < 0).any() or abs(ours - whole) > MAX_MEAN_ERROR * whole:
+            exact, mean = float(smoothing._inverse_flare(flare) @ squares), float(scale @ squares[centres])
+            if (scale < 0).any() or abs(mean - exact) > MAX_MEAN_ERROR * exact:
                 return cls(np.arange(n), np.eye(n), sigma, rows.multiply(used).tocsr())
         return smoothing
 
@@ -247,22 +246,22 @@ class Smoothing:
         The shapes are (n_chunk, n_slot, chunk) and (n_chunk,). Slot 0 belongs to the first unfinished centre.
         """
         n_centre, n_pixel = self.rows.shape
-        weighs = self.rows != 0
-        some = weighs.any(axis=1)
-        first = np.where(some, weighs.argmax(axis=1), self.centres)
-        last = np.where(some, n_pixel - 1 - weighs[:, ::-1].argmax(axis=1), self.centres)
+        used = self.rows != 0
+        has_pixels = used.any(axis=1)
+        first = np.where(has_pixels, used.argmax(axis=1), self.centres)
+        last = np.where(has_pixels, n_pixel - 1 - used[:, ::-1].argmax(axis=1), self.centres)
         ends = np.arange(chunk, n_padded + 1, chunk)
         # Centres are finished in order.
-        done = np.searchsorted(np.maximum.accumulate(last), ends - 1, side="right")
+        finished = np.searchsorted(np.maximum.accumulate(last), ends - 1, side="right")
         begun = np.searchsorted(np.minimum.accumulate(first[::-1])[::-1], ends, side="left")
-        before = np.append(0, done[:-1])
+        before = np.append(0, finished[:-1])
         slots = -(-int((begun - before).max()) // 4) * 4
         weights = np.zeros((ends.size, slots, chunk), np.float32)
         padded = np.zeros((n_centre, n_padded), np.float32)
         padded[:, :n_pixel] = self.rows
         for c, (low, high) in enumerate(zip(before, begun, strict=True)):
             weights[c, : high - low] = padded[low:high, c * chunk : (c + 1) * chunk]
-        return weights, np.diff(done, prepend=0).astype(np.uint32)
+        return weights, np.diff(finished, prepend=0).astype(np.uint32)
 
 
 @lru_cache(maxsize=4)
@@ -278,9 +277,9 @@ def _interpolation(n: int, step: int) -> tuple[NDArray[np.int64], Float]:
     between = np.zeros((n, centres.size))
     first = np.clip(np.searchsorted(centres, np.arange(n), side="right") - points // 2, 0, centres.size - points)
     near = first[:, None] + np.arange(points)
-    at, own = centres[near], np.eye(points, dtype=bool)
-    ratios = (np.arange(n)[:, None, None] - at[:, None, :]) / np.where(own, 1, at[:, :, None] - at[:, None, :])
-    np.put_along_axis(between, near, np.where(own, 1.0, ratios).prod(axis=2), axis=1)
+    at, diagonal = centres[near], np.eye(points, dtype=bool)
+    ratios = (np.arange(n)[:, None, None] - at[:, None, :]) / np.where(diagonal, 1, at[:, :, None] - at[:, None, :])
+    np.put_along_axis(between, near, np.where(diagonal, 1.0, ratios).prod(axis=2), axis=1)
     between.setflags(write=False)
     return centres, between
 
@@ -321,7 +320,8 @@ class Paper(Statistic):
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
         smoothing, scale = self.smoothing(setting), self.scale(setting, flare)
         weight, vectors = smoothing.modes(scale, seen.variance)
-        return QuadraticForm(weight, (np.sqrt(scale) * (smoothing.weights @ seen.mean)) @ vectors / np.sqrt(weight))
+        mean = np.sqrt(scale) * (smoothing.weights @ seen.mean)
+        return QuadraticForm(weight, mean @ vectors / np.sqrt(weight))
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         return np.asarray((x @ self.smoothing(setting).rows.T) ** 2 @ self.scale(setting, flare))

@@ -70,8 +70,8 @@ class RowCounts:
     def of(self, row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the numbers of a row, ascending, and their counts."""
         first = row * self._span
-        mine = slice(*np.searchsorted(self.keys, (first, first + self._span)))
-        return self._keys[mine] - first - self._half, self._counts[mine].copy()
+        places = slice(*np.searchsorted(self.keys, (first, first + self._span)))
+        return self._keys[places] - first - self._half, self._counts[places].copy()
 
     def add(self, rows: NDArray[np.int64] | int, numbers: NDArray[np.int64], counts: NDArray[np.integer]) -> None:
         """Add counts of different numbers."""
@@ -84,8 +84,8 @@ class RowCounts:
         low = int(numbers.min())
         if int(numbers.max()) - low < MAX_DENSE:
             counts = np.bincount(numbers - low)
-            where = np.flatnonzero(counts)
-            self.add(row, where + low, counts[where])
+            filled = np.flatnonzero(counts)
+            self.add(row, filled + low, counts[filled])
         else:
             self.add(row, *np.unique_counts(numbers))
 
@@ -99,7 +99,8 @@ class RowCounts:
     def _merge(self) -> None:
         if not self._waiting:
             return
-        keys, counts = (np.concatenate(parts) for parts in zip((self._keys, self._counts), *self._waiting, strict=True))
+        pairs = (self._keys, self._counts), *self._waiting
+        keys, counts = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
         self._keys, place = np.unique(keys, return_inverse=True)
         self._counts = np.zeros(self._keys.size, np.int64)
         np.add.at(self._counts, place, counts)
@@ -107,8 +108,8 @@ class RowCounts:
 
     def pack(self, name: str) -> Arrays:
         """Return the counts as arrays: differences of keys, in the smallest integer types."""
-        parts = {f"{name}-steps": np.diff(self.keys), name: self.counts}
-        packed = {key: each.astype(np.min_scalar_type(int(each.max(initial=0)))) for key, each in parts.items()}
+        arrays = {f"{name}-steps": np.diff(self.keys), name: self.counts}
+        packed = {key: array.astype(np.min_scalar_type(int(array.max(initial=0)))) for key, array in arrays.items()}
         return {f"{name}-first": self.keys[:1], **packed}
 
     def merge(self, name: str, arrays: Arrays) -> None:
@@ -143,10 +144,10 @@ def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
     powers = np.maximum(np.frexp(values)[1] + (UNIT_BITS - 24), 0)
     first = second = 0
     for power in np.flatnonzero(np.bincount(powers)).tolist():
-        whole = np.ldexp(values[powers == power].astype(np.float64), UNIT_BITS - power).astype(np.int64)
-        first += int(whole.sum()) << power
-        for part in np.split(whole, range(CHUNK, whole.size, CHUNK)):
-            second += int(part @ part) << 2 * power
+        multiples = np.ldexp(values[powers == power].astype(np.float64), UNIT_BITS - power).astype(np.int64)
+        first += int(multiples.sum()) << power
+        for chunk in np.split(multiples, range(CHUNK, multiples.size, CHUNK)):
+            second += int(chunk @ chunk) << 2 * power
     return first, second
 
 
@@ -273,11 +274,11 @@ class Distribution:
         mean = total / self.n
         return mean, squares / self.n - mean**2
 
-    def refuse_undefined(self, what: str = "the statistic") -> None:
+    def refuse_undefined(self, name: str = "the statistic") -> None:
         """Raise InputError if values are not finite."""
         if self.undefined:
             raise InputError(
-                f"{what} must be finite, but is infinite or no number in {self.undefined} of {self.n} realisations",
+                f"{name} must be finite, but is infinite or no number in {self.undefined} of {self.n} realisations",
                 key="statistic",
             )
 
@@ -329,21 +330,19 @@ class Distribution:
         at = int(np.searchsorted(upper, edge, side="right"))
         return int(counts[at:].sum()), int(counts[at - 1]) if at else 0
 
-    def quantile(self, probability: float | Float) -> Float:
-        """Return quantiles, interpolated linearly within bins."""
+    def quantile_interval(self, probability: float) -> Interval:
+        """Return a quantile, interpolated linearly within a bin, with the 95 % interval of order statistics.
+
+        The interval is rounded outwards to edges of bins.
+        """
+        check_probability("probability", probability)
         lower, upper, counts = self.bins
         edges = np.column_stack([lower, upper]).ravel()
-        return np.asarray(np.interp(probability, steps_of(counts) / self.n, edges))
-
-    def quantile_interval(self, probability: float) -> Interval:
-        """Return a quantile with the 95 % interval of order statistics, rounded outwards to edges of bins."""
-        check_probability("probability", probability)
         # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
         low, high = central_counts(self.n, probability)
-        lower, upper, counts = self.bins
         first, last = (int(np.searchsorted(counts.cumsum(), rank)) for rank in (low, high + 1))
         ends = float(lower[first]) if low else -np.inf, float(upper[last]) if high < self.n else np.inf
-        return Interval(float(self.quantile(probability)), *ends)
+        return Interval(float(np.interp(probability, steps_of(counts) / self.n, edges)), *ends)
 
     def histogram(self, bins: int = 200) -> tuple[Float, NDArray[np.int64]]:
         """Return edges, shape (m + 1,), and counts, shape (m,), in at most `bins` equal bins, for plots."""

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from mauvecl.detection import NoThresholdError, Tails, check_atom, check_fap, countable
-from mauvecl.detection.chi2 import Chi2, Paper
 from mauvecl.detection.counts import Distribution, TailSamples, Tally
 from mauvecl.detection.distributions import (
     CONFIDENCE_SD,
-    Form,
     Interval,
     central_counts,
     clopper_pearson,
@@ -25,189 +22,19 @@ from mauvecl.detection.distributions import (
     detection_interval,
 )
 from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
-from mauvecl.detection.statistics import Differences, LinearStatistic
+from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.detection.tails import Tail, tail
 from mauvecl.host.arrays import ContentEquality, Float
-from mauvecl.noise.disturbances import ADDITIVE
-from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import INTERVAL, Column, Drawable, interval, number, percent, table_of
+from mauvecl.schema.columns import INTERVAL, Column, Drawable, interval, number, table_of
 from mauvecl.schema.errors import Message
 from mauvecl.schema.fields import Range
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.host.exposure.expectation import Expectation
-
-#: Differences above this many standard errors are significant.
-SIGNIFICANT = 4.0
 #: Value that is undefined, since a flare saturates every pixel or no threshold has a false-alarm probability.
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
-
-
-@dataclass(frozen=True)
-class Departure:
-    """False-alarm probability of a statistic at the threshold for Gaussian noise."""
-
-    statistic: str
-    template: int  # flare that a shaped statistic uses as template
-    threshold: float  # for Gaussian noise
-    fap: float  # wanted false-alarm probability
-    simulated: Interval  # simulated false-alarm probability at the threshold
-    # Predicted changes of the false-alarm probability at the threshold, relative to `fap`.
-    skew: float  # due to third and fourth cumulants of the noise
-    rounding: float  # due to the steps of the ADC
-    clipping: float  # due to the ends of its range
-    others: tuple[str, ...]  # effects that the closed form does not include and that have no prediction
-    realisations: int
-    amplitude: float = np.nan  # of the flare that a shaped statistic uses as template, in tables
-
-    @property
-    def ratio(self) -> float:
-        """Simulated divided by wanted false-alarm probability."""
-        return self.simulated.value / self.fap
-
-    @property
-    def error(self) -> float:
-        """Standard error of the ratio if the closed form is exact."""
-        return float(np.sqrt((1.0 - self.fap) / (self.fap * self.realisations)))
-
-    @property
-    def differs(self) -> bool:
-        """True if the ratio deviates significantly from 1."""
-        return abs(self.ratio - 1.0) > SIGNIFICANT * self.error
-
-    @property
-    def why(self) -> str:
-        """Largest cause of a significant deviation, else an empty string."""
-        if not self.differs:
-            return ""
-        causes = {"skew of the noise": self.skew, "rounding": self.rounding, "clipping": self.clipping}
-        rest = self.ratio - 1.0 - sum(causes.values())
-        if self.others:
-            causes[" and ".join(self.others)] = rest
-        name, size = max(causes.items(), key=lambda item: abs(item[1]))
-        return name if abs(size) > 0.2 * abs(self.ratio - 1.0) else "unexplained"
-
-
-@validated
-def departures(detection: Detection, fap: float) -> list[Departure]:
-    """Return the departures of all statistics from the closed forms, at a wanted false-alarm probability per test.
-
-    Shaped statistics have one departure per flare.
-    """
-    scene = detection.scene
-    others = []
-    if scene.comparison.estimated:
-        others.append("variances estimated from the counts")
-    others += [ADDITIVE[name].label for name in scene.additive]
-    if scene.modulations and not detection.setting.integrates:
-        others.append("priors that the reference does not know")
-    elif detection.nuisances is not None and not scene.modulations:
-        others.append("unknowns that are marginalised over and not drawn")
-    digital = _adc_moments(detection.quiet) if scene.clip else []
-    rows = []
-    for statistic, template in detection._nulls():
-        kind, flare = detection.statistic(statistic), detection.shape(statistic, template)
-        null, added = detection.closed_form(statistic, template=template), kind.added_variance(detection.setting)
-        cut, rounding, both = null.isf(fap), 0.0, 0.0
-        for shift, variance in digital:
-            moved = Differences(np.where(scene.used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
-            form = kind.integrate_drawn(detection.setting, detection.quiet, moved, flare)
-            rounding, both = both, form.sf(cut) / fap - 1.0
-        simulated = detection.false_alarm_probability(cut, statistic, template=template)
-        skew = _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0
-        effects = skew, rounding, both - rounding, tuple(others)
-        rows.append(Departure(statistic, template, cut, fap, simulated, *effects, detection.realisations))
-    return rows
-
-
-def departure_table(detection: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
-    """Return the departures of a detection as a table, without rows if too few realisations lie beyond thresholds.
-
-    `amplitudes` are those of the detection's flares.
-    """
-    rows = []
-    for row in departures(detection, fap) if countable(fap, detection.realisations) else ():
-        shaped = detection.statistic(row.statistic).shaped
-        rows.append(replace(row, amplitude=amplitudes[row.template]) if shaped else row)
-    return table_of(DEPARTURE_COLUMNS, rows, fap=fap)
-
-
-#: Columns of the table of departures.
-DEPARTURE_COLUMNS = (
-    Column("statistic", description="detection statistic", heading="statistic", kind=str),
-    Column("amplitude", description="flare amplitude: relative rise of the photons in the flare's band",
-           heading="flare", format=percent("g")),
-    Column("gaussian_threshold", "threshold", description="threshold for Gaussian noise"),
-    Column("fap", "simulated.value", description="simulated false-alarm probability there", heading="simulated",
-           format=".3g"),
-    Column("fap_low", "simulated.low", description="its 95 % interval, lower end", heading=INTERVAL,
-           format=interval(".3g"), others=("fap_high",), detail=True),
-    Column("fap_high", "simulated.high", description="its 95 % interval, upper end"),
-    Column("ratio", description="simulated over wanted false-alarm probability", heading="ratio", format=".3f"),
-    Column("ratio_error", "error", description="standard error of the ratio"),
-    Column("skew", description="predicted change of the ratio by the noise's skew and kurtosis"),
-    Column("rounding", description="predicted change of the ratio by the ADC's steps"),
-    Column("clipping", description="predicted change of the ratio by the ADC's ends"),
-    Column("differs", description="whether chance does not explain the ratio: 4 standard errors", kind=bool),
-    Column("why", description="main cause of a difference from the closed form", heading="why", kind=str),
-)  # fmt: skip
-
-
-def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
-    """Return the false-alarm probability at a threshold with the noise's third and fourth cumulants."""
-    scene, quiet = detection.scene, detection.quiet
-    draws = scene.n_draws
-    c = Cumulants.of(quiet, quiet.n_frames // draws)
-    kind, flare = detection.statistic(statistic), detection.shape(statistic, template)
-    # Cumulants of the difference between an exposure and the mean of reference exposures.
-    added = kind.added_variance(detection.setting)
-    third, fourth, sixth = (
-        draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * added ** (r - 1)) for r in (3, 4, 6)
-    )
-    variance = kind.variance(detection.setting)
-    if isinstance(kind, LinearStatistic):
-        weights = kind.weights_per_dn(detection.setting, flare)
-        sd = float(np.sqrt(weights**2 @ variance))
-        z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
-        # Edgeworth series (Abramowitz & Stegun 26.2.48).
-        series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
-        return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
-    assert isinstance(kind, Chi2 | Paper)
-    # The square of a skewed variable has more variance and skew than that of a normal one.
-    weights = kind.square_weights(detection.setting, flare)
-    more = weights**2 @ fourth, weights**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
-    # Shifted gamma distributions with the cumulants of normal and of skewed noise.
-    second, skewed = null.std**2 + np.array([0.0, more[0]]), null.third + np.array([0.0, more[1]])
-    shape = 4.0 * second**3 / skewed**2
-    away = (cut - null.mean) / np.sqrt(second)
-    plain, there = special.gammaincc(shape, np.maximum(shape + away * np.sqrt(shape), 0.0)).tolist()
-    return float(null.sf(cut) * there / plain)
-
-
-def _adc_moments(x: Expectation) -> list[tuple[Float, Float]]:
-    """Return mean shift and variance of an exposure behind the ADC, DN, without and with its lower limit.
-
-    Saturation at the upper limit is part of the closed forms.
-    """
-    mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
-    recorded = x.recorded_dn / x.n_frames
-    # Integers around each pixel's mean; the outermost ones include the tails.
-    first, last = np.floor(mean - 9 * sd) - 1, np.ceil(mean + 9 * sd) + 1
-    dn = first[:, None] + np.arange(int((last - first).max()) + 1)
-    gap = dn[:, :-1] + 0.5 - mean[:, None]
-    z = np.divide(gap, sd[:, None], out=np.where(gap >= 0, np.inf, -np.inf), where=sd[:, None] > 0)
-    chance = np.diff(special.ndtr(z), prepend=0.0, append=1.0)
-    moments = []
-    for low in (-np.inf, 0.0):
-        seen = np.clip(dn, low, x.highest_dn)
-        centre = np.sum(chance * seen, axis=1)
-        variance = np.sum(chance * (seen - centre[:, None]) ** 2, axis=1)
-        moments.append((x.n_frames * (centre - recorded), x.n_frames * variance))
-    return moments
-
 
 #: Rows of a curve's table.
 ROC_ROWS = 200
@@ -248,12 +75,12 @@ class Roc(Drawable):
         Pearson for as many pairs as there are realisations.
         """
         # Union of the filled bins; the shapes are (2, n), for null and flare.
-        both, n = (null.bins, flare.bins), np.array([[null.n], [flare.n]])
-        lower, first = np.unique(np.concatenate([one[0] for one in both]), return_index=True)
-        upper = np.concatenate([one[1] for one in both])[first]
+        bins, n = (null.bins, flare.bins), np.array([[null.n], [flare.n]])
+        lower, first = np.unique(np.concatenate([edges for edges, *_ in bins]), return_index=True)
+        upper = np.concatenate([edges for _, edges, _ in bins])[first]
         counts = np.zeros((2, lower.size), np.int64)
-        for row, (own, _, filled) in zip(counts, both, strict=True):
-            row[np.searchsorted(lower, own)] = filled
+        for row, (edges, _, filled) in zip(counts, bins, strict=True):
+            row[np.searchsorted(lower, edges)] = filled
         # Integer counts above each edge make the ends of the curve exactly 1 and 0.
         above = np.pad(counts[:, ::-1].cumsum(axis=1)[:, ::-1], ((0, 0), (0, 1))) / n
         share = counts / n
@@ -261,11 +88,11 @@ class Roc(Drawable):
         area = float(np.clip(share[1] @ beaten, 0.0, 1.0))
         spread = [float(c @ (values - area) ** 2) for c, values in ((share[1], beaten), (share[0], beating))]
         reach = CONFIDENCE_SD * float(np.sqrt(spread[0] / flare.n + spread[1] / null.n))
-        found = Interval(area, max(area - reach, 0.0), min(area + reach, 1.0))
-        if both[0][0][-1] < both[1][0][0] or both[1][0][-1] < both[0][0][0]:
+        area_interval = Interval(area, max(area - reach, 0.0), min(area + reach, 1.0))
+        if max(bins[0][0][0], bins[1][0][0]) > min(bins[0][0][-1], bins[1][0][-1]):
             fewest = min(null.n, flare.n)
-            found = clopper_pearson(round(area) * fewest, fewest)
-        return cls(np.append(lower[0], upper), above[0], above[1], null.n, found)
+            area_interval = clopper_pearson(round(area) * fewest, fewest)
+        return cls(np.append(lower[0], upper), above[0], above[1], null.n, area_interval)
 
     def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> Any:
         """Plot detection probability against false-alarm probability; needs matplotlib."""
@@ -282,11 +109,11 @@ class Roc(Drawable):
     def points(self, rows: int = ROC_ROWS) -> dict[str, Float]:
         """Return at most `rows` points of the curve with their intervals, by the names of `ROC_COLUMNS`."""
         n = self.realisations
-        wanted = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)
-        chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))
+        levels = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)
+        chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -levels), self.fap.size - 1))
         points = {"threshold": self.threshold[chosen]}
-        for name, chance in (("fap", self.fap), ("probability", self.probability)):
-            ends = clopper_pearson_ends(np.rint(chance[chosen] * n).astype(np.int64), n)
+        for name, fraction in (("fap", self.fap), ("probability", self.probability)):
+            ends = clopper_pearson_ends(np.rint(fraction[chosen] * n).astype(np.int64), n)
             points |= dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
         return points
 
@@ -311,10 +138,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     @classmethod
     def of(cls, hypotheses: Hypotheses, realisations: int, tails: Tails, seed: int) -> Self:
         """Make a detection that shares the prepared state and closed forms of `hypotheses`."""
-        made = object.__new__(cls)
+        detection = object.__new__(cls)
         counts: dict[str, Any] = {"_tails": {}, "_distributions": {}, "_samples": {}}
-        vars(made).update(vars(hypotheses) | counts, realisations=realisations, tails=tails, seed=seed)
-        return made
+        vars(detection).update(vars(hypotheses) | counts, realisations=realisations, tails=tails, seed=seed)
+        return detection
 
     def _line(self) -> str:
         flares, names = len(self.flares), ", ".join(self.statistics)
@@ -325,7 +152,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Mapping[int, TailSamples]) -> None:
         """Add the distributions and extremes of one batch."""
         self._distributions |= {key: tally.distribution(index) for index, key in enumerate(plan.keys)}
-        self._samples |= {plan.keys[index]: kept for index, kept in samples.items()}
+        self._samples |= {plan.keys[index]: extremes for index, extremes in samples.items()}
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """Return the simulated distribution of a statistic.
@@ -372,9 +199,9 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             return sampled.threshold
         null = self.distribution(statistic, template=template)
         n_low, n_high = central_counts(null.n, fap)
-        wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
+        numbers_above = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
         # The lowest edges of the null's bins with few enough counts above.
-        cut = Interval(*map(null.edge_with_at_most, wanted))
+        cut = Interval(*map(null.edge_with_at_most, numbers_above))
         beyond, at = null.around(cut.value)
         check_atom(f"{statistic} of {self.quiet.name}", fap, beyond / null.n, at / null.n)
         return cut
@@ -418,7 +245,11 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
     def without_threshold(self, fap: float) -> tuple[Message, ...]:
         """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
-        cuts = (self._cut(fap, statistic, template) for statistic, template in self._nulls())
+        cuts = [
+            self._cut(fap, name, template)
+            for name in self.statistics
+            for template in range(len(self.flares) if self.statistic(name).shaped else 1)
+        ]
         sentences = (f"NO THRESHOLD: {cut}." for cut in cuts if isinstance(cut, NoThresholdError))
         return tuple(Message(sentence, "no threshold") for sentence in dict.fromkeys(sentences))
 
@@ -467,8 +298,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             for statistic in self.statistics
         ]
         tails = "counted" if countable(fap, self.realisations) else "importance sampling"
-        about = {"realisations": self.realisations, "exposure_s": self.quiet.exposure_s, "tails": tails}
-        return table_of(COLUMNS, rows, fap=fap, **about)
+        metadata = {"realisations": self.realisations, "exposure_s": self.quiet.exposure_s, "tails": tails}
+        return table_of(COLUMNS, rows, fap=fap, **metadata)
 
     def _row(self, fap: float, statistic: str, flare: int, probability: Interval) -> dict[str, Any]:
         """Return the row of one flare and statistic, as `COLUMNS` have it."""
@@ -483,10 +314,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         limit = self.closed_form(statistic, template=flare).isf(fap)
         # A weighted sum has no reduced value.
         reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
-        names = ("expected", "mean", "std", "reduced", "closed_form_probability")
-        of_flare = dict(zip(names, (theory.mean, d.mean, d.std, reduced, theory.sf(limit)), strict=True))
+        of_flare = {"expected": theory.mean, "mean": d.mean, "std": d.std, "reduced": reduced}
+        of_flare["closed_form_probability"] = theory.sf(limit)
         if flare in self.blinding:
-            of_flare = dict.fromkeys(names, np.nan)
+            of_flare = dict.fromkeys(of_flare, np.nan)
         return of_flare | vars(probability) | {
             "name": self.flares[flare].name, "statistic": statistic, "dof": dof, "probability": probability.value,
             "threshold": cut.value, "threshold_low": cut.low, "threshold_high": cut.high,

@@ -99,16 +99,17 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     middle, lower, upper = special.ndtri([(k + 0.5) / (trials + 1.0) for k in above]).tolist()
     above_cut, missed, tail = above[0], trials - above[0], (1.0 - CONFIDENCE) / 2.0
     # For small counts Jeffreys's interval undercovers; Clopper and Pearson's never does.
-    more = 0.5 if min(above_cut, missed) >= FEW else 0.0
-    low = float(special.ndtri(special.betaincinv(above_cut + more, missed + 1.0 - more, tail)))
-    high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - more, missed + more, 1.0 - tail)))
+    half = 0.5 if min(above_cut, missed) >= FEW else 0.0
+    low = float(special.ndtri(special.betaincinv(above_cut + half, missed + 1.0 - half, tail)))
+    high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - half, missed + half, 1.0 - tail)))
     # Correlation of the crossings of the threshold without and with a flare.
     p, cut = float(special.ndtr(middle)), float(special.ndtri(1.0 - fap))
-    both = _orthant(cut, float(special.ndtri(1.0 - p)), min(max(correlation, 0.0), 1.0))
-    shared = float((both - fap * p) / np.sqrt(fap * (1.0 - fap) * p * (1.0 - p)))
+    joint = _orthant(cut, float(special.ndtri(1.0 - p)), min(max(correlation, 0.0), 1.0))
+    shared = float((joint - fap * p) / np.sqrt(fap * (1.0 - fap) * p * (1.0 - p)))
 
-    def combined(sd: float, other: float) -> float:
-        return float(np.sqrt(max(sd**2 + other**2 - 2.0 * shared * sd * other, 0.0)))
+    def combined(sd: float, sd_of_threshold: float) -> float:
+        covariance = shared * sd * sd_of_threshold
+        return float(np.sqrt(max(sd**2 + sd_of_threshold**2 - 2.0 * covariance, 0.0)))
 
     below = combined(middle - low, middle - lower) if above_cut else np.inf
     beyond = combined(high - middle, upper - middle) if missed else np.inf
@@ -143,19 +144,19 @@ BISECTIONS = 18
 TOGETHER = 16
 
 
-def _falling_root(off: Callable[[float], float], start: float, step: float) -> float:
+def _falling_root(function: Callable[[float], float], start: float, step: float) -> float:
     """Return the root of a falling function to 1e-8 of a step, searched outwards from `start` in growing steps."""
     from scipy.optimize import brentq
 
-    off = cache(off)
+    function = cache(function)
     low = high = start
     width = step
-    while off(low) < 0:
+    while function(low) < 0:
         low, high, width = low - width, low, 2 * width
     width = step
-    while off(high) > 0:
+    while function(high) > 0:
         low, high, width = high, high + width, 2 * width
-    return float(brentq(off, low, high, xtol=1e-8 * step)) if low < high else low
+    return float(brentq(function, low, high, xtol=1e-8 * step)) if low < high else low
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,11 +196,11 @@ class QuadraticForm:
         shape, scale = (self.mean / self.std) ** 2, self.std**2 / self.mean
         start = (special.gammainccinv if upper[0] else special.gammaincinv)(shape, tail)
 
-        def off(log_value: float) -> float:
-            more = float(self._tails.logarithms(float(np.exp(log_value)), upper)[0] - np.log(tail))
-            return more if upper[0] else -more
+        def excess(log_value: float) -> float:
+            log_ratio = float(self._tails.logarithms(float(np.exp(log_value)), upper)[0] - np.log(tail))
+            return log_ratio if upper[0] else -log_ratio
 
-        return float(np.exp(_falling_root(off, float(np.log(max(start * scale, 1e-300))), 1e-2)))
+        return float(np.exp(_falling_root(excess, float(np.log(max(start * scale, 1e-300))), 1e-2)))
 
     @cached_property
     def _tails(self) -> _Tails:
@@ -220,8 +221,10 @@ class _Tails:
             values, member = np.unique(form.weight / unit, return_inverse=True)
             distinct.append((values, np.bincount(member), np.bincount(member, form.shift**2)))
         size = max(values.size for values, *_ in distinct)
-        padded = np.array([[np.pad(part, (0, size - part.size)) for part in parts] for parts in distinct], np.float64)
-        self.weight, self.count, self.push = padded.transpose(1, 0, 2)
+        padded = np.zeros((3, len(distinct), size))
+        for row, arrays in enumerate(distinct):
+            padded[:, row, : arrays[0].size] = arrays
+        self.weight, self.count, self.push = padded
 
     def above(self, value: float) -> Float:
         """Return the probabilities of exceeding a value, shape (n_form,)."""
@@ -251,7 +254,7 @@ class _Tails:
 
     def _integrals(self, x: Float, upper: NDArray[np.bool_], path: tuple[Float, Float, Float], top: Float) -> Float:
         """Integrate the probabilities divided by exp(top); NaN if the integrand grows on the contour."""
-        gap, bend, scale = (each[:, None] for each in path)
+        gap, bend, scale = (values[:, None] for values in path)
 
         def summed(first: float, step: float) -> Float:
             """Sum the integrands over points first, first + step, ... until they are negligible."""
@@ -284,18 +287,18 @@ class _Tails:
 
     def _exponent(self, gap: NDArray[Any], x: Float, upper: NDArray[np.bool_]) -> NDArray[np.complex128]:
         """Return K(s) - s x - log(+-s), shape of the gap."""
-        left, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
+        factors, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
         # Real logarithms and angles are several times faster than complex ones.
-        square = left.real**2 + left.imag**2
-        log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(left.imag, left.real) @ count)
-        turn = (left.real / square) @ push - push.sum(axis=1, keepdims=True) - 1j * ((left.imag / square) @ push)
+        square = factors.real**2 + factors.imag**2
+        log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(factors.imag, factors.real) @ count)
+        turn = (factors.real / square) @ push - push.sum(axis=1, keepdims=True) - 1j * ((factors.imag / square) @ push)
         sign = np.where(upper, 1.0, -1.0)[:, None]
         return np.asarray((0.5 * (turn - log))[..., 0] - s * x[:, None] - np.log(sign * s))
 
     def _derivative(self, gap: Float, order: int) -> Float:
         """Return a derivative of K of order 1 to 3, shape (n_form,)."""
-        left = self._factors(gap[:, None])[:, 0]
-        terms = (self.weight / left) ** order * (self.count + order * self.push / left)
+        factors = self._factors(gap[:, None])[:, 0]
+        terms = (self.weight / factors) ** order * (self.count + order * self.push / factors)
         return np.asarray((0.0, 1.0, 2.0, 8.0)[order] * terms.sum(axis=1))
 
     def _saddles(self, x: Float, upper: NDArray[np.bool_]) -> Float:
@@ -371,13 +374,13 @@ class Mixture:
         return [(np.array(chunk), _Tails([forms[place] for place in chunk])) for chunk in chunks]
 
     def isf(self, probability: float) -> float:
-        def off(value: float) -> float:
+        def excess(value: float) -> float:
             return float(np.log(max(self.sf(value), 1e-300) / probability))
 
         # From the quantile of a normal distribution with the same skewness (Cornish & Fisher 1938), outwards.
         z = -float(special.ndtri(probability))
         start = self.mean + self.std * z + (z**2 - 1.0) * self.third / (6.0 * self.std**2)
-        return _falling_root(off, start, 0.02 * self.std)
+        return _falling_root(excess, start, 0.02 * self.std)
 
 
 #: Closed form of a statistic's distribution.

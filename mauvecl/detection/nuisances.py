@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.host.arrays import ContentEquality, Float
 from mauvecl.host.tables.files import LARGEST, SMALLEST, read_text
@@ -55,8 +56,8 @@ class Nuisances(ContentEquality):
                     f"the standard deviation of the unknown {name!r} must be above 0 or 'free', not {sd:g}", key="sd"
                 )
         for name, expected in zip(("of_flare", "mean"), shapes, strict=True):
-            given = getattr(self, name)
-            values = np.asarray(given, np.float64) if np.size(given) else np.zeros(expected)
+            values = np.asarray(getattr(self, name), np.float64)
+            values = values if values.size else np.zeros(expected)
             if values.shape != expected or not np.isfinite(values).all():
                 raise InputError(
                     f"{name} of the unknowns must be finite and of the shape {expected}; its shape is {values.shape}",
@@ -84,8 +85,8 @@ class Nuisances(ContentEquality):
                     key="own",
                 )
             if not spectrum.any():
-                fault = f"the unknown {name!r} must change pixels of {quiet.name}, but changes none"
-                raise InputError(fault, key="own")
+                message = f"the unknown {name!r} must change pixels of {quiet.name}, but changes none"
+                raise InputError(message, key="own")
             spectra[k] = spectrum
         return cls(tuple(sd), spectra, np.array(list(sd.values()), np.float64), of_flare)
 
@@ -130,13 +131,18 @@ class Nuisances(ContentEquality):
 
     def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:
         """Return the parameters with another prior of one amplitude."""
-        chosen = np.array([other == name for other in self.names])
+        chosen = np.array([parameter == name for parameter in self.names])
         return replace(self, sd=np.where(chosen, sd, self.sd), mean=np.where(chosen, mean, self.mean))
+
+    @property
+    def _are_factors(self) -> NDArray[np.bool_]:
+        """Mask of the parameters that multiply all light, that of a flare included, shape (k,)."""
+        return np.asarray((self.of_flare == 1.0).all(axis=1))
 
     @property
     def has_factor(self) -> bool:
         """Whether the last parameter multiplies all light, that of a flare included; see `around`."""
-        return bool(self.names) and bool((self.of_flare[-1] == 1.0).all())
+        return bool(self._are_factors[-1:].any())
 
     def around(self, flare_dn: Float) -> Nuisances:
         """Return the parameters for fits of a flare next to one that is recorded with these DN.
@@ -145,7 +151,7 @@ class Nuisances(ContentEquality):
         recorded. The spectra of the others include the flare.
         """
         self._check_pixels(flare_dn=flare_dn)
-        order, factors = [*range(len(self.names))], np.flatnonzero((self.of_flare == 1.0).all(axis=1))
+        order, factors = [*range(len(self.names))], np.flatnonzero(self._are_factors)
         if factors.size:
             order.append(order.pop(int(factors[0])))
         spread = self._rows(order)
@@ -157,7 +163,7 @@ class Nuisances(ContentEquality):
     @property
     def mean_factor(self) -> float:
         """Prior mean of the factor on all light, that of a flare included."""
-        return 1.0 + float(self.mean[(self.of_flare == 1.0).all(axis=1)].sum())
+        return 1.0 + float(self.mean[self._are_factors].sum())
 
     @property
     def mean_dn(self) -> Float:
@@ -227,29 +233,30 @@ def read_at_pixels(kind: Literal["weights", "spectrum"], name: str, path: Path, 
     """Read weights per DN of a statistic, or the spectrum of an unknown in DN per exposure, and apply `at_pixels`."""
     from mauvecl.host.tables.text_tables import columns
 
-    what, values = f"{kind} {shortened(path.name)} of {shortened(name)}", "DN" if kind == "spectrum" else kind
-    rows = columns(what, read_text(path, kind), f"wavelengths and {values}", "nm")
-    return at_pixels(what, values, rows, wavelength_nm)
+    source, unit = f"{kind} {shortened(path.name)} of {shortened(name)}", "DN" if kind == "spectrum" else kind
+    rows = columns(source, read_text(path, kind), f"wavelengths and {unit}", "nm")
+    return at_pixels(source, unit, rows, wavelength_nm)
 
 
-def at_pixels(what: str, kind: str, rows: Float, wavelength_nm: Float) -> Float:
+def at_pixels(source: str, kind: str, rows: Float, wavelength_nm: Float) -> Float:
     """Interpolate rows of wavelength, nm, and value linearly to pixels, 0 outside their range.
 
-    `what` and `kind` name the source and its values in messages.
+    `source` and `kind` name the source and its values in messages.
     """
     if rows.ndim != 2 or rows.shape[1] != 2:
-        raise InputError(f"{what} must have two columns, nm and {kind}, but have the shape {rows.shape}", key=what)
+        raise InputError(f"{source} must have two columns, nm and {kind}, but have the shape {rows.shape}", key=source)
     if not np.all(np.diff(rows[:, 0]) > 0):
-        raise InputError(f"{what} must ascend in wavelength", key=what)
+        raise InputError(f"{source} must ascend in wavelength", key=source)
     sizes = np.abs(rows)
     bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():
         raise InputError(
-            f"{what} must be 0 or of a size from {SMALLEST:g} to {LARGEST:g}, but hold {rows[bad][0]!r}", key=what
+            f"{source} must be 0 or of a size from {SMALLEST:g} to {LARGEST:g}, but hold {rows[bad][0]!r}", key=source
         )
     values = np.interp(wavelength_nm, rows[:, 0], rows[:, 1], left=0.0, right=0.0)
     if not values.any():
         raise InputError(
-            f"{what} must differ from 0 somewhere in {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm", key=what
+            f"{source} must differ from 0 somewhere in {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm",
+            key=source,
         )
     return np.asarray(values)

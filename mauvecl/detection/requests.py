@@ -49,7 +49,7 @@ class Hypotheses:
 
     quiet: Expectation
     flares: tuple[Expectation, ...]
-    asked: Sequence[str | Linear]  # requested statistics
+    requested: Sequence[str | Linear]  # names of statistics, and user-defined ones
     scene: Scene
     _: KW_ONLY
     nuisances: Nuisances | None = None  # parameters over which the statistics are marginalised
@@ -59,7 +59,7 @@ class Hypotheses:
 
     def __post_init__(self) -> None:
         self._chosen = {}
-        for statistic in self.asked:
+        for statistic in self.requested:
             if isinstance(statistic, str):
                 check_statistic(statistic)
                 self._chosen[statistic] = STATISTICS[statistic]
@@ -77,25 +77,20 @@ class Hypotheses:
         shaped = [name for name, kind in self._chosen.items() if kind.shaped]
         if shaped and not self.flares:
             raise InputError(f"the statistic {shaped[0]!r} needs at least one flare, but none is given", key="flares")
-        if not self.scene.used.any():
+        if not scene.used.any():
             raise entirely_saturated(self.quiet, "quiet")
         for kind in self._chosen.values():
             kind.check(self.setting)
         for k, flare in enumerate(self.flares if "matched" in self._chosen else ()):
             # `messages` report a flare that saturates every pixel.
             if k not in self.blinding:
-                check_shape(self.quiet, flare, self.scene.used, k)
+                check_shape(self.quiet, flare, scene.used, k)
 
     def statistic(self, name: str) -> Statistic:
         """Return a statistic by name; raises InputError if it was not requested."""
         if name not in self._chosen:
             raise InputError.of("statistic", name, f"one of {', '.join(self.statistics)}")
         return self._chosen[name]
-
-    def _nulls(self) -> list[tuple[str, int]]:
-        """Return every statistic with every template that gives it a null distribution of its own."""
-        several = range(len(self.flares))
-        return [(name, k) for name, kind in self._chosen.items() for k in (several if kind.shaped else (0,))]
 
     def shape(self, statistic: str, template: int = 0) -> Expectation | None:
         """Return the flare that a shaped statistic uses as template; None for other statistics."""
@@ -127,12 +122,12 @@ class Hypotheses:
     @cached_property
     def lowered(self) -> tuple[Message, ...]:
         """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
-        sentences, how = [], "marginalised over unknowns, " if self.nuisances else ""
+        sentences, treatment = [], "marginalised over unknowns, " if self.nuisances else ""
         for name, (k, flare) in product(self.statistics, enumerate(self.flares)):
             if falls := self.fall(name, k):
                 matched = Matched().closed_form(self.setting, flare, flare)
                 sentences.append(Message(
-                    f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
+                    f"WRONG SIGN: {treatment}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
                     f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing of "
                     f"the flare, which matched has at {matched.mean / matched.std:.3g}.", "wrong sign",
                 ))  # fmt: skip
@@ -149,9 +144,9 @@ class Hypotheses:
         self._check(statistic, flare, template)
         observed = self.quiet if flare is None else self.flares[flare]
         # Only the nulls of shaped statistics depend on the template.
-        looked_for = self.shape(statistic, template if flare is None else flare)
+        shape = self.shape(statistic, template if flare is None else flare)
         kind, name = self.statistic(statistic), f"form of {statistic} with flare {flare}"
-        return self.setting.cached(name, lambda: kind.closed_form(self.setting, observed, looked_for), looked_for)
+        return self.setting.cached(name, lambda: kind.closed_form(self.setting, observed, shape), shape)
 
     def dof(self, statistic: str) -> int:
         """Return the degrees of freedom without a flare: pixels, resolution elements, or one."""
@@ -190,6 +185,8 @@ Key = tuple[str, Role, int]
 class ChannelPlan:
     """Channels that a launch computes for a batch of flares."""
 
+    hypotheses: Hypotheses
+    scene: Scene  # the quiescent star and the flares of the batch
     weights: NDArray[np.float32]  # shape (n_linear, n_padded)
     linear_end: NDArray[np.uint32]  # one past the last linear statistic of each scenario, shape (n_scenario,)
     # One past the last linear statistic with weights per pixel, shape (n_scenario,). Later ones have weights per
@@ -218,7 +215,7 @@ Rows = dict[tuple[str, int, int], Float]
 
 
 def _rows(
-    hypotheses: Hypotheses, asked: Sequence[Statistic], batch: Sequence[int]
+    hypotheses: Hypotheses, statistics: Sequence[Statistic], batch: range
 ) -> tuple[Rows, Rows, NDArray[np.uint32]]:
     """Return the weights of sums, and the scales of the paper's statistic, in the kernel's order, and ends of rows.
 
@@ -230,28 +227,28 @@ def _rows(
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
         of_pixels = len(weighted)
         # Shaped statistics come first, since the kernel fuses the first row, and sums over elements last.
-        for statistic in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
+        for statistic in sorted(statistics, key=lambda s: (s.by_element, not s.shaped)):
             name, setting = statistic.name, hypotheses.setting
             for flare in shapes if statistic.shaped else [0]:
-                looked_for = hypotheses.shape(name, flare)
+                shape = hypotheses.shape(name, flare)
                 if isinstance(statistic, LinearStatistic):
-                    weighted[name, scenario, flare] = statistic.weights_per_dn(setting, looked_for)
+                    weighted[name, scenario, flare] = statistic.weights_per_dn(setting, shape)
                 elif isinstance(statistic, Chi2):
-                    weighted |= {(name, scenario, k): own for k, own in enumerate(statistic.subtracted_rows(setting))}
+                    weighted |= {(name, scenario, k): row for k, row in enumerate(statistic.subtracted_rows(setting))}
                 elif isinstance(statistic, Paper):
-                    smoothed[name, scenario, flare] = statistic.scale(setting, looked_for)
+                    smoothed[name, scenario, flare] = statistic.scale(setting, shape)
             of_pixels = of_pixels if statistic.by_element else len(weighted)
         ends.append((len(weighted), of_pixels, len(smoothed)))
     return weighted, smoothed, np.array(ends, np.uint32).T.copy()
 
 
-def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
+def plan_channels(hypotheses: Hypotheses, batch: range) -> ChannelPlan:
     """Plan the channels of a batch of flares; scenario 0 is always the quiescent one.
 
-    If `first`, the batch also counts the null distributions that all batches share.
+    The first batch also counts the null distributions that all batches share.
     """
-    asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
-    weighted, smoothed, (linear_end, pixels_end, scale_end) = _rows(hypotheses, asked, batch)
+    statistics = [hypotheses.statistic(name) for name in hypotheses.statistics]
+    weighted, smoothed, (linear_end, pixels_end, scale_end) = _rows(hypotheses, statistics, batch)
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
     channels = {key: fixed * n_scenario + number for number, key in enumerate([*weighted, *smoothed])}
 
@@ -262,14 +259,14 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
 
     subtractions: list[tuple[int, int, int]] = []
     if hypotheses.nuisances:
-        sums = [statistic for statistic in asked if isinstance(statistic, Chi2)]
+        sums = [statistic for statistic in statistics if isinstance(statistic, Chi2)]
         for chi2, scenario in product(sums, range(n_scenario)):
             begin = channels[chi2.name, scenario, 0]
             subtractions.append((channel_of(chi2, scenario, 0), begin, begin + len(hypotheses.nuisances.names)))
     counted: list[tuple[Key, int, Form]] = []
-    for statistic in asked:
+    for statistic in statistics:
         name = statistic.name
-        if first and not statistic.shaped:
+        if batch.start == 0 and not statistic.shaped:
             counted.append(((name, "null", 0), channel_of(statistic, 0, 0), hypotheses.closed_form(name)))
         for i, flare in enumerate(batch):
             null = hypotheses.closed_form(name, template=flare)
@@ -279,12 +276,12 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
             counted.append(((name, "flare_on_null_grid", flare), channel, null))
             counted.append(((name, "flare", flare), channel, hypotheses.closed_form(name, flare)))
     keys, of_grids, forms = zip(*counted, strict=True)
-    scene = hypotheses.scene
+    scene = hypotheses.scene.part([0, *(k + 1 for k in batch)])
     weights = np.zeros((len(weighted), len(scene.pixels)), np.float32)
     weights[:, : scene.n_pixel] = np.reshape([*weighted.values()], (len(weighted), scene.n_pixel))
     scales = np.array([*smoothed.values()], np.float32) if smoothed else np.zeros((0, 1), np.float32)
     return ChannelPlan(
-        weights, linear_end, pixels_end, scales, scale_end,
+        hypotheses, scene, weights, linear_end, pixels_end, scales, scale_end,
         grids=grids_of(of_grids, [form.mean for form in forms], [form.std for form in forms]), keys=[*keys],
         subtractions=np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T,
     )  # fmt: skip
@@ -333,17 +330,17 @@ class Countable:
         raise NotImplementedError
 
     @classmethod
-    def of(cls, *what: Any, **how: Any) -> Self:
+    def of(cls, *arguments: Any, **keywords: Any) -> Self:
         """Make a request from keywords that may include the fields of a `Drawing`."""
-        words = {name: how.pop(name) for name in DrawingOptions.__annotations__ if name in how}
-        return cls(*what, **how | {"drawing": Drawing(**words)})
+        options = {name: keywords.pop(name) for name in DrawingOptions.__annotations__ if name in keywords}
+        return cls(*arguments, **keywords | {"drawing": Drawing(**options)})
 
     def __post_init__(self) -> None:
         check_last(self.start, self.realisations)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle: request fields only, no caches."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
+        return {row.name: getattr(self, row.name) for row in fields(self)}  # type: ignore[arg-type]
 
 
 @validated
@@ -376,15 +373,11 @@ class DetectRequest(Countable):
         return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=self.nuisances)
 
     @cached_property
-    def plans(self) -> list[tuple[ChannelPlan, Scene]]:
-        """Channels and scene of each part, with as many flares as a launch can process."""
-        scene, count = self.hypotheses.scene, len(self.flares)
-        size = BATCH[scene.frames] - 1
-        batches = [range(i, min(i + size, count)) for i in range(0, count, size)] or [range(0)]
-        return [
-            (plan_channels(self.hypotheses, batch, first=batch is batches[0]), scene.part([0, *(k + 1 for k in batch)]))
-            for batch in batches
-        ]
+    def plans(self) -> list[ChannelPlan]:
+        """Channels of each part, with as many flares as a launch can process."""
+        count, size = len(self.flares), BATCH[self.hypotheses.scene.frames] - 1
+        batches = [range(i, min(i + size, count)) for i in range(0, max(count, 1), size)]
+        return [plan_channels(self.hypotheses, batch) for batch in batches]
 
     @property
     def parts(self) -> int:
@@ -392,7 +385,7 @@ class DetectRequest(Countable):
 
     @property
     def work(self) -> int:
-        return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
+        return self.hypotheses.scene.n_pixel * max(len(plan.scene.levels) for plan in self.plans)
 
 
 @validated

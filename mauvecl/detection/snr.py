@@ -61,8 +61,8 @@ def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
     real["gain"] = x.gain_dn_per_electron
     real["variance"] = x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
     # The narrowest bins of whole DN that cover +-8 sigma: sigma / 128 to sigma / 64.
-    wanted = 16.0 * np.sqrt(x.variance_dn2) / layout.OBSERVER_BINS
-    real["bin_shift"] = np.ceil(np.log2(np.maximum(wanted, 1.0)))
+    width = 16.0 * np.sqrt(x.variance_dn2) / layout.OBSERVER_BINS
+    real["bin_shift"] = np.ceil(np.log2(np.maximum(width, 1.0)))
     return table
 
 
@@ -109,19 +109,19 @@ class Counts:
     ) -> None:
         """Add the device's histograms of one or more tiles."""
         for kind, dense in (("pixel", pixel), ("element", element)):
-            which, column = np.nonzero(dense[:, 1:-1])
-            self.bins[kind].add(which, FIRST_BIN + column, dense[which, 1 + column])
+            row, column = np.nonzero(dense[:, 1:-1])
+            self.bins[kind].add(row, FIRST_BIN + column, dense[row, 1 + column])
         self.clipped += clipped
         self.n += n
 
     def add_far(
-        self, dn: NDArray[np.integer], observers: NDArray[np.void], elements: NDArray[np.void], asked: NDArray[np.intp]
+        self, dn: NDArray[np.integer], observers: NDArray[np.void], elements: NDArray[np.void], rows: NDArray[np.intp]
     ) -> None:
         """Count the values outside the dense bins of some elements and their pixels.
 
-        `dn`, shape (n_pixel, n), holds raw DN minus the scene's base. `asked` holds the indices of the elements.
+        `dn`, shape (n_pixel, n), holds raw DN minus the scene's base, and `rows` the indices of the elements.
         """
-        for e in asked:
+        for e in rows:
             element = elements[e]
             first, end = int(element["first"]), int(element["end"])
             for p in range(first, end):
@@ -136,18 +136,18 @@ class Counts:
                 )
             self._count_far("element", e, steps.astype(np.int64))
 
-    def _count_far(self, kind: str, which: int, bins: NDArray[np.int64]) -> None:
-        self.bins[kind].count(which, bins[(bins < FIRST_BIN) | (bins > LAST_BIN)])
+    def _count_far(self, kind: str, row: int, bins: NDArray[np.int64]) -> None:
+        self.bins[kind].count(row, bins[(bins < FIRST_BIN) | (bins > LAST_BIN)])
 
     def dense(self, kind: str) -> NDArray[np.int64]:
         """Return the histograms in the device's columns, without values beyond, shape (n, OBSERVER_BINS)."""
         dense = np.zeros(self.shapes[kind], np.int64)
-        (which, bins), inner = self.bins[kind].places, self.within(kind)
-        dense[which[inner], bins[inner] - FIRST_BIN + 1] = self.bins[kind].counts[inner]
+        (rows, bins), inner = self.bins[kind].places, self.within(kind)
+        dense[rows[inner], bins[inner] - FIRST_BIN + 1] = self.bins[kind].counts[inner]
         return dense
 
     def within(self, kind: str) -> NDArray[np.bool_]:
-        """Return which filled bins are among the device's."""
+        """Return the mask of the filled bins that are among the device's."""
         _, bins = self.bins[kind].places
         return (bins >= FIRST_BIN) & (bins <= LAST_BIN)
 
@@ -158,8 +158,8 @@ class Counts:
 
     def merge(self, packed: Arrays) -> None:
         """Add packed counts of other realisations."""
-        for kind, each in self.bins.items():
-            each.merge(kind, packed)
+        for kind, bins in self.bins.items():
+            bins.merge(kind, packed)
         self.clipped += packed["clipped"]
         self.n += int(packed["n"])
 
@@ -195,15 +195,15 @@ class SnrResult(Drawable, ContentEquality):
 
         The histogram counts whole DN, of which the S/N is a function, in bins of at most 1/64 of a standard deviation.
         """
-        x, seen = self.expectation, self.observers[: self.scene.n_pixel]
-        width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
+        x, table = self.expectation, self.observers[: self.scene.n_pixel]
+        width, sky = 2.0 ** table["bin_shift"].astype(float), x.subtracted_dn
 
-        def snr(which: int, place: NDArray[np.number]) -> Float:
+        def snr(row: int, bin_number: NDArray[np.number]) -> Float:
             # A bin contains the whole DN from its lower edge up to the next.
-            dn = width[which] * place - 0.5
-            net = dn + seen["net_offset"].astype(float)[which]
-            noise2 = np.maximum(net, 0.0) * seen["gain"][which] + seen["variance"][which]
-            return np.asarray(np.divide(net - sky[which], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
+            dn = width[row] * bin_number - 0.5
+            net = dn + table["net_offset"].astype(float)[row]
+            noise2 = np.maximum(net, 0.0) * table["gain"][row] + table["variance"][row]
+            return np.asarray(np.divide(net - sky[row], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
 
         low, high = self.counts.clipped.T / (self.counts.n * x.n_frames)
         return self._table("pixel", x.wavelength_nm, x.snr(), snr, clipped_low=low, clipped_high=high)
@@ -211,11 +211,11 @@ class SnrResult(Drawable, ContentEquality):
     @property
     def element(self) -> QTable:
         """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
-        x, every = self.expectation, elements(self.expectation)
-        step = np.divide(1.0, every["bins_per_unit"], out=np.zeros(len(every)), where=every["bins_per_unit"] > 0)
+        x, table = self.expectation, elements(self.expectation)
+        step = np.divide(1.0, table["bins_per_unit"], out=np.zeros(len(table)), where=table["bins_per_unit"] > 0)
 
-        def snr(which: int, place: NDArray[np.number]) -> Float:
-            return np.asarray(every["centre"][which] + step[which] * (place - 0.5))
+        def snr(row: int, bin_number: NDArray[np.number]) -> Float:
+            return np.asarray(table["centre"][row] + step[row] * (bin_number - 0.5))
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
@@ -228,18 +228,19 @@ class SnrResult(Drawable, ContentEquality):
     ) -> QTable:  # fmt: skip
         """Return the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
         rows = []
-        for which in range(len(expected)):
-            filled, counts = self.counts.bins[kind].of(which)
-            middle = snr(which, filled + 0.5)
+        for row in range(len(expected)):
+            filled, counts = self.counts.bins[kind].of(row)
+            middle = snr(row, filled + 0.5)
             mean = counts @ middle / self.counts.n
-            edges = np.column_stack([snr(which, filled), snr(which, filled + 1)]).ravel()
+            edges = np.column_stack([snr(row, filled), snr(row, filled + 1)]).ravel()
             quantiles = np.interp(np.array(PERCENTAGES) / 100, steps_of(counts) / self.counts.n, edges)
             rows.append((mean, np.sqrt(counts @ (middle - mean) ** 2 / self.counts.n), *quantiles))
-        names = ("mean", "std", *(f"q{percentage:g}" for percentage in PERCENTAGES))
-        values = {"wavelength": wavelength_nm, "expected": expected} | dict(zip(names, np.array(rows).T, strict=True))
-        x, columns = self.expectation, (*COLUMNS, *CLIPPED_COLUMNS) if clipped else COLUMNS
-        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
-        return table_of(columns, [values | clipped], realisations=self.counts.n, **about)
+        arrays = np.column_stack([wavelength_nm, expected, np.array(rows)]).T
+        values = dict(zip((column.name for column in COLUMNS), arrays, strict=True)) | clipped
+        columns = (*COLUMNS, *CLIPPED_COLUMNS) if clipped else COLUMNS
+        x = self.expectation
+        metadata = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
+        return table_of(columns, [values], realisations=self.counts.n, **metadata)
 
 
 def counts_of(request: SnrRequest) -> Counts:
@@ -250,6 +251,6 @@ def counts_of(request: SnrRequest) -> Counts:
 def detection_of(request: DetectRequest, tallies: Iterable[Tally]) -> Detection:
     """Return the result of a request from the tallies of its parts."""
     detection = Detection.of(request.hypotheses, request.realisations, request.tails, request.seed)
-    for (plan, _), tally in zip(request.plans, tallies, strict=True):
+    for plan, tally in zip(request.plans, tallies, strict=True):
         detection.collect(plan, tally, tally.tails)
     return detection

@@ -151,18 +151,20 @@ class Statistic(ABC):
         Without `priors`, nuisance parameters that are not drawn do not scatter.
         """
         if not setting.integrates:
-            return self.form(setting, seen if priors else replace(seen, scatter=np.zeros((0, seen.mean.size))), flare)
+            if not priors:
+                seen = replace(seen, scatter=np.zeros((0, seen.mean.size)))
+            return self.form(setting, seen, flare)
         assert setting.nuisances
         nodes = factor_nodes(setting.drawn, observed, weighted=isinstance(self, LinearStatistic))
         rows = nodes.spectra
         if priors:
             # Parameters that are not drawn keep their Gaussian priors.
-            others = setting.nuisances.without(tuple(setting.drawn))
-            rows = np.vstack([rows, others.finite(others.spectra)])
+            fixed = setting.nuisances.without(tuple(setting.drawn))
+            rows = np.vstack([rows, fixed.finite(fixed.spectra)])
         means, variances = changes_of(observed)
         moved = Differences(seen.mean, seen.variance, scatter=rows)
-        parts = self.moved_forms(setting, moved, nodes.amounts, means * setting.used, variances, flare)
-        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), nodes.probability)
+        forms = self.moved_forms(setting, moved, nodes.amounts, means * setting.used, variances, flare)
+        return forms[0] if len(forms) == 1 else Mixture(tuple(forms), nodes.probability)
 
     def moved_forms(
         self, setting: Setting, seen: Differences, amounts: Float, means: Float, variances: Float,
@@ -172,7 +174,7 @@ class Statistic(ABC):
 
         `amounts` has the shape (n, k), `means` and `variances` the shape (k, n_pixel).
         """
-        moved = ((seen.mean + each @ means, seen.variance + each @ variances) for each in amounts)
+        moved = ((seen.mean + amount @ means, seen.variance + amount @ variances) for amount in amounts)
         return [self.form(setting, Differences(*moments, scatter=seen.scatter), flare) for moments in moved]
 
     @abstractmethod
@@ -221,18 +223,18 @@ class LinearStatistic(Statistic):
         variance = self.variance(setting) * setting.used
         sought = variance * weights
         rows = setting.nuisances.rows(variance, setting.nuisances.spectra * setting.used)
-        left = weights - (rows @ sought) @ rows
-        power = float(left @ sought)
+        residual = weights - (rows @ sought) @ rows
+        power = float(residual @ sought)
         if power <= 1e-10 * float(weights @ sought):
-            used, every = int(np.count_nonzero(setting.used)), setting.used.size
-            where = f" in the {used} of {every} pixels that are used" if used < every else ""
+            used, n_pixel = int(np.count_nonzero(setting.used)), setting.used.size
+            where = f" in the {used} of {n_pixel} pixels that are used" if used < n_pixel else ""
             raise InputError(
                 f"the flare that {self.name!r} looks for cannot be distinguished from "
                 f"{join_names(setting.nuisances.names)}{where}; use fewer unknowns or smaller standard deviations, "
                 "such as `nuisances.usual=false`",
                 key="statistic",
             )
-        return np.asarray(left / np.sqrt(power) if self.normalised else left)
+        return np.asarray(residual / np.sqrt(power) if self.normalised else residual)
 
     def dof(self, setting: Setting) -> int:
         return 1

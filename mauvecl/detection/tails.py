@@ -47,7 +47,7 @@ MIN_BEYOND = 100
 
 @dataclass(frozen=True)
 class CampaignRisk:
-    """Probability of any false alarm in a campaign, or the one of each test that gives a wanted one of the campaign."""
+    """Probability of any false alarm in a campaign, or that per test for a wanted probability of the campaign."""
 
     tests: int
     bound: float  # for any dependence of the tests (Bonferroni)
@@ -56,10 +56,10 @@ class CampaignRisk:
 
 
 def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> CampaignRisk:
-    """Return the false-alarm probability per test for a wanted one of the campaign; the inverse of `campaign`.
+    """Return the false-alarm probability per test that gives the wanted one of a campaign; the inverse of `campaign`.
 
-    The bound suffices for any dependence of the tests, and the probability for independent ones also for overlapping
-    stacks of a linear statistic. Too few simulated maxima beyond a threshold give no probability for overlapping ones.
+    The bound suffices for any dependence of the tests, and the probability for independent tests also for overlapping
+    stacks of a linear statistic. `overlapping` is None if too few simulated maxima lie beyond the threshold.
 
     Examples
     --------
@@ -109,8 +109,8 @@ def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None
         # The probability of an alarm in a stretch; stretches are combined as if they were independent.
         stretch = min(tests, STRETCH)
         alarms = int((_maxima(stretch, stack, step, seed) >= -special.ndtri(fap) * np.sqrt(stack)).sum())
-        one = clopper_pearson(alarms, SIMULATIONS)
-        chances = np.minimum([one.value, one.low, one.high], 1 - 1e-16)
+        fraction = clopper_pearson(alarms, SIMULATIONS)
+        chances = np.minimum([fraction.value, fraction.low, fraction.high], 1 - 1e-16)
         overlapping = Interval(*(-np.expm1(tests / stretch * np.log1p(-chances))).tolist())
     return CampaignRisk(tests, min(tests * fap, 1.0), independent, overlapping)
 
@@ -173,12 +173,12 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError.of("fap", fap, f"between {SMALLEST_FAP:g} and 0.1 for importance sampling")
     _check(hypotheses, fap)
-    how = _Tilt.for_alarms(fap, hypotheses, statistic, template)
+    tilt = _Tilt.for_alarms(fap, hypotheses, statistic, template)
     blocks: list[tuple[Float, Float]] = []
     goal = FIRST_REALISATIONS
     while True:
         for number in range(len(blocks), goal // BLOCK):
-            blocks.append(_block(hypotheses, statistic, template, how, seed, number))
+            blocks.append(_block(hypotheses, statistic, template, tilt, seed, number))
         values, logs = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
         weight, n = np.exp(logs), values.size
         cut, error = _threshold(values, weight, fap)
@@ -282,12 +282,12 @@ class _Tilt:
         """Return the change of differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
         along = difference @ self.directions.T
         if self.shift:
-            there = along + self.shift
-            return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * there[:, 0]
-        there = along * self.stretch
+            shifted = along + self.shift
+            return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * shifted[:, 0]
+        stretched = along * self.stretch
         # Ratio of standard normal densities to those of spread `stretch`.
-        logs = np.log(self.stretch).sum() - 0.5 * there**2 @ (1.0 - 1.0 / self.stretch**2)
-        return (there - along) @ self.directions, np.asarray(logs)
+        logs = np.log(self.stretch).sum() - 0.5 * stretched**2 @ (1.0 - 1.0 / self.stretch**2)
+        return (stretched - along) @ self.directions, np.asarray(logs)
 
 
 def _stretch(square: Float, goal: float) -> Float:
@@ -310,24 +310,24 @@ def _block(
     scene = hypotheses.scene
     kind = hypotheses.statistic(statistic)
     exposures = 1 if kind.paired else scene.comparison.exposures
-    z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
+    z, *z_references = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
     added = kind.added_variance(hypotheses.setting)
     # Only the difference is tilted; orthogonal combinations remain as drawn.
     root = np.sqrt(1.0 + added)
-    difference = (z - added * sum(others)) / root
+    difference = (z - added * sum(z_references)) / root
     move, logs = tilt.apply(difference)
-    factors, more = _factors(scene, tilt.scores, seed, block)
-    excess, logs = _excess(scene, z + move / root, factors), logs + more
+    factors, log_ratios = _factors(scene, tilt.scores, seed, block)
+    excess, logs = _excess(scene, z + move / root, factors), logs + log_ratios
     # Exposures are subtracted only if no factors are drawn.
-    subtracted = [_excess(scene, other - added * move / root, factors) for other in others]
+    subtracted = [_excess(scene, z_reference - added * move / root, factors) for z_reference in z_references]
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
     variance = np.broadcast_to(kind.variance(hypotheses.setting), excess.shape)
     if scene.comparison.estimated:
         # The variances that an observer estimates of both exposures.
-        known = scene.estimates[0, : scene.n_pixel]
-        nets = (one - scene.fraction[0, : scene.n_pixel] + known["net_offset"] for one in (excess, mean))
-        own, other = (np.maximum(net, 0.0) * known["gain"] + known["variance"] for net in nets)
-        variance = own + added * other
+        estimate = scene.estimates[0, : scene.n_pixel]
+        nets = (dn - scene.fraction[0, : scene.n_pixel] + estimate["net_offset"] for dn in (excess, mean))
+        of_exposure, of_reference = (np.maximum(net, 0.0) * estimate["gain"] + estimate["variance"] for net in nets)
+        variance = of_exposure + added * of_reference
     shape = hypotheses.shape(statistic, template)
     return kind.values(hypotheses.setting, excess - mean, variance, shape), logs
 
@@ -339,8 +339,8 @@ def _normals(n_pixel: int, seed: int, block: int, exposure: int, purpose: int = 
     uniform = ((words >> np.uint64(11)) + 0.5) * 2.0**-53
     half = uniform.size // 2
     radius, angle = np.sqrt(-2.0 * np.log(uniform[:half])), 2.0 * np.pi * uniform[half : 2 * half]
-    both = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
-    return np.asarray(both[: BLOCK * n_pixel].reshape(BLOCK, n_pixel))
+    normals = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+    return np.asarray(normals[: BLOCK * n_pixel].reshape(BLOCK, n_pixel))
 
 
 def _factors(

@@ -49,7 +49,7 @@ class DeviceRecord:
 
 
 def write_outcome(device: DeviceRecord, checks: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
-    """Keep a self-test in the kernel cache, for records of the same device, driver and version; return what is kept."""
+    """Store and return the record of a self-test, for later records of the same device, driver and version."""
     record = {
         "mauvecl": VERSION,
         "device": asdict(device),
@@ -69,8 +69,8 @@ def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
 
 
 def _outcome_key(device: DeviceRecord) -> str:
-    said = f"selftest {VERSION} {device.label} {device.driver}"
-    return hashlib.sha256(said.encode()).hexdigest()[:32]
+    unique = f"selftest {VERSION} {device.label} {device.driver}"
+    return hashlib.sha256(unique.encode()).hexdigest()[:32]
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def load_opencl() -> Any:
     return pyopencl
 
 
-def _found() -> list[tuple[Any, DeviceRecord]]:
+def _handles_and_records() -> list[tuple[Any, DeviceRecord]]:
     """Return all OpenCL devices and their records, the default one first."""
     cl = load_opencl()
     handles, kind = list[Any](), cl.device_type
@@ -164,12 +164,12 @@ def _found() -> list[tuple[Any, DeviceRecord]]:
     if not handles:
         # If a variable names a folder, loaders search only that.
         folders = ", ".join(f"{name}={os.environ[name]}" for name in drivers.FOLDER_VARIABLES if os.environ.get(name))
-        searched = f" ({folders})" if folders else ""
-        raise drivers.DeviceError(f"no OpenCL device found{searched}: install {drivers.driver_sources()}", "no device")
+        place = f" ({folders})" if folders else ""
+        raise drivers.DeviceError(f"no OpenCL device found{place}: install {drivers.driver_sources()}", "no device")
     # PoCL on the CPU is the default.
     handles.sort(key=lambda device: (device.platform.name != POCL, not device.type & kind.CPU))
     kinds = {"cpu": kind.CPU, "gpu": kind.GPU, "accelerator": kind.ACCELERATOR}
-    found = list[tuple[Any, DeviceRecord]]()
+    pairs = list[tuple[Any, DeviceRecord]]()
     for device in handles:
         lacking = weaknesses(device)
         record = DeviceRecord(
@@ -179,11 +179,11 @@ def _found() -> list[tuple[Any, DeviceRecord]]:
             kind=next((name for name, bit in kinds.items() if device.type & bit), "other"),
             compute_units=int(device.max_compute_units),
             global_memory=int(device.global_mem_size),
-            default=not found,
+            default=not pairs,
             promise=f"same draws to float rounding: no {', no '.join(lacking)}" if lacking else SAME_BITS,
         )
-        found.append((device, record))
-    return found
+        pairs.append((device, record))
+    return pairs
 
 
 def weaknesses(device: Any) -> list[str]:
@@ -200,17 +200,17 @@ def weaknesses(device: Any) -> list[str]:
 
 def devices() -> list[DeviceRecord]:
     """List all OpenCL devices, the default one first. Raises DeviceError if there is none, or no linker."""
-    return [record for _, record in _found()]
+    return [record for _, record in _handles_and_records()]
 
 
-def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
-    """Return the device whose number, platform or name matches `wanted`, by default the first one, and its record."""
-    found = _found()
-    for index, (handle, record) in enumerate(found):
-        if wanted is None or wanted == str(index) or wanted.casefold() in record.label.casefold():
+def choose_device(name: str | None) -> tuple[Any, DeviceRecord]:
+    """Return the device whose number, platform or name matches `name`, by default the first one, and its record."""
+    pairs = _handles_and_records()
+    for index, (handle, record) in enumerate(pairs):
+        if name is None or name == str(index) or name.casefold() in record.label.casefold():
             return handle, record
-    present = "; ".join(f"{index} = {record.label}" for index, (_, record) in enumerate(found))
-    raise drivers.DeviceError(f"device {wanted!r} is not here; use one of: {present}", "unknown device")
+    present = "; ".join(f"{index} = {record.label}" for index, (_, record) in enumerate(pairs))
+    raise drivers.DeviceError(f"device {name!r} is not here; use one of: {present}", "unknown device")
 
 
 @cache
@@ -241,8 +241,8 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
     # Rendering takes longer than loading a compiled kernel.
     source = drivers.kernel_cache().read_text(key)
     if source is None:
-        parts = (str(_parsed(text).render(**values)) for text in texts)
-        source = "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
+        rendered = (str(_parsed(text).render(**values)) for text in texts)
+        source = "\n".join((f"/* mauvecl {VERSION} */", structs, *rendered))
         drivers.kernel_cache().write_text(key, source)
     return source
 
@@ -270,9 +270,11 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     cache = drivers.kernel_cache()
+    pointers = [handle.int_ptr for handle, _ in _handles_and_records()]
+    number = pointers.index(device.int_ptr) if device.int_ptr in pointers else None
     # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
     # store, and the installation, since PoCL compiles a program of another installation again at every start.
-    level = str(drivers.choose_processor_level(device, lambda: [handle for handle, _ in _found()]))
+    level = str(drivers.choose_processor_level(device, number))
     target = (device.name, device.version, device.driver_version, level, sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = cache.restore(key)
@@ -289,8 +291,8 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
                 "processor",
             ) from error
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
-        fault = f"a kernel did not compile on {device.name}"
-        raise drivers.DeviceError(f"{fault}\n{numbered}\n{error}", "kernel") from error
+        message = f"a kernel did not compile on {device.name}"
+        raise drivers.DeviceError(f"{message}\n{numbered}\n{error}", "kernel") from error
     return program
 
 
@@ -301,13 +303,13 @@ VECTORS = 4
 class Device:
     """Open OpenCL device with its context, queue and compiled kernels.
 
-    `wanted` is the number or part of the name, as for `Engine`, and `width` the number of realisations per work-item,
+    `name` is the number or part of the name, as for `Engine`, and `width` the number of realisations per work-item,
     by default 16 on CPUs and 1 elsewhere.
     """
 
-    def __init__(self, wanted: str | None = None, *, width: int | None = None) -> None:
+    def __init__(self, name: str | None = None, *, width: int | None = None) -> None:
         self.cl = load_opencl()
-        handle, self.record = choose_device(wanted)
+        handle, self.record = choose_device(name)
         self.context = self.cl.Context([handle])
         self.queue = self.cl.CommandQueue(self.context)
         self.width = width or (16 if self.record.kind == "cpu" else 1)

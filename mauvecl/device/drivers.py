@@ -42,7 +42,7 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -163,8 +163,8 @@ class KernelCache:
             with contextlib.suppress(OSError), os.scandir(self.store) as entries:
                 # A full store has a thousand archives, and is read twice for each program.
                 stored = ((entry.stat(), entry.path) for entry in entries)
-                for about, path in sorted(stored, key=lambda pair: -pair[0].st_mtime):
-                    total += about.st_size
+                for status, path in sorted(stored, key=lambda pair: -pair[0].st_mtime):
+                    total += status.st_size
                     if total > MAX_STORED:
                         os.unlink(path)
 
@@ -185,8 +185,8 @@ def kernel_cache() -> KernelCache:
     """
     import platformdirs
 
-    wanted = os.environ.get("MAUVECL_CACHE_DIR") or platformdirs.user_cache_dir("mauvecl")
-    base = Path(wanted) / f"kernels-{VERSION}"
+    folder = os.environ.get("MAUVECL_CACHE_DIR") or platformdirs.user_cache_dir("mauvecl")
+    base = Path(folder) / f"kernels-{VERSION}"
     work = _working_folder(base) or _working_folder(Path(tempfile.gettempdir()))
     if work is None:
         raise OSError(f"no folder for compiled kernels can be written to with {MIN_FREE_BYTES >> 20} MiB to spare")
@@ -277,7 +277,7 @@ def _name_address(device: Any) -> int | None:
     match = TARGET.search(str(device.version))
     if match is None or not (CHOOSES_LIBRARY in str(device.platform.version) or match[2] == UNKNOWN):
         return None
-    (triple, own), record = match.groups(), int(device.int_ptr)
+    (triple, name), record = match.groups(), int(device.int_ptr)
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError:
@@ -287,7 +287,7 @@ def _name_address(device: Any) -> int | None:
         # library.
         pointers = [int.from_bytes(_bytes(memory, record + at, 8), "little") for at in range(0, RECORD_BYTES, 8)]
         for place, (first, second) in enumerate(itertools.pairwise(pointers), 1):
-            if _text_at(memory, first) == triple and _text_at(memory, second) in (own, *_names):
+            if _text_at(memory, first) == triple and _text_at(memory, second) in (name, *_names):
                 return record + 8 * place
     finally:
         os.close(memory)
@@ -393,41 +393,40 @@ settled: dict[int, str | None] = {}
 _one_at_a_time = threading.Lock()
 
 
-def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
+def choose_processor_level(device: Any, number: int | None) -> str | None:
     """Set the highest processor level at which the driver works, and return its name; None if the driver chooses.
 
-    `others` returns all devices, including this one, in the order in which another process finds them. Raises
-    DeviceError if the driver works at no level.
+    `number` is that of the device in another process, or None if it has none. Raises DeviceError if the driver works at
+    no level.
     """
     place = int(device.int_ptr)
     with _one_at_a_time:
         if place not in settled:
-            name = _working_level(device, names(device), others)
+            name = _working_level(device, names(device), number)
             if name is not None:
                 set_processor_name(device, name)
             settled[place] = name
     return settled[place]
 
 
-def _working_level(device: Any, names: tuple[str | None, ...], others: Callable[[], Sequence[Any]]) -> str | None:
+def _working_level(device: Any, names: tuple[str | None, ...], number: int | None) -> str | None:
     """Return the level that an earlier process has found, or try levels until a first build succeeds."""
-    said = os.environ.get(LIMIT, "")
+    setting = os.environ.get(LIMIT, "")
     try:
-        limit_s = float(said or LIMIT_S)
+        limit_s = float(setting or LIMIT_S)
     except ValueError:
         limit_s = -1.0
     if not 0 <= limit_s <= 86400:
-        raise InputError.of(LIMIT, said, "between 1 and 86400 seconds of processor time, or 0 for no limit")
-    number = next((i for i, other in enumerate(others()) if other.int_ptr == device.int_ptr), None)
+        raise InputError.of(LIMIT, setting, "between 1 and 86400 seconds of processor time, or 0 for no limit")
     if limit_s == 0 or number is None or not sys.executable:
         return names[0]
     # The level's key in the cache is unique for driver, processor and installation.
-    about = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
-    unique = "\0".join((*map(str, about), *map(str, names), *sorted(flags())))
+    target = (device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
+    unique = "\0".join((*map(str, target), *map(str, names), *sorted(flags())))
     cache, key = kernel_cache(), f"level-{hashlib.sha256(unique.encode()).hexdigest()[:32]}"
-    known = cache.read_text(key)
-    if known is not None:
-        return known or None
+    level = cache.read_text(key)
+    if level is not None:
+        return level or None
     failed: list[str] = []
     for name in names:
         why = _try(name, number, device, limit_s)

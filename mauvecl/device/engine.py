@@ -171,8 +171,8 @@ class Engine:
         with scene_launches(self.open_device, scene, seed, row_type="ushort" if narrow else "int") as launches:
 
             def work(tile: Tile, done: int) -> None:
-                there = slice(done, done + tile.wanted)
-                clipped[there] = launches.realise(tile, rows[there])
+                place = slice(done, done + tile.count)
+                clipped[place] = launches.realise(tile, rows[place])
 
             self._tiles.for_each(start, count, scene.n_pixel * dtype.itemsize, work)
         return out, clipped
@@ -219,9 +219,8 @@ class Engine:
             case requests.SnrRequest():
                 return self._snr(request, shard).pack()
             case requests.RealiseRequest():
-                x, seed, how = request.expectation, request.seed, vars(request.drawing)
-                rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
-                return {"rows": rows}
+                x, seed, options = request.expectation, request.seed, vars(request.drawing)
+                return {"rows": self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **options)}
         # Exposures do not need the modules of stares.
         from mauvecl.device.stares import Stares
         from mauvecl.flares.stare_scene import StaresRequest
@@ -270,19 +269,19 @@ class Engine:
             Nuisance parameters to marginalise: standard deviations by name (`nuisances.NUISANCES`), infinite for those
             that are projected out.
         """
-        how = (start, Drawing(**drawing), comparison, tails, nuisances)
-        request = requests.DetectRequest(quiet, flares, realisations, seed, statistics, *how)  # type: ignore[arg-type]
-        each, total = request.realisations, request.parts * request.realisations
-        shards = [requests.Shard(part, request.start, each) for part in range(request.parts)]
-        tallies = (self._detection(request, shard, before=shard.part * each, total=total) for shard in shards)
+        options = (start, Drawing(**drawing), comparison, tails, nuisances)
+        request = requests.DetectRequest(quiet, flares, realisations, seed, statistics, *options)  # type: ignore[arg-type]
+        n = request.realisations
+        shards = [requests.Shard(part, request.start, n) for part in range(request.parts)]
+        tallies = (self._detection(request, shard, before=shard.part * n, total=len(shards) * n) for shard in shards)
         return snr.detection_of(request, tallies)
 
     def _detection(
         self, request: requests.DetectRequest, shard: requests.Shard, *, before: int = 0, total: int | None = None
     ) -> Tally:
-        plan, scene = request.plans[shard.part]
+        plan = request.plans[shard.part]
         tally = plan.tally()
-        with detection_launches(self.open_device, scene, request.seed, plan, request.hypotheses) as launches:
+        with detection_launches(self.open_device, plan, request.seed) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
@@ -323,22 +322,20 @@ class Engine:
             of each scenario: ``matched`` (the null's for each flare's template) and the others in the requested order,
             including the sums that a marginalised chi2 subtracts. Finally ``paper``, in the order of ``matched``.
         """
-        how = (start, Drawing(**drawing), comparison, "counted", nuisances)
+        options = (start, Drawing(**drawing), comparison, "counted", nuisances)
         # The request validates the arguments and turns a single flare into a sequence.
-        request = requests.DetectRequest(quiet, flares, count, seed, statistics, *how)  # type: ignore[arg-type]
-        hypotheses, n_flares = request.hypotheses, len(request.flares)
-        scene = hypotheses.scene
-        if n_flares >= BATCH[scene.frames]:
-            raise InputError.of("flares", n_flares, f"at most {BATCH[scene.frames] - 1} in one launch")
-        plan = requests.plan_channels(hypotheses, range(n_flares), first=True)
+        request = requests.DetectRequest(quiet, flares, count, seed, statistics, *options)  # type: ignore[arg-type]
+        if request.parts > 1:
+            most = BATCH[request.hypotheses.scene.frames] - 1
+            raise InputError.of("flares", len(request.flares), f"at most {most} in one launch")
+        plan = request.plans[0]
         out = np.empty((plan.n_rows, count), np.float32)
-
-        with detection_launches(self.open_device, scene, seed, plan, hypotheses) as launches:
+        with detection_launches(self.open_device, plan, seed) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
                 for number, row in enumerate(out):
-                    row[done : done + tile.wanted] = launches.channel(tile, number)
+                    row[done : done + tile.count] = launches.channel(tile, number)
 
             self._tiles.for_each(start, count, 4 * plan.n_rows, work)
         return out

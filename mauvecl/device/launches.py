@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.chi2 import Paper
 from mauvecl.detection.counts import Tally
-from mauvecl.detection.requests import ChannelPlan, Hypotheses
+from mauvecl.detection.requests import ChannelPlan
 from mauvecl.detection.snr import Counts
 from mauvecl.device.build import VECTORS, Device, Variant, out_of_memory
 from mauvecl.device.drivers import DeviceError
@@ -29,38 +29,37 @@ LARGEST_TILE = 2**16
 
 @dataclass(frozen=True)
 class Tile:
-    """Range of realisations computed in one launch."""
+    """Range of requested realisations that one launch computes, in whole vectors of `width` realisations."""
 
-    first: int  # a multiple of the vector width
-    size: int
-    start: int  # the requested realisations are [start, stop), relative to first
-    stop: int
+    begin: int  # first requested realisation
+    count: int  # number of requested realisations
+    width: int
 
     @property
-    def wanted(self) -> int:
-        """Number of requested realisations."""
-        return self.stop - self.start
+    def start(self) -> int:
+        """Number of realisations that are computed before the requested ones."""
+        return self.begin % self.width
+
+    @property
+    def size(self) -> int:
+        """Number of computed realisations."""
+        return -(-(self.start + self.count) // self.width) * self.width
 
     def address(self) -> tuple[np.uint32, np.uint32]:
-        """Return both words of the first index."""
-        return np.uint32(self.first & 0xFFFFFFFF), np.uint32(self.first >> 32)
+        """Return both words of the number of the first computed realisation."""
+        first = self.begin - self.start
+        return np.uint32(first & 0xFFFFFFFF), np.uint32(first >> 32)
 
     def rows(self) -> tuple[np.uint32, np.uint32]:
-        """Return the requested range, relative to the first realisation."""
-        return np.uint32(self.start), np.uint32(self.stop)
-
-    def narrow(self, width: int) -> Tile:
-        """Return the tile of the same requested realisations with the fewest vectors of this width."""
-        skip = self.start - self.start % width
-        return Tile(self.first + skip, -(-self.stop // width) * width - skip, self.start - skip, self.stop - skip)
+        """Return the requested range, relative to the first computed realisation."""
+        return np.uint32(self.start), np.uint32(self.start + self.count)
 
     def pieces(self, size: int) -> Iterator[Tile]:
-        """Yield tiles of at most `size` realisations, a multiple of those per work-item."""
-        for begin in range(0, self.size, size):
-            length = min(size, self.size - begin)
-            start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
-            if start < stop:
-                yield Tile(self.first + begin, length, start, stop)
+        """Yield tiles of at most `size` realisations, which are divided at the multiples of `size`."""
+        end = self.begin + self.count
+        for multiple in range(self.begin - self.begin % size, end, size):
+            begin = max(multiple, self.begin)
+            yield Tile(begin, min(multiple + size, end) - begin, self.width)
 
 
 class Tiles:
@@ -102,14 +101,12 @@ class Tiles:
                     ) from error
                 size //= 2
                 continue
-            done += tile.wanted
+            done += tile.count
             report(before + done, total or count)
 
-    def at(self, index: int, left: int, size: int) -> Tile:
+    def at(self, index: int, count: int, size: int) -> Tile:
         """Return the tile from `index` to a multiple of `size`, so that no tile crosses a multiple of 2**32."""
-        first = index - index % size
-        # A short tile computes only the vectors that it needs.
-        return Tile(first, size, index - first, min(index - first + left, size)).narrow(self._step)
+        return Tile(index, min(size - index % size, count), self._step)
 
 
 #: Realisations times frames counted on the device before its 32-bit bins and 64-bit sums are moved to the host.
@@ -133,6 +130,8 @@ class Launches:
         self._cl, self._queue = device.cl, device.queue
         self._buffers: list[Any] = []
         self._named: dict[str, Any] = {}
+        # Buffers to which kernels add, and the zeros with which they begin.
+        self._sums: dict[str, tuple[Any, NDArray[Any]]] = {}
         self._counted = 0
         self._subtractions: list[Any] = []
         job = scene.job.copy()
@@ -178,7 +177,10 @@ class Launches:
 
     @contextlib.contextmanager
     def _output(self, name: str, out: NDArray[Any]) -> Iterator[Any]:
-        """Yield a buffer whose contents are in `out` at the end of the block; CPUs write to `out` without a copy."""
+        """Yield a buffer whose contents are in `out` at the end of the block.
+
+        CPUs write to `out` without a copy, which saves a third of the time of raw spectra.
+        """
         if self._device.record.kind != "cpu":
             buffer = self._scratch(name, out.nbytes)
             yield buffer
@@ -204,11 +206,11 @@ class Launches:
         self._device.kernel(kernel_files, self.variant, name)(self._queue, items, local, *arguments)
 
     def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
-        """Draw the raw spectra of a tile into `out`, of uint16 or int32 and shape (tile.wanted, n_pixel).
+        """Draw the raw spectra of a tile into `out`, of uint16 or int32 and shape (tile.count, n_pixel).
 
-        Return the number of samples (pixels times frames) clipped at zero or saturation, shape (tile.wanted,).
+        Return the number of samples (pixels times frames) clipped at zero or saturation, shape (tile.count,).
         """
-        clipped = np.empty(tile.wanted, np.uint32)
+        clipped = np.empty(tile.count, np.uint32)
         counts, items = self._scratch("clipped", clipped.nbytes), (tile.size // self.variant.width,)
         with self._output("rows", out) as rows:
             self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
@@ -217,24 +219,23 @@ class Launches:
 
     def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
         """Upload the observer's subtraction and variances, and the resolution elements."""
-        n_pixel, n_element = self._scene.n_pixel + PIXEL_BLOCK, len(elements)
+        n_pixel, n_element, bins = self._scene.n_pixel + PIXEL_BLOCK, len(elements), layout.OBSERVER_BINS
         self._observing = [self.upload(padded(observers)), self.upload(elements)]
-        self._shapes = ((n_pixel, layout.OBSERVER_BINS), (n_element, layout.OBSERVER_BINS), (n_pixel, 2), (n_element,))
-        self._histograms = [self.upload(np.zeros(shape, np.uint32)) for shape in self._shapes]
+        self._begin(pixels=(n_pixel, bins), elements=(n_element, bins), clipped=(n_pixel, 2), outside=(n_element,))
         self._observed = observers, elements
 
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Add each pixel's DN and each element's S/N of a tile to the device's histograms."""
         n_element = len(self._observed[1])
-        items = (n_element,) if self.variant.width > 1 else (n_element, min(tile.wanted, ITEMS))
-        observed = (*self._arguments, *tile.address(), *tile.rows(), *self._observing, *self._histograms)
-        self._launch("histogram", items, *observed)
+        items = (n_element,) if self.variant.width > 1 else (n_element, min(tile.count, ITEMS))
+        sums = (buffer for buffer, _ in self._sums.values())
+        self._launch("histogram", items, *self._arguments, *tile.address(), *tile.rows(), *self._observing, *sums)
         self._queue.finish()
-        self._counted += tile.wanted
-        outside = np.flatnonzero(self._take(self._histograms[-1], self._shapes[-1]))
+        self._counted += tile.count
+        outside = np.flatnonzero(self._take("outside"))
         # The host counts values outside the device's bins, from the raw spectra of the same realisations.
         for piece in tile.pieces(RAW_BATCH) if outside.size else ():
-            raw = np.empty((piece.wanted, self._scene.n_pixel), np.int32)
+            raw = np.empty((piece.count, self._scene.n_pixel), np.int32)
             self.realise(piece, raw)
             base = self._scene.n_draws * self._scene.base_dn[0]
             counts.add_far(np.ascontiguousarray(raw.T) - base[:, None], *self._observed, outside)
@@ -244,15 +245,20 @@ class Launches:
     def flush_counts(self, counts: Counts) -> None:
         """Move the device's histograms to the host."""
         n = self._scene.n_pixel
-        pixels, elements, clipped, _ = map(self._take, self._histograms, self._shapes)
-        counts.add(pixels[:n], elements, clipped[:n], self._counted)
+        counts.add(self._take("pixels")[:n], self._take("elements"), self._take("clipped")[:n], self._counted)
         self._counted = 0
 
-    def _take(self, buffer: Any, shape: tuple[int, ...], dtype: type = np.uint32) -> NDArray[Any]:
-        """Copy a buffer to the host and fill it with zeros."""
-        host: NDArray[Any] = np.empty(shape, dtype)
+    def _begin(self, dtype: type = np.uint32, **shapes: tuple[int, ...]) -> None:
+        """Make buffers of zeros to which kernels add."""
+        zeros: dict[str, NDArray[Any]] = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
+        self._sums |= {name: (self.upload(array), array) for name, array in zeros.items()}
+
+    def _take(self, name: str) -> NDArray[Any]:
+        """Copy a buffer of sums to the host and fill it with zeros."""
+        buffer, zeros = self._sums[name]
+        host = np.empty_like(zeros)
         self._cl.enqueue_copy(self._queue, host, buffer)
-        self._cl.enqueue_copy(self._queue, buffer, np.zeros(shape, dtype))
+        self._cl.enqueue_copy(self._queue, buffer, zeros)
         return host
 
     def weigh(self, plan: ChannelPlan, bands: NDArray[np.float32], finished: NDArray[np.uint32]) -> None:
@@ -266,8 +272,10 @@ class Launches:
         constants = scene.constants(plan.weights, plan.linear_end, plan.pixels_end)
         self._weighing = [*map(self.upload, (constants, weights, plan.linear_end, plan.pixels_end))]
         if self.variant.compared:
-            more = map(self.upload, (padded(scene.estimates), bands, finished, plan.scales, plan.scale_end))
-            self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(plan.scales.shape[1])]
+            compared = map(self.upload, (padded(scene.estimates), bands, finished, plan.scales, plan.scale_end))
+            # All scenarios are compared with the first.
+            references = self.upload(np.zeros(len(scene.levels), np.uint32))
+            self._weighing = [references, *self._weighing, *compared, np.uint32(plan.scales.shape[1])]
         if plan.subtractions.size:
             self._subtractions = [np.uint32(plan.subtractions.shape[1]), *map(self.upload, plan.subtractions)]
 
@@ -282,8 +290,8 @@ class Launches:
             self._launch("marginalise", items, *self._subtractions, np.uint32(tile.size), values)
 
     def channel(self, tile: Tile, number: int) -> NDArray[np.float32]:
-        """Return one channel of the last computed tile, shape (tile.wanted,)."""
-        host = np.empty(tile.wanted, np.float32)
+        """Return one channel of the last computed tile, shape (tile.count,)."""
+        host = np.empty(tile.count, np.float32)
         offset = 4 * (number * tile.size + tile.start)
         self._cl.enqueue_copy(self._queue, host, self._named["values"], src_offset=offset)
         return host
@@ -292,17 +300,17 @@ class Launches:
         """Add the channels of a tile to the histograms and integer sums on the device."""
         count = len(tally.grids)
         items = 1 if self.variant.width > 1 else ITEMS
-        if "grids" not in self._named:
+        if not self._sums:
             self._named["grids"] = self.upload(tally.grids)
-            self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
-            self._named["sums"] = self.upload(np.zeros((count, items, 2), np.int64))
-            self._named["outside"] = self.upload(np.zeros(count, np.uint32))
-        buffers = (self._named[name] for name in ("values", "grids", "histogram", "sums", "outside"))
+            self._begin(histogram=(count, layout.BINS))
+            self._begin(np.int64, sums=(count, items, 2))
+            self._begin(outside=(count,))
+        buffers = (self._named["values"], self._named["grids"], *(buffer for buffer, _ in self._sums.values()))
         self._launch("tally", (count,) if items == 1 else (count, items), *tile.rows(), np.uint32(tile.size), *buffers)
         self._queue.finish()
-        self._counted += tile.wanted
+        self._counted += tile.count
         # The host counts values outside the device's bins.
-        outside = self._take(self._named["outside"], (count,))
+        outside = self._take("outside")
         for index in np.flatnonzero(outside).tolist():
             outlying = tally.add_far(index, self.channel(tile, int(tally.grids["channel"][index])))
             if outlying != outside[index]:
@@ -315,10 +323,7 @@ class Launches:
 
     def flush(self, tally: Tally) -> None:
         """Move the device's histograms and sums to the host."""
-        count = len(tally.grids)
-        histogram = self._take(self._named["histogram"], (count, layout.BINS))
-        sums = self._take(self._named["sums"], (count, self._named["sums"].size // (16 * count), 2), np.int64)
-        tally.add(histogram, sums.sum(axis=1), self._counted)
+        tally.add(self._take("histogram"), self._take("sums").sum(axis=1), self._counted)
         self._counted = 0
 
 
@@ -362,21 +367,22 @@ def scene_launches(
         **options,
     )
     single = device.width == 1 or scene.frames or variant.compared
-    many = VECTORS if not (variant.elements or variant.linears) else FEW_VECTORS
-    return Launches(device, scene, replace(variant, vectors=1 if single else many), seed)
+    vectors = FEW_VECTORS if variant.elements or variant.linears else VECTORS
+    return Launches(device, scene, replace(variant, vectors=1 if single else vectors), seed)
 
 
-def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPlan, hypotheses: Hypotheses) -> Launches:
-    """Return the launches of a scene, with the weights and scales of all statistics of a detection."""
+def detection_launches(device: Device, plan: ChannelPlan, seed: int) -> Launches:
+    """Return the launches of a batch of flares, with the weights and scales of all statistics of a detection."""
+    statistics, setting = plan.hypotheses.statistics, plan.hypotheses.setting
     bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
     if len(plan.scales):
-        bands, finished = Paper().smoothing(hypotheses.setting).bands(len(scene.pixels), device.variant.chunk)
+        bands, finished = Paper().smoothing(setting).bands(len(plan.scene.pixels), device.variant.chunk)
     launches = scene_launches(
         device,
-        scene,
+        plan.scene,
         seed,
-        pair="chi2_pair" in hypotheses.statistics,
-        elements="chi2_element" in hypotheses.statistics,
+        pair="chi2_pair" in statistics,
+        elements="chi2_element" in statistics,
         linears=len(plan.weights),
         smooths=len(plan.scales),
         slots=bands.shape[1],

@@ -67,17 +67,17 @@ def toy(
 ) -> Expectation:
     """Return a small exposure of a smooth spectrum on a uniform detector; dark in DN, light in electrons per frame."""
     shape = light * (1.0 + 0.5 * np.sin(np.arange(pixels) / 9.0))
-    ones = np.ones(pixels)
+    uniform = np.ones(pixels)
     element = np.arange(pixels, dtype=np.int32) // 10
     return Expectation(
         wavelength_nm=np.arange(200.0, 200.0 + pixels),
         source_electrons=shape * (1.0 + flare * np.linspace(1.0, 0.2, pixels)),
-        sky_electrons=0.4 * ones,
-        dark_dn=dark * ones,
+        sky_electrons=0.4 * uniform,
+        dark_dn=dark * uniform,
         dark_unit=unit,
-        bias_dn=600.0 * ones,
-        read_noise_dn=read * ones,
-        gain_dn_per_electron=0.6 * ones,
+        bias_dn=600.0 * uniform,
+        read_noise_dn=read * uniform,
+        gain_dn_per_electron=0.6 * uniform,
         n_frames=frames,
         frame_s=5.0,
         element=element,
@@ -132,8 +132,8 @@ DEVICE_COLUMNS = (
 def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
     """List all devices with their promise and, if `measure` is true, their speed.
 
-    Each has the fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason of a failure, or
-    "").
+    Each has the fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason for a failure,
+    or "").
     """
     rates = []
     for number, record in enumerate(devices()):
@@ -148,7 +148,7 @@ def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
 
 
 def child(request: dict[str, Any]) -> None:
-    """Draw a small scene within the limits; print the reason of a failure and exit with code 1."""
+    """Draw a small scene within the limits; print the reason for a failure and exit with code 1."""
     limit(request)
     name, number = request["name"], str(request["number"])
     try:
@@ -181,13 +181,13 @@ def limit(request: dict[str, Any]) -> None:
         _lower(resource.RLIMIT_DATA, request["memory"], request["memory"])
 
 
-def _lower(what: int, soft: int, hard: int) -> None:
+def _lower(kind: int, soft: int, hard: int) -> None:
     """Lower a resource limit, unless it is lower already."""
-    now = resource.getrlimit(what)[1]
-    most = hard if now == resource.RLIM_INFINITY else min(hard, now)
+    present = resource.getrlimit(kind)[1]
+    most = hard if present == resource.RLIM_INFINITY else min(hard, present)
     # macOS defines some limits without enforcing them.
     with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(what, (min(soft, most), most))
+        resource.setrlimit(kind, (min(soft, most), most))
 
 
 #: Small stares that run every branch: options of `toy`, unknowns of the stare, number of sums.
@@ -276,39 +276,38 @@ def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
     Those of stares are the sums of every frame with flares by each method, and the noise factors of the flares.
     """
     if name in STARE_CASES:
-        stares, (components, stare, given) = Stares(engine.open_device), stare_case(name, count)
-        same: dict[str, Any] = {"first": START, "count": count, "seed": SEED}
-        ours = {
-            method: stares.frames(components, stare, given, method=method, processes=processes, **same)
+        stares, (components, stare, flares) = Stares(engine.open_device), stare_case(name, count)
+        keywords: dict[str, Any] = {"first": START, "count": count, "seed": SEED}
+        sums = {
+            method: stares.frames(components, stare, flares, method=method, processes=processes, **keywords)
             for method, processes in METHODS.items()
         }
         request = StaresRequest(components, stare, count, SEED, start=START, glow=True)
-        return ours | {"noise of flares": stares.reduced(request)["glow"]}
-    options, how = CASES[name]
+        return sums | {"noise of flares": stares.reduced(request)["glow"]}
+    options, keywords = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     place: dict[str, Any] = {"start": START, "seed": SEED}
-    drawing = {key: value for key, value in how.items() if key not in ("comparison", "nuisances")}
+    drawing = {key: value for key, value in keywords.items() if key not in ("comparison", "nuisances")}
     raw, clipped = engine.realise_and_count(quiet, count=count, **place, **drawing)
-    seen = engine.snr(quiet, realisations=count, **place, **drawing)
-    values, fast = (
-        engine.statistic_values(quiet, [flare], count=count, statistics=names, **place, **how)
-        for names in (statistics_of(how), statistics_of(how, FAST))
-    )
-    detection = engine.detect(quiet, [flare], realisations=count, statistics=statistics_of(how, FAST), **place, **how)
+    result = engine.snr(quiet, realisations=count, **place, **drawing)
+    keywords = keywords | place
+    names = statistics_of(keywords), statistics_of(keywords, FAST)
+    values, fast = (engine.statistic_values(quiet, [flare], count=count, statistics=s, **keywords) for s in names)
+    detection = engine.detect(quiet, [flare], realisations=count, statistics=names[1], **keywords)
     return {
         "raw": raw.astype(np.int32),
         "clipped": clipped.astype(np.uint32),
         "statistics": values,
         "fast statistics": fast,
-        "histograms": histograms_of(seen.counts),
+        "histograms": histograms_of(result.counts),
         "tally": tally_of(detection.distribution("chi2")),
     }
 
 
 def histograms_of(counts: Counts) -> NDArray[np.int64]:
     """Return all counts of histograms as one array."""
-    far = [each[~counts.within(k)] for k, bins in counts.bins.items() for each in (bins.keys, bins.counts)]
-    return np.concatenate([np.ravel(each) for each in (*map(counts.dense, counts.bins), counts.clipped, *far)])
+    far = [array[~counts.within(k)] for k, bins in counts.bins.items() for array in (bins.keys, bins.counts)]
+    return np.concatenate([np.ravel(array) for array in (*map(counts.dense, counts.bins), counts.clipped, *far)])
 
 
 def tally_of(distribution: Distribution) -> NDArray[np.int64]:
@@ -317,7 +316,7 @@ def tally_of(distribution: Distribution) -> NDArray[np.int64]:
     keys, counts = distribution.numbers[far], distribution.filled[far]
     # The known answers number the bins below the fine ones without an offset.
     keys = np.where(keys < 0, keys + FAR, keys)
-    return np.concatenate([each.astype(np.int64) for each in (distribution.counts, moments, keys, counts)])
+    return np.concatenate([array.astype(np.int64) for array in (distribution.counts, moments, keys, counts)])
 
 
 @cache
@@ -330,9 +329,9 @@ def known_arrays() -> dict[str, NDArray[Any]]:
         return dict(arrays)
 
 
-def statistics_of(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
+def statistics_of(keywords: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
     """Return the statistics of a case; if it marginalises, only those that support this."""
-    return tuple(n for n in names if not STATISTICS[n].paired) if "nuisances" in how else names
+    return tuple(n for n in names if not STATISTICS[n].paired) if "nuisances" in keywords else names
 
 
 def known_answers(engine: Engine) -> Check:
@@ -341,12 +340,11 @@ def known_answers(engine: Engine) -> Check:
     wide, flags = device.width > 1, device.cl.mem_flags
     counters, keys, answers = (np.array([row[i] for row in PHILOX_VECTORS], np.uint32) for i in range(3))
     kernel = device.kernel(("probes",), replace(device.variant, chunk=32 if wide else 4), "probe_philox")
-    given = [
-        device.cl.Buffer(device.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x) for x in (counters, keys)
-    ]
+    flag = flags.READ_ONLY | flags.COPY_HOST_PTR
+    inputs = [device.cl.Buffer(device.context, flag, hostbuf=array) for array in (counters, keys)]
     out = np.empty((len(counters), 8), np.uint32)
     words = device.cl.Buffer(device.context, flags.WRITE_ONLY, out.nbytes)
-    kernel(device.queue, (len(counters),), (1,) if wide else None, np.uint32(len(counters)), *given, words)
+    kernel(device.queue, (len(counters),), (1,) if wide else None, np.uint32(len(counters)), *inputs, words)
     device.cl.enqueue_copy(device.queue, out, words)
     right = np.array_equal(out, np.hstack([answers, answers]))
     return Check("Philox4x32-10, known answers", right, f"{len(PHILOX_VECTORS)} vectors of Random123")
@@ -360,26 +358,26 @@ def check_results(engine: Engine) -> Iterator[Check]:
     """Compare every branch of every kernel, and every frame of some stares, with the known answers."""
     arrays = known_arrays()
     for name in (*CASES, *STARE_CASES):
-        ours = results(engine, name, COUNT)
-        theirs = {part: arrays[f"{name}: {part}"] for part in ours}
-        differ = [part for part in ours if ours[part].tobytes() != theirs[part].tobytes()]
+        computed = results(engine, name, COUNT)
+        expected = {part: arrays[f"{name}: {part}"] for part in computed}
+        differ = [part for part in computed if computed[part].tobytes() != expected[part].tobytes()]
         if name in STARE_CASES:
             # Zeros may have either sign.
-            differ = [part for part in differ if not np.array_equal(ours[part], theirs[part])]
+            differ = [part for part in differ if not np.array_equal(computed[part], expected[part])]
         if not differ:
-            digests = (hashlib.sha256(array.tobytes()).hexdigest()[:12] for array in ours.values())
+            digests = (hashlib.sha256(array.tobytes()).hexdigest()[:12] for array in computed.values())
             passed, text = True, f"digests {' '.join(digests)}"
         elif engine.device.promise == SAME_BITS:
             passed, text = False, f"{', '.join(differ)} differ from the reference's"
         else:
             # Fewer than 1 % of the counts differ, by 1 DN. Statistics differ by less than 0.2 of their standard
             # deviation, and noise factors of flares by less than 0.2.
-            off = np.abs(ours["raw"] - theirs["raw"]) if "raw" in ours else np.zeros(1, int)
+            off = np.abs(computed["raw"] - expected["raw"]) if "raw" in computed else np.zeros(1, int)
             share, apart = float(np.mean(off > 0)), 0.0
-            for part in ours.keys() & {*_CHANCE, "noise of flares"}:
-                scale = np.maximum(theirs[part].std(axis=_CHANCE[part]), 1e-3) if part in _CHANCE else 1.0
-                far = np.abs(ours[part] - theirs[part]).max(axis=_CHANCE.get(part))
-                apart = max(apart, float(np.max(far / scale)))
+            for part in computed.keys() & {*_CHANCE, "noise of flares"}:
+                scale = np.maximum(expected[part].std(axis=_CHANCE[part]), 1e-3) if part in _CHANCE else 1.0
+                largest = np.abs(computed[part] - expected[part]).max(axis=_CHANCE.get(part))
+                apart = max(apart, float(np.max(largest / scale)))
             passed = bool(off.max() <= 1 and share < 1e-2 and apart < 0.2)
             text = f"{share:.2g} of counts off, by {off.max()} DN at most; statistics by {apart:.2g} sigma"
             text = f"weaker promise: {text}"
@@ -392,10 +390,10 @@ def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> floa
     expected = n * probability
     common = expected > 20
     observed = np.append(counts[common], counts[~common].sum())
-    wanted = np.append(expected[common], n - expected[common].sum())
-    if wanted[-1] < 20:
-        observed, wanted = observed[:-1], wanted[:-1]
-    statistic = float(np.sum((observed - wanted) ** 2 / wanted))
+    expected = np.append(expected[common], n - expected[common].sum())
+    if expected[-1] < 20:
+        observed, expected = observed[:-1], expected[:-1]
+    statistic = float(np.sum((observed - expected) ** 2 / expected))
     upper = float(special.chdtrc(observed.size - 1, statistic))
     return 2 * min(upper, 1 - upper)
 
@@ -445,19 +443,19 @@ def closed_forms(engine: Engine) -> Iterator[Check]:
     yield Check("S/N per element, closed form", bool(worst < 0.03 + 5 / np.sqrt(n)), f"means within {worst:.3f} sigma")
     detection = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
     for statistic in STATISTICS:
-        for which in (None, 0):
-            ours, theory = detection.distribution(statistic, which), detection.closed_form(statistic, which)
-            error = (ours.mean - theory.mean) / (theory.std / np.sqrt(n))
-            name = f"{statistic}, mean {'with a flare' if which is not None else 'without'}"
+        for flare_index in (None, 0):
+            drawn, theory = (f(statistic, flare_index) for f in (detection.distribution, detection.closed_form))
+            error = (drawn.mean - theory.mean) / (theory.std / np.sqrt(n))
+            name = f"{statistic}, mean {'without' if flare_index is None else 'with a flare'}"
             yield Check(f"{name}, closed form", bool(abs(error) < 5), f"{error:+.1f} standard errors")
 
 
 def tiles(engine: Engine) -> Iterator[Check]:
     """Compare realisations drawn at once with the same ones drawn in pieces."""
     quiet = toy()
-    whole = engine.realise(quiet, start=0, count=500, seed=SEED)
-    parts = [engine.realise(quiet, start=a, count=b - a, seed=SEED) for a, b in ((0, 1), (1, 77), (77, 500))]
-    yield Check("same bits in pieces", bool(np.array_equal(whole, np.concatenate(parts))), "500 realisations in 3")
+    at_once = engine.realise(quiet, start=0, count=500, seed=SEED)
+    pieces = [engine.realise(quiet, start=a, count=b - a, seed=SEED) for a, b in ((0, 1), (1, 77), (77, 500))]
+    yield Check("same bits in pieces", bool(np.array_equal(at_once, np.concatenate(pieces))), "500 realisations in 3")
 
 
 def run(engine: Engine) -> list[Check]:

@@ -126,41 +126,39 @@ class Stares:
 
         Return the joined results of the request's reduction, and of a shard with its ``start``.
         """
-        there = shard or Shard(0, request.start, request.realisations)
-        if there.start + there.count > 2**64:
-            raise InputError.of("first", there.start, f"at most {2**64 - there.count} for {there.count} stares")
-        components, stare = request.components, request.stare
-        reduction = request.reducing
+        start, count = (shard.start, shard.count) if shard else (request.start, request.realisations)
+        if start + count > 2**64:
+            raise InputError.of("first", start, f"at most {2**64 - count} for {count} stares")
+        n_frames = request.stare.n_frames
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()
-        shape = (components.n_statistics, stare_scene.padded_frames(stare.n_frames))
-        each = 4 * len(request.flares.amplitudes) * shape[0] * shape[1]
+        shape = (request.components.n_statistics, stare_scene.padded_frames(n_frames))
+        values_per_stare = len(request.flares.amplitudes) * shape[0] * shape[1]
         # Pieces are small enough for a processor's cache; the cumulants need no full vector of long stares.
         step = 1 if request.method == "cumulants" else self.open_device.width
-        piece = max(step, REDUCED_BYTES // each // step * step)
-        room = np.empty(each * piece // 4, np.float32)
+        piece = max(step, REDUCED_BYTES // (4 * values_per_stare) // step * step)
+        buffer = np.empty(values_per_stare * piece, np.float32)
         glow = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
         with StareLaunches(self.open_device, request) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 reduced = []
                 for few in tile.pieces(piece):
-                    out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
-                    first = few.first + few.start
-                    launches.upload_flares(request.flares.part(first - request.start, few.wanted), first, few.wanted)
+                    out = buffer[: values_per_stare * few.count].reshape(-1, few.count, *shape)
+                    flares = request.flares.part(few.begin - request.start, few.count)
+                    launches.upload_flares(flares, few.begin, few.count)
                     launches.draw(few, out)
-                    values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
-                    more = []
+                    draws = [np.moveaxis(out[..., :n_frames], 2, 3)[scenarios]]
                     if request.glow:
                         launches.glow(few, glow)
-                        more = [np.moveaxis(glow[0, : few.wanted, :, : stare.n_frames], 1, 2)]
-                    reduced.append(dict(reduction(values, first, *more)))
+                        draws.append(np.moveaxis(glow[0, : few.count, :, :n_frames], 1, 2))
+                    reduced.append(dict(request.reducing(draws[0], few.begin, *draws[1:])))
                 # Results are added last, since a tile that fails is drawn again.
                 parts.extend(reduced)
 
-            self._tiles.for_each(there.start, there.count, each, work)
+            self._tiles.for_each(start, count, 4 * values_per_stare, work)
         arrays = stare_scene.joined(request, parts)
-        return arrays | {"start": np.array(there.start)} if shard else arrays
+        return arrays | {"start": np.array(start)} if shard else arrays
 
 
 #: Frames per work-item of the kernels whose lanes are frames.
@@ -199,13 +197,14 @@ class StareLaunches(Launches):
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
-            more = (padded(stare.mixtures), stare.spectra, stare.weights, stare.constants)
+            by_pixels = (padded(stare.mixtures), stare.spectra, stare.weights, stare.constants)
             # Only the range of pixels that a sum weights is drawn.
             chunks = np.flatnonzero(stare.weights.reshape(len(stare.weights), -1, variant.chunk).any(axis=(0, 2)))
             first, last = (chunks[0], chunks[-1] + 1) if chunks.size else (0, 0)
-            self._own = [*map(self.upload, more), np.uint32(first * variant.chunk), np.uint32(last * variant.chunk)]
+            ends = np.uint32(first * variant.chunk), np.uint32(last * variant.chunk)
+            self._of_method = [*map(self.upload, by_pixels), *ends]
         else:
-            self._own = [self.upload(table.packed)]
+            self._of_method = [self.upload(table.packed)]
 
     def upload_flares(self, flares: stare_scene.Flares, first: int, count: int) -> None:
         """Upload the flares and the pointing losses of the next `count` stares."""
@@ -230,34 +229,35 @@ class StareLaunches(Launches):
     def draw(self, tile: Tile, out: Floats) -> None:
         """Draw the statistics of a tile's frames into `out`, shape (n_scenario, n_stare, n_statistic, n_padded)."""
         if self._by_sums:
-            self._in_frames("stare_sums", self.variant, self._own, tile, out)
+            self._in_frames("stare_sums", self.variant, self._of_method, tile, out)
             return
         # Pixels are drawn a few frames of all stares at a time.
-        tile = tile.narrow(self.variant.width)
-        n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
-        block = max(1, TILE_BYTES // (4 * each))
+        tile = replace(tile, width=self.variant.width)
+        n_frames, values_per_frame = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
+        block = max(1, TILE_BYTES // (4 * values_per_frame))
         # The number of scenarios is rounded up to a power of two, so that few programs are built.
         variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
         kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
         common = (*self._arguments, *self._flares, *tile.address(), *tile.rows())
         for begin in range(0, n_frames, block):
             size = min(block, n_frames - begin)
-            items, values = (tile.size // self.variant.width, size), self._scratch("values", 4 * each * size)
-            own = (np.uint32(begin), *self._own, np.uint32(tile.size))
-            kernel(self._queue, items, self._local, *common, *own, values)
+            items = (tile.size // self.variant.width, size)
+            values = self._scratch("values", 4 * values_per_frame * size)
+            arguments = (np.uint32(begin), *self._of_method, np.uint32(tile.size), values)
+            kernel(self._queue, items, self._local, *common, *arguments)
             host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
             self._cl.enqueue_copy(self._queue, host, values)
-            out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
+            out[..., begin : begin + size] = host[..., tile.start : tile.start + tile.count].transpose(1, 3, 2, 0)
 
     def glow(self, tile: Tile, out: Floats) -> None:
         """Compute what `Injections` need to add flares, into `out`, shape (1, n_stare, n_statistic + 1, n_padded)."""
         self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out)
 
-    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats) -> None:
+    def _in_frames(self, name: str, variant: Variant, arguments: list[Any], tile: Tile, out: Floats) -> None:
         """Launch a kernel whose lanes are frames, and which fills the first stares of `out`."""
-        each = FRAMES_EACH if variant.width > 1 else 1
+        frames_per_item = FRAMES_EACH if variant.width > 1 else 1
         kernel = self._device.kernel(("stare", name), variant, name)
-        items, number = (tile.wanted, -(-out.shape[3] // each)), np.uint32(out.shape[1])
-        common = (self._arguments[0], *self._flares, *tile.narrow(1).address(), np.uint32(each))
+        items, n_stare = (tile.count, -(-out.shape[3] // frames_per_item)), np.uint32(out.shape[1])
+        common = (self._arguments[0], *self._flares, *replace(tile, width=1).address(), np.uint32(frames_per_item))
         with self._output("values", out) as values:
-            kernel(self._queue, items, self._local, *common, *own, number, values)
+            kernel(self._queue, items, self._local, *common, *arguments, n_stare, values)

@@ -9,6 +9,7 @@ import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
@@ -107,9 +108,9 @@ class CosmicRays(AdditiveProcess):
         if not 1 <= low <= high <= 100_000:
             raise InputError.of("electrons", (low, high), "between 1 and 100000, ascending", where="cosmic rays")
         if self.weights is not None:
-            wanted = int(high) - int(low) + 1
-            if len(self.weights) != wanted or min(self.weights) < 0 or not sum(self.weights) > 0:
-                raise InputError.of("weights", self.weights, f"{wanted} numbers of at least 0", where="cosmic rays")
+            size = int(high) - int(low) + 1
+            if len(self.weights) != size or min(self.weights) < 0 or not sum(self.weights) > 0:
+                raise InputError.of("weights", self.weights, f"{size} numbers of at least 0", where="cosmic rays")
 
     def charge(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> Float:
         """Return the distribution of the charge that a pixel collects in a time, a compound Poisson distribution."""
@@ -277,10 +278,10 @@ class Normal:
             low, high = np.log(below), np.log(above)
             a, b = ((np.array([self.low, self.high]) - self.mean) / self.sd).tolist()
             # Each side of the mean uses the logarithm of its own tail, which does not underflow.
-            left = special.ndtri_exp(np.logaddexp(special.log_ndtr(a) + high, special.log_ndtr(b) + low))
-            right = -special.ndtri_exp(np.logaddexp(special.log_ndtr(-a) + high, special.log_ndtr(-b) + low))
-        inside = np.where(left < 0.0, left, right)
-        return np.asarray(np.clip(self.mean + self.sd * inside, self.low, self.high))
+            negative = special.ndtri_exp(np.logaddexp(special.log_ndtr(a) + high, special.log_ndtr(b) + low))
+            positive = -special.ndtri_exp(np.logaddexp(special.log_ndtr(-a) + high, special.log_ndtr(-b) + low))
+        score = np.where(negative < 0.0, negative, positive)
+        return np.asarray(np.clip(self.mean + self.sd * score, self.low, self.high))
 
 
 Prior = Uniform | Normal
@@ -290,20 +291,20 @@ _FORMS: dict[type[Prior], tuple[str, ...]] = {Uniform: ("uniform",), Normal: ("n
 _PAIR = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
 
 
-def _from_study(given: Any) -> Prior:
+def _from_study(value: Any) -> Prior:
     """Return the prior that a study gives as a table; raises InputError otherwise."""
-    if isinstance(given, Uniform | Normal):
-        return given
-    table = given if isinstance(given, Mapping) else {}
+    if isinstance(value, Uniform | Normal):
+        return value
+    table = value if isinstance(value, Mapping) else {}
     for kind, form in _FORMS.items():
         if {key for key in table if table[key] is not None} == {*form}:
             for key in form:
                 if not isinstance(table[key], list | tuple) or len(table[key]) != 2:
                     raise InputError.of(key, table[key], "2 numbers")
-            return kind(*(_number(value) for key in form for value in table[key]))
-    keys = [key for form in _FORMS.values() for key in form]
-    if other := next((key for key in table if key not in keys), None):
-        raise InputError(f"unknown key {other!r} of a prior; use some of {', '.join(keys)}", key=other)
+            return kind(*(_number(number) for key in form for number in table[key]))
+    keys = [*chain.from_iterable(_FORMS.values())]
+    if unknown := next((key for key in table if key not in keys), None):
+        raise InputError(f"unknown key {unknown!r} of a prior; use some of {', '.join(keys)}", key=unknown)
     raise InputError(
         "a prior must be { uniform = [low, high] } or { normal = [mean, sd], between = [low, high] }", key="uniform"
     )

@@ -54,17 +54,18 @@ class Cumulants:
     light_variance: Float  # variance of the light, Gaussian or Poisson
 
     @staticmethod
-    def of(x: Expectation, each: int) -> Cumulants:
-        """Compute the cumulants of a draw of `each` frames."""
+    def of(x: Expectation, n_frames: int) -> Cumulants:
+        """Compute the cumulants of a draw of `n_frames` frames."""
         gain = x.gain_dn_per_electron
-        photons = each * x.light_electrons
+        photons = n_frames * x.light_electrons
         poisson = x.photon_noise == "poisson"
         # A stack of n rounded frames has a rounding variance of n/12; the rounding of the draw adds the last 1/12.
-        other = each * x.read_noise_dn**2 + (each - 1) / 12
+        read_variance = n_frames * x.read_noise_dn**2 + (n_frames - 1) / 12
         return Cumulants(
-            mean=each * x.mean_raw_dn, gaussian=other if poisson else other + gain**2 * photons, photons=photons,
-            photon_step=gain if poisson else np.zeros_like(gain), dark_step=x.dark_step_dn, dark_dn=each * x.dark_dn,
-            light_dn=gain * photons, light_variance=gain**2 * photons,
+            mean=n_frames * x.mean_raw_dn, photons=photons,
+            gaussian=read_variance if poisson else read_variance + gain**2 * photons,
+            photon_step=gain if poisson else np.zeros_like(gain), dark_step=x.dark_step_dn,
+            dark_dn=n_frames * x.dark_dn, light_dn=gain * photons, light_variance=gain**2 * photons,
         )  # fmt: skip
 
     def photon_cumulant(self, order: int) -> Float:
@@ -282,10 +283,6 @@ class Factors:
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
         return cls(tables, centre, ends)
 
-    def median_on_light(self, x: Expectation) -> Float:
-        """Return `factor_on_light` at the priors' medians."""
-        return factor_on_light(self.medians["light"], self.medians["sky"], x)
-
 
 def factor_on_light(light: float, sky: float, x: Expectation) -> Float:
     """Return the factor on each pixel's total light, which includes the sky's, shape (n_pixel,)."""
@@ -294,8 +291,6 @@ def factor_on_light(light: float, sky: float, x: Expectation) -> Float:
 
 #: Frames are drawn one by one if a pixel's mean is within this many standard deviations of a rail.
 RAIL_SIGMA = 8.0
-#: The device does not round counts correctly beyond this distance from their base.
-REACH_DN = 2.0**22
 #: Limit of the counter's 24 bits for groups of four pixels.
 MAX_PIXELS = 65_536
 
@@ -314,7 +309,7 @@ class DrawMethod:
     joint: bool
     quartic: bool
     photons: bool
-    each: int  # frames per draw
+    frames_per_draw: int
     cumulants: list[Cumulants]  # of one draw of each scenario
     tables: list[layout.AliasTable] = field(default_factory=list)  # of the scene, filled as its arrays are
 
@@ -325,10 +320,10 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
     factors = Factors.of(drawing.processes, quiet.conditions)
     if quiet.wavelength_nm.size > MAX_PIXELS:
         raise InputError.of("pixels", quiet.wavelength_nm.size, f"at most {MAX_PIXELS}")
-    for other, name in product(scenarios[1:], OF_DETECTOR):
-        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
+    for x, name in product(scenarios[1:], OF_DETECTOR):
+        if not np.array_equal(getattr(quiet, name), getattr(x, name)):
             raise InputError(
-                f"scenarios of one study must share instrument and exposure, but {name} of {other.name} differs from "
+                f"scenarios of one study must share instrument and exposure, but {name} of {x.name} differs from "
                 f"that of {quiet.name}",
                 key=name,
             )
@@ -336,8 +331,8 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in factors.ends.values()]
     corners = [*product(*(grid.tolist() for grid in grids))]
     frames = _draw_frames(scenarios, drawing, factors, corners)
-    each = 1 if frames else quiet.n_frames
-    cumulants = [Cumulants.of(x, each) for x in scenarios]
+    frames_per_draw = 1 if frames else quiet.n_frames
+    cumulants = [Cumulants.of(x, frames_per_draw) for x in scenarios]
     varied = [(x, c.scaled(x, *at)) for (x, c), at in product(zip(scenarios, cumulants, strict=True), corners)]
     joint = _joint(varied, drawing.recipe)
     if modulations and not joint:
@@ -350,7 +345,8 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
         is_noticeable(truncation_distance(c.over_sd(), fourth_power=False, varying=bool(modulations)), c.variance).any()
         for _, c in varied
     )
-    return DrawMethod(factors, frames, joint, quartic, not joint and quiet.photon_noise == "poisson", each, cumulants)
+    photons = not joint and quiet.photon_noise == "poisson"
+    return DrawMethod(factors, frames, joint, quartic, photons, frames_per_draw, cumulants)
 
 
 def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray[np.bool_]:
@@ -358,18 +354,12 @@ def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray
 
     The limits include all values allowed by the priors and the largest charge of additive processes per frame.
     """
-    variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
-    mean = x.mean_raw_dn
-    ends = []
-    for end_light, more_dark, sky in zip(*factors.ends.values(), strict=True):
-        more_light = factor_on_light(end_light, sky, x)
-        there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
-        more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
-        ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
+    frame = Cumulants.of(x, 1)
+    faint, bright = (frame.scaled(x, *at_end) for at_end in zip(*factors.ends.values(), strict=True))
+    # Even the faint end scatters as the expectation does.
+    low, high = (RAIL_SIGMA * np.sqrt(np.maximum(end.variance, frame.variance) + 1 / 12) for end in (faint, bright))
     added = x.gain_dn_per_electron * sum(process.most_electrons(x.frame_s) for process in processes.additive.values())
-    low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
-    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + added > x.highest_dn
-    return low | high
+    return np.asarray((faint.mean < low) | (bright.mean + high + added > x.highest_dn))
 
 
 def _joint(varied: Sequence[tuple[Expectation, Cumulants]], recipe: Recipe) -> bool:
@@ -394,6 +384,7 @@ def _joint(varied: Sequence[tuple[Expectation, Cumulants]], recipe: Recipe) -> b
 def _draw_frames(
     scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors, corners: Sequence[tuple[float, float, float]]
 ) -> bool:
+    """Return whether frames are drawn one by one; raises InputError if they would have to be, but must be stacked."""
     if scenarios[0].n_frames == 1 or drawing.mode == "frames":
         # For a single frame, both modes give the same draws.
         return drawing.mode == "frames" and scenarios[0].n_frames > 1
@@ -411,23 +402,6 @@ def _draw_frames(
             if pixels.any():
                 return True
     return False
-
-
-def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
-    """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
-    ends, middle = factors.ends, factors.median_on_light(x)
-    least, most = (factor_on_light(*both, x) for both in zip(ends["light"], ends["sky"], strict=True))
-    light = np.maximum(most - middle, middle - least)
-    dark = max(ends["dark"][1] - factors.medians["dark"], factors.medians["dark"] - ends["dark"][0])
-    variance = c.variance + most * c.light_variance + ends["dark"][1] * c.dark_variance
-    reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
-    if (reach >= REACH_DN).any():
-        pixel = int(np.argmax(reach))
-        raise InputError(
-            f"the priors must move pixel {pixel} of {x.name} less than {REACH_DN:g} DN away from its mean, not "
-            f"{reach[pixel]:.3g}: shorten the exposure or draw frame by frame",
-            key="priors",
-        )
 
 
 def sky_share(x: Expectation) -> Float:

@@ -200,8 +200,6 @@ def alias_table(mean: float) -> AliasTable:
     Walker's method (1977, doi 10.1145/355744.355749) is applied to integers: the probabilities are rounded to multiples
     of 2**-32 that sum to one, which the table then represents exactly.
     """
-    if not 0.0 <= mean <= LARGEST_MEAN:
-        raise ValueError(f"Poisson mean must be 0 to {LARGEST_MEAN:g}, not {mean!r}")
     if mean == 0.0:
         return alias_table_of(np.ones(1))
     # All counts beyond this range have together less than half a word.
@@ -227,17 +225,17 @@ def alias_table_of(probability: Float, low: int = 0) -> AliasTable:
     words: NDArray[np.int64] = np.floor(exact).astype(np.int64)
     words[np.argsort(words - exact, kind="stable")[: int(2**WORD_BITS - words.sum())]] += 1
     shift = WORD_BITS - bits
-    share, left = 1 << shift, words.tolist()
+    share, remaining = 1 << shift, words.tolist()
     # A full column is its own alias, with threshold 0.
     entries = [column << shift for column in range(1 << bits)]
-    small = [c for c, n in enumerate(left) if n < share]
-    large = [c for c, n in enumerate(left) if n > share]
+    small = [c for c, n in enumerate(remaining) if n < share]
+    large = [c for c, n in enumerate(remaining) if n > share]
     while small:
         poor, rich = small.pop(), large[-1]
-        entries[poor] = rich << shift | left[poor]
-        left[rich] -= share - left[poor]
-        if left[rich] <= share:
+        entries[poor] = rich << shift | remaining[poor]
+        remaining[rich] -= share - remaining[poor]
+        if remaining[rich] <= share:
             large.pop()
-            if left[rich] < share:
+            if remaining[rich] < share:
                 small.append(rich)
     return AliasTable(low, bits, np.array(entries, dtype=np.uint32))

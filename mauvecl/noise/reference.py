@@ -90,9 +90,9 @@ def fma(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Floats:
 
 
 def _horner(name: str, x: Floats) -> Floats:
-    *rest, value = _POLYNOMIALS[name]
-    result: Floats = np.full_like(x, value)
-    for coefficient in reversed(rest):
+    *lower, highest = _POLYNOMIALS[name]
+    result: Floats = np.full_like(x, highest)
+    for coefficient in reversed(lower):
         result = fma(result, x, coefficient)
     return result
 
@@ -233,9 +233,8 @@ def analogue(
             light = combine_factors(light, sky * response["sky_share"], fma)
         v = _responding(response, level["c0"], z, light, dark, fma, quartic=scene.quartic)
     elif scene.joint:
-        first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
-        v = np.broadcast_to(level[first], z.shape)
-        for name in rest:
+        v = np.broadcast_to(level["c4" if scene.quartic else "c3"], z.shape)
+        for name in ("c3", "c2", "c1", "c0") if scene.quartic else ("c2", "c1", "c0"):
             v = fma(z, v, level[name])
     else:
         assert drawn.dark is not None
@@ -251,8 +250,8 @@ def analogue(
 def _responding(
     r: NDArray[np.void], c0: Floats, z: Floats, light_change: Floats, dark_change: Floats, fma: Fma, *, quartic: bool
 ) -> Floats:
-    one = np.float32(1.0)
-    light, dark = light_change + one, dark_change + one
+    unity = np.float32(1.0)
+    light, dark = light_change + unity, dark_change + unity
     variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))
     third = fma(light, r["light_third"], dark * r["dark_third"])
     fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
@@ -346,11 +345,11 @@ def pointing_drifts(
     begin = np.zeros((len(numbers), 1))
     index, n, stream = np.asarray(numbers, np.uint64)[:, None], 0, "stare_pointing"
     while not parts or not (parts[-1][0][:, -1] >= end_s).all():
-        which = np.arange(n, n + DRIFTS_AT_ONCE)[None]
+        drift = np.arange(n, n + DRIFTS_AT_ONCE)[None]
         # Half the sum of two squared normals is exponential, and has the same bits on every machine.
-        a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, which, stream, 0, seed)))
+        a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, drift, stream, 0, seed)))
         wait, lasts = (a * a + b * b) / 2 * (3600.0 / process.rate_per_h), (c * c + d * d) / 2 * process.duration_s
-        share = (words_at(index, which, stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
+        share = (words_at(index, drift, stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
         ends = begin + np.cumsum(wait + lasts, axis=1)
         parts.append((ends - lasts, lasts, share * process.depth))
         begin, n = ends[:, -1:], n + DRIFTS_AT_ONCE
@@ -409,8 +408,8 @@ def components(x: Expectation, *, realisation: int, seed: int, **drawing: Unpack
         del values["neighbours"]
     values["net"] = raw - x.n_frames * (x.bias_dn + x.dark_dn) - x.subtracted_dn
     columns = [column for column in COLUMNS if column.name in values]
-    about = {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
-    return table_of(columns, [values], **about)
+    metadata = {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
+    return table_of(columns, [values], **metadata)
 
 
 def _split(
@@ -421,19 +420,19 @@ def _split(
     light, warm, glow = (
         (1.0 + change.astype(np.float64)) * middle for change, middle in zip(changes, scene.medians, strict=True)
     )
-    drawn, n, each = draws(scene, index, frames, seed), scene.n_pixel, x.n_frames // scene.n_draws
+    drawn, n, frames_per_draw = draws(scene, index, frames, seed), scene.n_pixel, x.n_frames // scene.n_draws
     v = analogue(scene, drawn, 0, *changes)
     gain, step = x.gain_dn_per_electron[:, None], x.dark_step_dn[:, None]
-    source = each * light * gain * x.source_electrons[:, None]
-    sky = each * light * glow * gain * x.sky_electrons[:, None]
-    neighbours = each * light * gain * x.neighbour_electrons[:, None]
+    source = frames_per_draw * light * gain * x.source_electrons[:, None]
+    sky = frames_per_draw * light * glow * gain * x.sky_electrons[:, None]
+    neighbours = frames_per_draw * light * gain * x.neighbour_electrons[:, None]
     photon_variance = gain * (source + sky + neighbours)
-    read_variance = each * x.read_noise_dn[:, None] ** 2 + (each - 1) / 12
-    mean_dark = each * warm * x.dark_dn[:, None]
+    read_variance = frames_per_draw * x.read_noise_dn[:, None] ** 2 + (frames_per_draw - 1) / 12
+    mean_dark = frames_per_draw * warm * x.dark_dn[:, None]
     added = {name: (scene.pixels["electron_gain"][:, None] * charge)[:n] for name, charge in drawn.added.items()}
     # All random parts: photon noise + read noise + dark counts.
     total = scene.base_dn[0][:, None] + v[:n].astype(np.float64) - sum(added.values())
-    total = total - source - sky - neighbours - each * x.bias_dn[:, None]
+    total = total - source - sky - neighbours - frames_per_draw * x.bias_dn[:, None]
     groups = np.arange(len(scene.pixels) // 4)[:, None]
     if drawn.dark is None:
         chance = _per_pixel(words_at(index, frames, "split_dark", groups, seed))[:n].astype(np.float64) + 0.5
@@ -442,10 +441,10 @@ def _split(
         dark = step * np.rint(mean_dark / step) + (scene.dark_counts["gain"][:, None] * drawn.dark)[:n]
     if drawn.photon is not None:
         counted = poisson_counts(drawn.photon, scene.photon_counts[0], scene.tables)[:n]
-        photon = gain * (np.rint(each * x.light_electrons[:, None]) + counted) - source - sky - neighbours
+        photon = gain * (np.rint(frames_per_draw * x.light_electrons[:, None]) + counted) - source - sky - neighbours
     else:
-        both = photon_variance + read_variance
-        share = np.divide(photon_variance, both, out=np.zeros_like(both), where=both > 0)
+        variance = photon_variance + read_variance
+        share = np.divide(photon_variance, variance, out=np.zeros_like(variance), where=variance > 0)
         score = _per_pixel(four_normals(words_at(index, frames, "split", groups, seed)))[:n]
         photon = (total - dark) * share + np.sqrt(read_variance * share) * score
     parts = {"source": source, "sky": sky, "neighbours": neighbours, "photon_noise": photon, "dark": dark}

@@ -14,7 +14,7 @@ from scipy import special
 
 from mauvecl.host.arrays import Float
 from mauvecl.noise import layout
-from mauvecl.noise.drawing import Drawing, Factors, check_reach, choose_method, nodes, polynomial, sky_share
+from mauvecl.noise.drawing import Drawing, Factors, choose_method, factor_on_light, nodes, polynomial, sky_share
 from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, alias_table, alias_table_of
 from mauvecl.noise.unknowns import NOISE_FREE, PROCESSES, Comparison, Processes, SignalPart
 from mauvecl.schema.errors import InputError
@@ -89,21 +89,22 @@ def drawn_factors(processes: Processes, quiet: Expectation) -> dict[SignalPart, 
     A product of several independent factors is treated as normal.
     """
     factors, n_frames = Factors.of(processes, quiet.conditions), quiet.n_frames
-    every = dict[SignalPart, list[FactorDistribution]]()
-    for (name, factor), table in zip(processes.modulations, factors.tables, strict=True):
+    by_part = dict[SignalPart, list[FactorDistribution]]()
+    for (name, part), table in zip(processes.modulations, factors.tables, strict=True):
         # Relative to the factor at the median, as the table is.
-        one = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
+        factor = FactorDistribution(1.0 + quantile_at_score(table, SCORE))
         if PROCESSES[name].when == "frame" and n_frames > 1:
-            one = FactorDistribution(one.mean + one.sd / np.sqrt(n_frames) * SCORE)
-        every.setdefault(factor, []).append(one)
-    found = {}
-    for name, ones in every.items():
-        values = ones[0].values
-        if len(ones) > 1:
-            mean = np.prod([one.mean for one in ones])
-            values = mean + np.sqrt(np.prod([one.mean**2 + one.sd**2 for one in ones]) - mean**2) * SCORE
-        found[name] = FactorDistribution(factors.medians[name] * values)
-    return found
+            factor = FactorDistribution(factor.mean + factor.sd / np.sqrt(n_frames) * SCORE)
+        by_part.setdefault(part, []).append(factor)
+    products = {}
+    for part, several in by_part.items():
+        values = several[0].values
+        if len(several) > 1:
+            mean = np.prod([factor.mean for factor in several])
+            square = np.prod([factor.mean**2 + factor.sd**2 for factor in several])
+            values = mean + np.sqrt(square - mean**2) * SCORE
+        products[part] = FactorDistribution(factors.medians[part] * values)
+    return products
 
 
 def factor_nodes(factors: Mapping[SignalPart, FactorDistribution], x: Expectation, *, weighted: bool) -> Nodes:
@@ -111,8 +112,8 @@ def factor_nodes(factors: Mapping[SignalPart, FactorDistribution], x: Expectatio
     light, sky, dark = zip(*changes_of(x), strict=True)
     moved: dict[SignalPart, tuple[Float, Float]] = {"dark": dark, "light": light, "sky": sky}
     grids, rows = [], []
-    every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
-    score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
+    step, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
+    score, weight = SCORE[::step], WEIGHTS[::step] / WEIGHTS[::step].sum()
     for name, (part, variance) in moved.items():
         spread = factors.get(name)
         if spread is None:
@@ -164,12 +165,12 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
             key="mode",
         )
     # Equal means share a table; tables are contiguous on the device.
-    means, which = np.unique(mean[~expanded], return_inverse=True)
-    alias = [alias_table(one) for one in means.tolist()]
+    means, number = np.unique(mean[~expanded], return_inverse=True)
+    alias = [*map(alias_table, means.tolist())]
     starts = np.cumsum([sum(t.entries.size for t in tables), *(t.entries.size for t in alias)])
     tables += alias
-    out["table"][~expanded] = starts[which]
-    out["bits"][~expanded], low = (np.array([getattr(t, of) for t in alias])[which] for of in ("bits", "low"))
+    out["table"][~expanded] = starts[number]
+    out["bits"][~expanded], low = (np.array([getattr(t, name) for t in alias])[number] for name in ("bits", "low"))
     out["low"][~expanded] = low - centre[~expanded]
     root = np.sqrt(mean[expanded])
     out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
@@ -187,9 +188,10 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Fill `out` with a draw's response to factors on light, dark and sky, relative to the priors' medians."""
-    light, dark = factors.median_on_light(x), factors.medians["dark"]
+    on_light, dark, on_sky = factors.medians.values()
+    light = factor_on_light(on_light, on_sky, x)
     # The sky's light follows both factors.
-    out["sky_share"] = factors.medians["light"] * factors.medians["sky"] * sky_share(x) / light
+    out["sky_share"] = on_light * on_sky * sky_share(x) / light
     out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
     out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
     # A lower limit avoids 0 / 0 in pixels without noise.
@@ -197,6 +199,24 @@ def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors:
     for order, name in enumerate(layout.CUMULANTS[1:], 3):
         out[f"light_{name}"] = light * c.photon_cumulant(order)
         out[f"dark_{name}"] = dark * c.dark_cumulant(order)
+
+
+#: The device does not round counts correctly beyond this distance from their base.
+REACH_DN = 2.0**22
+
+
+def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
+    """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
+    faint, bright = (c.scaled(x, *at_end) for at_end in zip(*factors.ends.values(), strict=True))
+    middle = c.scaled(x, *factors.medians.values())
+    reach = np.maximum(bright.mean - middle.mean, middle.mean - faint.mean) + 8.0 * np.sqrt(bright.variance)
+    if (reach >= REACH_DN).any():
+        pixel = int(np.argmax(reach))
+        raise InputError(
+            f"the priors must move pixel {pixel} of {x.name} less than {REACH_DN:g} DN away from its mean, not "
+            f"{reach[pixel]:.3g}: shorten the exposure or draw frame by frame",
+            key="priors",
+        )
 
 
 #: Largest number of scenarios per launch for stacks, and frame by frame (True), which needs more registers.
@@ -225,13 +245,13 @@ class Scene:
     tables: NDArray[np.uint32]  # concatenated alias tables
     priors: NDArray[np.float32]  # shape (n_modulation, 2 * PRIOR_NODES); quantile tables
     medians: tuple[float, ...]  # factors on light, dark and sky at the priors' medians
-    references: NDArray[np.uint32]  # scenario with whose mean and variance each scenario is compared
-    #: Shape (n_scenario, n_padded); reference rounded to whole DN minus the reference; zero for noisy references.
+    #: Shape (n_scenario, n_padded); reference, the mean of the first scenario, rounded to whole DN minus the reference;
+    #: zero for noisy references.
     fraction: Float
     estimates: NDArray[np.void]  # shape (n_scenario, n_padded); for estimated variances; empty for the model's
     comparison: Comparison
     base_dn: NDArray[np.int64]  # shape (n_scenario, n_pixel); whole DN of one draw's mean that the kernels omit
-    used: NDArray[np.bool_]  # shape (n_pixel,); pixels that enter the statistics, those that no reference saturates
+    used: NDArray[np.bool_]  # shape (n_pixel,); pixels of the statistics, those that the reference does not saturate
 
     @property
     def n_draws(self) -> int:
@@ -261,35 +281,31 @@ class Scene:
         return np.array([*chi2, *linear], np.float32)
 
     def part(self, scenarios: Sequence[int]) -> Scene:
-        """Return the scene with some of its scenarios, in the given order, which must include their references."""
-        chosen = list(scenarios)
+        """Return the scene with some of its scenarios, in the given order, which must begin with the first."""
         job = self.job.copy()
-        job["scenario_count"] = len(chosen)
+        job["scenario_count"] = len(scenarios)
         per_scenario = {
-            name: array[chosen] if len(array := getattr(self, name)) else array
+            name: array[[*scenarios]] if len(array := getattr(self, name)) else array
             for name in ("levels", "edges", "photon_counts", "responses", "fraction", "estimates", "base_dn")
         }
-        references = np.array([chosen.index(t) for t in self.references[chosen]], np.uint32)
-        return replace(self, job=job, references=references, **per_scenario)
+        return replace(self, job=job, **per_scenario)
 
 
 def prepare(
-    scenarios: Sequence[Expectation], drawing: Drawing | None = None, *, references: Sequence[int] | None = None,
-    comparison: Comparison = NOISE_FREE, first_group: int = 0, **words: Unpack[DrawingOptions],
+    scenarios: Sequence[Expectation], drawing: Drawing | None = None, *, comparison: Comparison = NOISE_FREE,
+    first_group: int = 0, **options: Unpack[DrawingOptions],
 ) -> Scene:  # fmt: skip
     """Compute the arrays of scenarios for the device, from expectations that differ only in their light.
 
-    Options of the draw can also be given as keywords. Each scenario is compared with one of the quiescent `references`,
-    by default the first; `first_group` is the number of the first group of four pixels in the generator's counter.
+    Options of the draw can also be given as keywords. All scenarios are compared with the first, the quiescent star;
+    `first_group` is the number of the first group of four pixels in the generator's counter.
     """
-    drawing, quiet = drawing or Drawing(**words), scenarios[0]
-    method = choose_method(scenarios, drawing)
-    compared = np.array([0] * len(scenarios) if references is None else references, np.uint32)
-    used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
+    drawing, quiet = drawing or Drawing(**options), scenarios[0]
+    method, used = choose_method(scenarios, drawing), ~quiet.saturated
     dark_dn, step, darks = np.zeros(used.size), quiet.dark_step_dn, np.zeros(padded(used.size), layout.POISSON)
     if not method.joint:
         # Separate dark counts are relative to integers.
-        mean = method.each * quiet.dark_dn / step
+        mean = method.frames_per_draw * quiet.dark_dn / step
         dark_dn = step * fill_poisson_counts(darks[: used.size], mean, step, method.tables)
     pixels = np.zeros(darks.size, layout.PIXEL)
     pixels["used"][: used.size], pixels["electron_gain"][: used.size] = used, quiet.gain_dn_per_electron
@@ -300,14 +316,14 @@ def prepare(
     arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
         _fill_draw(arrays, k, x, method, dark_dn)
-        _fill_comparison(arrays, k, method.each, scenarios[compared[k]], comparison, used)
+    _fill_comparison(arrays, quiet, quiet.n_frames // method.frames_per_draw, comparison, used)
     job = _job(scenarios, drawing, method, comparison, first_group)
     tables = np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32)
     return Scene(
-        used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons, clip=method.each == 1,
-        processes=drawing.processes, job=job, pixels=pixels, dark_counts=darks,
+        used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons,
+        clip=method.frames_per_draw == 1, processes=drawing.processes, job=job, pixels=pixels, dark_counts=darks,
         tables=tables, priors=method.factors.tables, medians=tuple(method.factors.medians.values()),
-        references=compared, comparison=comparison, used=used, **arrays,
+        comparison=comparison, used=used, **arrays,
     )  # fmt: skip
 
 
@@ -341,56 +357,53 @@ def _fill_draw(arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, 
     level = arrays["levels"][k, :n_pixel]
     # The mean to which a draw is relative; separate Poisson counts are relative to integers.
     if method.joint:
-        light, dark = factors.median_on_light(x), factors.medians["dark"]
-        mean = c.mean + (light - 1.0) * c.light_dn + (dark - 1.0) * c.dark_dn
+        mean = c.scaled(x, *factors.medians.values()).mean
+        if arrays["responses"].size:
+            fill_responses(arrays["responses"][k, :n_pixel], x, c, factors)
+            _check_reach(x, c, factors)
+        else:
+            for power, coefficient in enumerate(polynomial(c)):
+                level[f"c{power}"] = coefficient
     else:
         photons = c.photons
         if method.photons:
             photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, method.tables)
-        mean = method.each * x.bias_dn + dark_dn + gain * photons
-    base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.each == 1 else np.inf)
-    if arrays["responses"].size:
-        fill_responses(arrays["responses"][k, :n_pixel], x, c, factors)
-        check_reach(x, c, factors)
-    elif method.joint:
-        for power, coefficient in enumerate(polynomial(c)):
-            level[f"c{power}"] = coefficient
-    else:
+        mean = method.frames_per_draw * x.bias_dn + dark_dn + gain * photons
         level["c1"] = np.sqrt(c.gaussian)
+    base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.frames_per_draw == 1 else np.inf)
     level["c0"] += mean - base
 
 
 def _fill_comparison(
-    arrays: PerScenario, k: int, each: int, reference: Expectation, comparison: Comparison, used: NDArray[np.bool_]
+    arrays: PerScenario, quiet: Expectation, n_draws: int, comparison: Comparison, used: NDArray[np.bool_]
 ) -> None:
-    """Fill the arrays for the comparison of scenario k, in draws of `each` frames, with its reference."""
-    base, n_pixel = arrays["base_dn"][k], used.size
-    level, edge, fraction = (arrays[name][k, :n_pixel] for name in ("levels", "edges", "fraction"))
-    mean_sum = reference.recorded_dn
-    whole = (reference.n_frames // each) * base - np.rint(mean_sum)
+    """Fill the arrays for the comparison of all scenarios with the quiescent star."""
+    base, n_pixel = arrays["base_dn"], used.size
+    mean_sum = quiet.recorded_dn
+    level, edge, fraction = (arrays[name][:, :n_pixel] for name in ("levels", "edges", "fraction"))
+    offset_dn = n_draws * base - np.rint(mean_sum)
     if not comparison.exposures:
         fraction[:] = np.rint(mean_sum) - mean_sum
-    level["shift"] = layout.MAGIC - whole
-    variance = (1.0 + comparison.added_variance) * reference.variance_dn2
+    level["shift"] = layout.MAGIC - offset_dn
+    variance = (1.0 + comparison.added_variance) * quiet.variance_dn2
     level["inverse_variance"] = used / variance
     level["twice"] = 2.0 * fraction * level["inverse_variance"]
-    edge["base"], edge["whole"] = base, whole
-    edge["low"] = layout.MAGIC - base
-    edge["high"] = layout.MAGIC + (reference.highest_dn - base)
+    edge["base"], edge["whole"] = base, offset_dn
+    edge["low"], edge["high"] = layout.MAGIC - base, layout.MAGIC + (quiet.highest_dn - base)
     if comparison.estimated:
         # An observer knows the detector; padding has a variance of 1.
-        estimate = arrays["estimates"][k]
-        estimate["variance"], estimate["fraction"] = 1.0, arrays["fraction"][k]
-        known = reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
-        offset = np.rint(mean_sum) - reference.n_frames * (reference.bias_dn + reference.dark_dn)
-        estimate["net_offset"][:n_pixel], estimate["gain"][:n_pixel] = offset, reference.gain_dn_per_electron
-        estimate["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
+        estimate = arrays["estimates"]
+        estimate["variance"], estimate["fraction"] = 1.0, arrays["fraction"]
+        estimate, detector = estimate[:, :n_pixel], quiet.read_noise_dn**2 + quiet.dark_variance_dn2 + 1 / 12
+        estimate["net_offset"] = np.rint(mean_sum) - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
+        estimate["gain"] = quiet.gain_dn_per_electron
+        estimate["variance"] = np.maximum(quiet.n_frames * detector, NO_VARIANCE)
     # The last pixel of each element.
-    ends = np.append(np.diff(reference.element) > 0, True)
-    element_variance = np.bincount(reference.element, variance * used)
+    ends = np.append(np.diff(quiet.element) > 0, True)
+    element_variance = np.bincount(quiet.element, variance * used)
     with np.errstate(divide="ignore"):
-        edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
-    edge["element_offset"][ends] = np.bincount(reference.element, fraction * used)
+        edge["inverse_element_variance"][:, ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
+    edge["element_offset"][:, ends] = np.bincount(quiet.element, fraction[0] * used)
 
 
 def _job(
@@ -406,7 +419,7 @@ def _job(
     job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
     job["pair_scale"] = (1.0 + comparison.added_variance) / 2.0
     for name, process in drawing.processes.additive.items():
-        table = alias_table_of(process.charge(method.each * quiet.frame_s))
+        table = alias_table_of(process.charge(method.frames_per_draw * quiet.frame_s))
         job[f"{name}_table"] = sum(t.entries.size for t in method.tables)
         job[f"{name}_bits"], job[f"{name}_low"] = table.bits, table.low
         method.tables.append(table)

@@ -109,7 +109,7 @@ class InstrumentValue(Unknown):
     of_throughput: bool = False
     mode: int | None = None  # number of the mode of a calibration of which this is the amplitude, from 0
     #: Changes of the logarithm of other values than the throughput for an amplitude of one of a mode, by name.
-    others: Mapping[str, float] = field(default_factory=dict)
+    slopes: Mapping[str, float] = field(default_factory=dict)
 
     def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
         """Return the changes of an instrument that set a value, of which those of other modes are kept."""
@@ -118,8 +118,8 @@ class InstrumentValue(Unknown):
         amplitudes = [*nominal.throughput_amplitudes]
         amplitudes += [0.0] * (self.mode + 1 - len(amplitudes))
         value, amplitudes[self.mode] = value - amplitudes[self.mode], value
-        others = {name: getattr(nominal, name) * math.exp(step * value) for name, step in self.others.items()}
-        return {"throughput_amplitudes": tuple(amplitudes)} | others
+        scaled = {name: getattr(nominal, name) * math.exp(slope * value) for name, slope in self.slopes.items()}
+        return {"throughput_amplitudes": tuple(amplitudes)} | scaled
 
 
 Row = TypeVar("Row", bound=Unknown)
@@ -250,9 +250,9 @@ def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
     measured = fitted.union(errors.values)
     values = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in measured}
     for k in range(min(len(errors.modes), MAX_MODES)):
-        others = {name: steps[k] for name, steps in errors.values.items() if k < len(steps) and steps[k]}
+        slopes = {name: steps[k] for name, steps in errors.values.items() if k < len(steps) and steps[k]}
         name, label = f"throughput_{k + 1}", f"calibration, mode {k + 1}"
-        values[name] = InstrumentValue(name=name, label=label, prior=MODE_PRIOR, mode=k, others=others)
+        values[name] = InstrumentValue(name=name, label=label, prior=MODE_PRIOR, mode=k, slopes=slopes)
     return values
 
 
@@ -316,12 +316,9 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
 
     def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
-        every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
-        update = {
-            name: process.with_particles(rate_per_cm2_s)
-            for name, process in every.items()
-            if process.particles_per_cm2_s is not None
-        }
+        processes = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
+        caused = {name: process for name, process in processes.items() if process.particles_per_cm2_s is not None}
+        update = {name: process.with_particles(rate_per_cm2_s) for name, process in caused.items()}
         return cast("Self", self.model_copy(update=update))
 
 

@@ -194,7 +194,7 @@ class Pool:
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
         request = DetectRequest.of(quiet, flares, **how)
-        tallies = [plan.tally() for plan, _ in request.plans]
+        tallies = [plan.tally() for plan in request.plans]
         self._add_up(request, lambda part, shard: tallies[part].merge(shard))
         return detection_of(request, tallies)
 

@@ -123,7 +123,7 @@ def test_statistics_equal_reference(any_width: Engine, name: str, more: dict[str
         names = (*(one for one in names if not requests.STATISTICS[one].paired and one != "uv_excess"), own)
     kind = {"statistics": names, "start": START, "seed": SEED, **how, **more}
     asked = requests.DetectRequest.of(quiet, tuple(flares), INDEX.size, **kind).hypotheses
-    plan = requests.plan_channels(asked, range(len(flares)), first=True)
+    plan = requests.plan_channels(asked, range(len(flares)))
     sums = numpy_kernels.statistics(asked, plan, INDEX, SEED)
     values = any_width.statistic_values(quiet, flares, count=INDEX.size, **kind)
     np.testing.assert_array_equal(values, numpy_kernels.marginalise(sums, plan.subtractions))

@@ -36,7 +36,7 @@ def results(name: str, count: int) -> dict[str, np.ndarray]:
     names = selftest.statistics_of(how)
     unknown = Nuisances.of(quiet, how["nuisances"]) if how.get("nuisances") else None
     hypotheses = requests.Hypotheses(quiet, (flare,), names, both, nuisances=unknown)
-    plan = requests.plan_channels(hypotheses, range(1), first=True)
+    plan = requests.plan_channels(hypotheses, range(1))
     sums = statistics.statistics(hypotheses, plan, index, seed)
     values = statistics.marginalise(sums, plan.subtractions)
     tally = counts.Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])

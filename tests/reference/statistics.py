@@ -29,10 +29,10 @@ def statistics(hypotheses: requests.Hypotheses, plan: Any, realisation: np.ndarr
     ]
     finished, begin = [], 0
     for k in range(n_scenario):
-        t, raw, level = int(scene.references[k]), x[k], scene.levels[k]
+        raw, level = x[k], scene.levels[k]
         y, variance = raw, np.zeros_like(raw)
         if exposures:
-            total = np.sum([other[t] for other in others], axis=0, dtype=np.float32)
+            total = np.sum([other[0] for other in others], axis=0, dtype=np.float32)
             y = fma(total, -added, raw)
         if estimated:
             estimate = scene.estimates[k]
@@ -47,9 +47,9 @@ def statistics(hypotheses: requests.Hypotheses, plan: Any, realisation: np.ndarr
         out[fixed * k + 1], of_elements = _element_sums(scene, k, y, variance, weights[pixels_end[k] : linear_end[k]])
         out[fixed * n_scenario + int(pixels_end[k]) : fixed * n_scenario + int(linear_end[k])] = of_elements
         for p, pixel in enumerate(scene.pixels) if pair else ():
-            d = raw[p] - others[0][t, p]
+            d = raw[p] - others[0][0, p]
             if estimated:
-                both = _variance(raw, estimate)[p] + _variance(others[0][t], estimate)[p]
+                both = _variance(raw, estimate)[p] + _variance(others[0][0], estimate)[p]
                 weight = pixel["used"] / both
             else:
                 weight = scale * level[p]["inverse_variance"]
@@ -64,7 +64,7 @@ def statistics(hypotheses: requests.Hypotheses, plan: Any, realisation: np.ndarr
         begin = int(linear_end[k])
         if smoothed:
             scales = plan.scales[plan.scale_end[k - 1] if k else 0 : plan.scale_end[k]]
-            finished += _smoothed_sums(rows, scales, raw - others[0][t])
+            finished += _smoothed_sums(rows, scales, raw - others[0][0])
     return np.concatenate([out, np.array(finished, np.float32).reshape(len(finished), len(realisation))])
 
 
