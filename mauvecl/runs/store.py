@@ -58,8 +58,8 @@ def _describe(root: Any, scene: StoredScene, study: Study) -> None:
     x, group = scene.expectation, root.require_group(scene.group)
 
     def store(name: str, values: NDArray[Any], unit: str, dimension: str = "pixel") -> None:
-        how: Any = {"chunks": values.shape, "compressors": [Crc32cCodec()], "dimension_names": [dimension]}
-        group.create_array(name, data=values, **how).attrs["units"] = unit
+        options: Any = {"chunks": values.shape, "compressors": [Crc32cCodec()], "dimension_names": [dimension]}
+        group.create_array(name, data=values, **options).attrs["units"] = unit
 
     if scene.name == "quiescent":
         group.attrs.update({"star": scene.star, **scene.at})
@@ -218,24 +218,24 @@ class Store:
         """Open an existing store; at least one copy of its study is intact, and intact copies are the same."""
         path = Path(path)
         copies: dict[str, Path] = {}
-        for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
+        for file in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
             # Only intact copies count: those whose digest is correct.
             with suppress(ValueError, LookupError, TypeError, AttributeError, RecursionError):
-                attributes = json.loads(read_bytes(place, "description"))["attributes"]
+                attributes = json.loads(read_bytes(file, "description"))["attributes"]
                 if signed(attributes["study"]).items() <= attributes.items():
-                    copies.setdefault(attributes["study"], place.relative_to(path))
+                    copies.setdefault(attributes["study"], file.relative_to(path))
         if not copies:
             raise InputError(
                 f"{str(path)!r} is not a store of spectra: give a folder that `mauvecl realise` wrote, with an intact "
                 "copy of its study",
                 key="store",
             )
-        (text, first), *others = copies.items()
-        if others:
-            other, second = others[0]
-            keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
+        (text, file), *contradictions = copies.items()
+        if contradictions:
+            other_text, other_file = contradictions[0]
+            keys = ", ".join(differing_keys(toml(text, path.name), toml(other_text, path.name)))
             raise InputError(
-                f"store {str(path)!r} must hold one study, but {str(first)!r} and {str(second)!r} differ in {keys}: "
+                f"store {str(path)!r} must hold one study, but {str(file)!r} and {str(other_file)!r} differ in {keys}: "
                 "restore the file of the correct one",
                 key="store",
             )
@@ -247,7 +247,7 @@ class Store:
     @cached_property
     def scenes(self) -> list[StoredScene]:
         """Arrays of spectra: every star and sweep value, without and with each flare."""
-        stored = []
+        scenes = []
         for number, case in enumerate(cases(self.study), 1):
             chosen = case.study.bulk.chosen(case.quiet.n_frames)
             # The amplitude is an attribute of the flare's array.
@@ -255,15 +255,15 @@ class Store:
             name = full_label(case.label, swept)
             for k, (amplitude, x) in enumerate(zip((0.0, *case.amplitudes), (case.quiet, *case.flares), strict=True)):
                 array = f"flare-{k}" if k else "quiescent"
-                stored.append(StoredScene(f"star-{number}", array, name, amplitude, x, chosen, swept, self.rows))
-        return stored
+                scenes.append(StoredScene(f"star-{number}", array, name, amplitude, x, chosen, swept, self.rows))
+        return scenes
 
     def scene(self, path: str) -> StoredScene:
         """Return an array by path, such as ``star-1/flare-2``."""
-        stored = next((scene for scene in self.scenes if scene.path == path), None)
-        if stored is None:
-            raise InputError.of("scenes", path, f"one of {', '.join(s.path for s in self.scenes)}")
-        return stored
+        by_path = {scene.path: scene for scene in self.scenes}
+        if path not in by_path:
+            raise InputError.of("scenes", path, f"one of {', '.join(by_path)}")
+        return by_path[path]
 
     @property
     def rows(self) -> int:
@@ -295,8 +295,8 @@ class Store:
         """Write the description of the arrays, or check that an existing one is of the same study."""
         root = self.path / "zarr.json"
         if root.exists():
-            there = Store.open(self.path).study
-            differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
+            existing = Store.open(self.path).study
+            differing = differing_keys(self.study.model_dump(mode="json"), existing.model_dump(mode="json"))
             if differing:
                 raise InputError(
                     f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: "
@@ -305,30 +305,30 @@ class Store:
                 )
             self.read_digests()
             return
-        ours = {scene.group for scene in self.scenes}
-        other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
-        if other:
+        groups = {scene.group for scene in self.scenes}
+        foreign = [p.name for p in self.path.iterdir() if p.name not in groups and not p.name.startswith(UNFINISHED)]
+        if foreign:
             raise InputError(
-                f"{str(self.path)!r} holds {min(other)!r} and no store: use an empty or a new folder", key="store"
+                f"{str(self.path)!r} holds {min(foreign)!r} and no store: use an empty or a new folder", key="store"
             )
         # The root comes last, so that its presence means that the description is complete.
-        made = self.description()
-        for name in sorted(made, key=lambda name: name == root.name):
-            write_whole(self.path / name, made[name])
+        files = self.description()
+        for name in sorted(files, key=lambda name: name == root.name):
+            write_whole(self.path / name, files[name])
 
     def make_folder(self) -> None:
         """Make the folder if needed; raises InputError if its file system is smaller than the spectra."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            room = shutil.disk_usage(self.path).total
+            disk_bytes = shutil.disk_usage(self.path).total
         except OSError as error:
             raise InputError(
                 f"store {str(self.path)!r} cannot be made ({error.strerror}): use a writable folder", key="store"
             ) from error
-        if self.n_bytes > room:
+        if self.n_bytes > disk_bytes:
             raise InputError(
                 f"the spectra need {self.n_bytes / 2**30:.4g} GiB, but the disk of {str(self.path)!r} has "
-                f"{room / 2**30:.4g} GiB",
+                f"{disk_bytes / 2**30:.4g} GiB",
                 key="run.realisations",
             )
 
@@ -360,28 +360,28 @@ class Store:
     def sort_digests(self) -> None:
         """Write the lists of digests in the order of their chunks, which may have been written in another."""
         for scene in self.scenes:
-            place, start = self.path / scene.path / DIGESTS, f"{scene.path}/"
-            names = [key.removeprefix(start) for key in self.digests if key.startswith(f"{start}c/")]
+            file, prefix = self.path / scene.path / DIGESTS, f"{scene.path}/"
+            names = [key.removeprefix(prefix) for key in self.digests if key.startswith(f"{prefix}c/")]
             names.sort(key=lambda name: int(name.split("/")[1]))
-            text = "".join(f"{_line(name, self.digests[start + name])}\n" for name in names).encode()
-            if names and place.read_bytes() != text:
-                write_whole(place, text)
+            text = "".join(f"{_line(name, self.digests[prefix + name])}\n" for name in names).encode()
+            if names and file.read_bytes() != text:
+                write_whole(file, text)
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
         """Encode a chunk by Zarr's codecs `bytes` and `crc32c`, padding the last chunk with zeros."""
         missing = chunk.scene.chunk_rows - len(rows)
         rows = np.pad(rows, [(0, missing), *[(0, 0)] * len(chunk.scene.row)]) if missing else rows
-        whole = np.ascontiguousarray(rows, chunk.scene.dtype)
-        return memoryview(whole.data).cast("B"), crc(whole)
+        rows = np.ascontiguousarray(rows, chunk.scene.dtype)
+        return memoryview(rows.data).cast("B"), crc(rows)
 
     def write(self, chunk: Chunk, rows: NDArray[Any]) -> None:
         """Write a chunk atomically, and then its digest to its array's list, for which threads wait for each other."""
         data, check = self.encode(chunk, rows)
         write_whole(self.path / chunk.key, data, check)
         written = self.digests[chunk.key] = digest(data, check)
-        place = self.path / chunk.scene.path / DIGESTS
-        what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
-        with self._listing, writing(what, NO_ROOM, key="store"), place.open("ab", buffering=0) as file:
+        digests = self.path / chunk.scene.path / DIGESTS
+        name = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
+        with self._listing, writing(name, NO_ROOM, key="store"), digests.open("ab", buffering=0) as file:
             # A single short write, which first ends a line that a full disk has cut short.
             file.write(f"\n{_line(chunk.name, written)}\n".encode())
 
@@ -398,24 +398,25 @@ class Store:
         scenes = {scene.path: scene for scene in self.scenes}
         described = {*self.description(), *(f"{path}/{DIGESTS}" for path in scenes)}
         for folder, folders, names in os.walk(self.path):
-            here = Path(folder).relative_to(self.path)
-            linked = [name for name in folders if (Path(folder) / name).is_symlink()]
-            for name in sorted([*names, *linked]):
-                whole = str(here / name.removeprefix(UNFINISHED))
+            links = [name for name in folders if (Path(folder) / name).is_symlink()]
+            for name in sorted([*names, *links]):
+                path = Path(folder).relative_to(self.path) / name
+                key = str(path.with_name(name.removeprefix(UNFINISHED) or name))
                 # Twenty digits suffice for any chunk; int() of a very long name would be slow.
-                chunk = re.match("(.+)/c/([0-9]{1,20})/", whole)
-                own = whole in described
-                if chunk is not None and (scene := scenes.get(chunk[1])) is not None:
-                    own |= int(chunk[2]) in scene.chunk_numbers() and whole == scene.chunk(int(chunk[2])).key
-                yield str(here / name), own
+                match = re.match("(.+)/c/([0-9]{1,20})/", key)
+                belongs = key in described
+                if match is not None and (scene := scenes.get(match[1])) is not None:
+                    number = int(match[2])
+                    belongs |= number in scene.chunk_numbers() and key == scene.chunk(number).key
+                yield str(path), belongs
 
     def clear(self) -> None:
         """Remove all files if no others exist; the study is last, so that an interrupted removal leaves a store."""
         files = list(self.files())
-        other = [key for key, own in files if not own]
-        if other:
+        foreign = [key for key, belongs in files if not belongs]
+        if foreign:
             raise InputError(
-                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {other[0]!r}",
+                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {foreign[0]!r}",
                 key="store",
             )
         for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):
