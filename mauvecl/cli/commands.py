@@ -363,7 +363,12 @@ class Command:
         question_values(study, detects=detects, draws=self.draws, insist=how.get("insist", False))
         with ExitStack() as held:
             session = Session(self.verb.name, study, given, held, draws=self.draws, notes=messages, **how)
-            self.run(session, **values)
+            try:
+                self.run(session, **values)
+            except InputError:
+                # No answer shows them.
+                session.say(session.notes)
+                raise
             session.report_lost()
 
     def _options(self) -> dict[str, tuple[Any, Any]]:
