@@ -41,7 +41,7 @@ from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
-from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, release_memory, shown
+from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, content_of, release_memory
 
 if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
@@ -87,8 +87,8 @@ def hosts(address: str, port: int, allowed: Sequence[str]) -> frozenset[str]:
             "visitors' browsers will show, such as https://mauve.example.org",
             key="address",
         )
-    own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
-    return frozenset(plain(host) for host in (*named, *(netloc(host, port) for host in own)))
+    addresses = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
+    return frozenset(plain(host) for host in (*named, *(netloc(address, port) for address in addresses)))
 
 
 class PageApplication(Application):
@@ -106,7 +106,7 @@ class PageApplication(Application):
             message = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
         elif is_visitor and not origins:
             message = "Expected a connection from the page."
-        elif (is_visitor or request.path == "/") and len(Visitor.here) >= MAX_VISITORS:
+        elif (is_visitor or request.path == "/") and len(Visitor.connected) >= MAX_VISITORS:
             status, message = 503, "Too many visitors are here at the moment; please come again in some minutes."
         if message:
             return self.get_handler_delegate(request, RefusalHandler, {"status": status, "message": message})
@@ -124,7 +124,7 @@ class BoundedServer(HTTPServer):
         self.streams = [stream for stream in self.streams if not stream.closed()]
         if len(self.streams) >= self.max_connections:
             # There are fewer pages than connections.
-            pages = {id(page.ws_connection.stream) for page in Visitor.here if page.ws_connection is not None}
+            pages = {id(page.ws_connection.stream) for page in Visitor.connected if page.ws_connection is not None}
             next(oldest for oldest in self.streams if id(oldest) not in pages).close()
         self.streams.append(stream)
         super().handle_stream(stream, address)
@@ -197,7 +197,7 @@ def close_unused() -> None:
         Visitor.has_left = False
         READER.submit(release_memory)
     now = time.monotonic()
-    for visitor in list(Visitor.here):
+    for visitor in list(Visitor.connected):
         if now - visitor.used > IDLE_S and visitor.job is None:
             visitor.close(UNUSED, "not used for a long time")
 
@@ -207,7 +207,7 @@ def warm() -> None:
     with tempfile.TemporaryDirectory() as folder:
         closed = ClosedForms.of(State().question(), Path(folder))
     for tab in TABS.values():
-        shown(tab, closed, {})
+        content_of(tab, closed, {})
     Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
     # What every visitor requests; pictures of other tabs follow on request.
     front()
@@ -240,7 +240,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
             await asyncio.Event().wait()
         finally:
             # Simulations would keep the process until they end.
-            for visitor in list(Visitor.here):
+            for visitor in list(Visitor.connected):
                 visitor.on_close()
 
     # Warnings and errors of all libraries have one format; bokeh and tornado write their own otherwise.
