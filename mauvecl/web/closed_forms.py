@@ -61,7 +61,7 @@ class FieldValues:
         return "your own star" if "star" in self.uploads else star_words(self.star)
 
     def case(self, folder: Path) -> Case:
-        """Return the question as a case, whose files are in a folder; a flare as observed has the amplitude of that."""
+        """Return the question as a case, whose files are in a folder; an observed flare has its own amplitude."""
         uploaded: Source | None = self.uploads.get("star")
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
@@ -164,7 +164,7 @@ class ClosedForms:
     ) -> ClosedForms:
         """Answer a question; `folder` holds the visitor's files for the study, and `inputs` their contents.
 
-        A star may be too bright for the `chance` of detection.
+        Without the `chance` of detection, the star may be too bright for a detection.
         """
         case = question.case(folder)
         # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.

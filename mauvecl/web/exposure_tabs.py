@@ -42,7 +42,7 @@ def budget(closed: ClosedForms, answers: Answers) -> ChartData:
 NOISE = Tab(
     name="noise",
     title="Noise",
-    about="Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star.",
+    about="Where the noise comes from, pixel by pixel, without a flare; for pinned scenarios, the photons of the star.",
     pictures=(budget,),
     questions=("snr",),
     files={"noise-budget": None},
@@ -154,7 +154,7 @@ def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     # A jump or line of the flare adds wavelengths.
     nm = flare.wavelength_nm[(flare.wavelength_nm >= 190) & (flare.wavelength_nm <= 710)]
     light = [np.interp(nm, source.wavelength_nm, source.flux_flam) for source in (star, flare)]
-    # Logarithms show nothing of zero.
+    # Logarithmic axes cannot show zeros.
     quiet, flaring = (np.where(flux > 0, flux, np.nan) for flux in light)
     rise = np.nanmax(flaring / quiet)
     text = f"The flare multiplies the star's light by up to {short(rise)} between 190 and 710 nm."

@@ -78,7 +78,7 @@ class Canvas:
             min_height=60,
             min_width=60,
             min_border=2,
-            # Half of a label at the end of the axis, which is else moved over its neighbour.
+            # Room for half of a label at the end of the axis, which Bokeh otherwise moves over its neighbour.
             min_border_right=14,
             # The wheel alone scrolls the page; two fingers zoom.
             tools=[models.BoxZoomTool(), models.WheelZoomTool(modifiers={"ctrl": True}), models.ResetTool()],

@@ -76,7 +76,7 @@ def _curve(closed: ClosedForms) -> tuple[Float, Float]:
         new = (x[steep] + x[steep + 1]) / 2
         x, y = np.insert(x, steep + 1, new), np.insert(y, steep + 1, exact(new))
     fine = np.linspace(*MAGNITUDES, 241)
-    # Probits are smooth; those of what rounds to 0 or 1 are not known.
+    # Probits are smooth, but infinite for probabilities that round to 0 or 1.
     probits = special.ndtri(np.clip(y, 1e-15, 1 - 1e-15))
     return fine, np.asarray(special.ndtr(PchipInterpolator(x, probits)(fine)))
 

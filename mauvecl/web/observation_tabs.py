@@ -253,7 +253,7 @@ PERIODS = Tab(
 )
 
 
-#: Ends of the axes, erg, the same for all questions; what is shown of `Planned.by_energy`.
+#: Limits of the energy axes, erg, the same for all questions; columns of `Planned.by_energy` in the pictures.
 ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 
 

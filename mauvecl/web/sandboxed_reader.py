@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -100,10 +101,9 @@ def _main() -> int:
     # Memory, time and files are limited permanently.
     limits = {"AS": int(memory_mib) << 20, "CPU": int(seconds), "FSIZE": 64 << 20, "CORE": 0, "NPROC": 0}
     for name, value in limits.items():
-        kind = getattr(resource, f"RLIMIT_{name}")
-        _, hard = resource.getrlimit(kind)
-        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        resource.setrlimit(kind, (value, value))
+        # A lower limit of the server's holds as well.
+        with contextlib.suppress(ValueError):
+            resource.setrlimit(getattr(resource, f"RLIMIT_{name}"), (value, value))
     try:
         content = resolve_name(request["reader"])(Path(request["file"]), **request["options"])
         values = {field.name: getattr(content, field.name) for field in fields(content)}

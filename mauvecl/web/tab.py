@@ -86,7 +86,7 @@ QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
     "completeness": Simulation(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
     "periods": Simulation(("change",), partial(_changed, change={"periods": True})),
 }
-#: What verbs count that use the pool's devices.
+#: Units of the progress of verbs that use the pool's devices.
 DRAWN_UNITS = ("realisations", "steps", "cells")
 
 
@@ -134,7 +134,7 @@ class Tab:
     title: str = ""
     about: str = ""  # what it shows, in a sentence
     pictures: tuple[Chart, ...] = ()
-    simulations: Mapping[str, str] = field(default_factory=dict)  # what can be simulated here, with labels of buttons
+    simulations: Mapping[str, str] = field(default_factory=dict)  # questions that its buttons simulate, with labels
     needs: str = ""  # field without which no simulation of it can start
     answer: str = ""  # name of the simulated answer whose table is below the pictures
     view: int = 0  # number of that table among the answer's `views`
@@ -294,7 +294,7 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
 
 def _text(value: str | float) -> str:
     """Return a value as it is typed, with every digit of a number."""
-    return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
+    return value if isinstance(value, str) else str(value).removesuffix(".0")
 
 
 #: Held while matplotlib draws.

@@ -117,12 +117,12 @@ class Job:
         self._counted = done, total
 
     def cancel(self) -> None:
-        """Cancel between tiles, outside of draws, or before the start."""
+        """Cancel the job: between two tiles if it draws, anywhere if it does not, or before it starts."""
         with self._lock:
             if self._thread is not None and not self._cancelled:
                 _set_pending(ctypes.c_ulong(self._thread), ctypes.py_object(Stopped))
             self._cancelled = True
-        # Work that waits for fits in other threads is not interrupted: fits end between two of their draws.
+        # The exception does not reach fits in other threads, which end between two of their draws.
         if self._pool is not None:
             self._pool.stop()
         self.future.cancel()
@@ -152,7 +152,7 @@ _closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
 MOST_ANSWERS = 12
 #: Number of requests of a visitor that the server works on at the same time.
 MOST_TASKS = 8
-#: Message if the page itself fails.
+#: Message about an error of the page itself.
 OWN_FAULT = "the page failed, and there is no answer; this is a fault of mauvecl: please report what was entered"
 #: Code with which the connection of an unused page is closed.
 UNUSED = 4000
