@@ -22,18 +22,7 @@ from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_folder, check_size, parsing, read_bytes, write_whole
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.pool import PREPARED, Pool
-from mauvecl.runs.store import (
-    CALIBRATION,
-    COMMON_DRAWS,
-    CRC_BYTES,
-    NOMINAL,
-    Chunk,
-    Store,
-    StoredScene,
-    crc,
-    digest,
-    exposure_attributes,
-)
+from mauvecl.runs.store import CALIBRATION, REMARKS, Chunk, Store, StoredScene, digest, exposure_attributes, is_intact
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, missing_package
@@ -235,7 +224,7 @@ def state(store: Store, chunk: Chunk) -> str:
     except InputError:
         # Too large, or no regular file.
         return "damaged"
-    if len(data) != size or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
+    if len(data) != size or not is_intact(data):
         return "damaged"
     listed = store.digests.get(chunk.key)
     if listed is None:
@@ -484,7 +473,7 @@ def _fits(selection: Selection) -> HDUList:
     primary.header["ORIGIN"] = (f"mauvecl {VERSION}", "simulated, not observed")
     primary.header["SEED"] = (str(store.study.run.seed), "of the random numbers")
     primary.header["FIRSTROW"] = (selection.first, "realisation of the first row of each image")
-    for line in (COMMON_DRAWS, NOMINAL):
+    for line in REMARKS.values():
         primary.header["COMMENT"] = f"{line[0].upper()}{line[1:]}."
     primary.header["HISTORY"] = "The table STUDY holds the study that gives these spectra again."
     extensions: list[ImageHDU | BinTableHDU] = []
@@ -548,7 +537,7 @@ def _hdf5(selection: Selection, content: io.BytesIO) -> None:
     store = selection.store
     with h5py.File(content, "w") as file:
         file.attrs.update({"mauvecl": VERSION, "study": store.study.toml(), "seed": str(store.study.run.seed)})
-        file.attrs.update({"first_row": selection.first, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        file.attrs.update({"first_row": selection.first} | REMARKS)
         for scene in selection.scenes:
             group = file.require_group(scene.group)
             if "wavelength_nm" not in group:

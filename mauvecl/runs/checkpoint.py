@@ -40,24 +40,17 @@ from mauvecl.schema.errors import InputError
 @contextlib.contextmanager
 def locked(folder: Path, name: str) -> Iterator[None]:
     """Lock a folder for this process; the operating system releases the lock however the process ends."""
-
-    def unusable(reason: str) -> InputError:
-        return InputError(f"{name} {str(folder)!r} {reason}", key="lock")
-
-    try:
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except OSError as error:
-        raise unusable(f"cannot be opened ({error.strerror}): use a readable folder") from error
-    try:
+    with ExitStack() as stack:
         try:
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            stack.callback(os.close, handle)
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise unusable("is being written by another process: wait until it ends") from error
         except OSError as error:
-            raise unusable(f"cannot be locked ({error.strerror}): use a file system with locks") from error
+            reason = f"cannot be locked ({error.strerror}): use a readable folder of a file system with locks"
+            if isinstance(error, BlockingIOError):
+                reason = "is being written by another process: wait until it ends"
+            raise InputError(f"{name} {str(folder)!r} {reason}", key="lock") from error
         yield
-    finally:
-        os.close(handle)
 
 
 def differing_keys(ours: Any, theirs: Any) -> list[str]:
@@ -116,14 +109,7 @@ class Stopped(Exception):  # noqa: N818
 
 
 class ShardLost(Exception):  # noqa: N818
-    """Raised by workers that could not count a shard, which the pool then submits again.
-
-    If `failed` is true, it counts as a failure of the shard, of which there may be `MAX_FAILURES`.
-    """
-
-    def __init__(self, reason: object, *, failed: bool = True) -> None:
-        super().__init__(str(reason))
-        self.failed = failed
+    """Raised by workers that could not count a shard, which the pool then submits again up to `MAX_FAILURES` times."""
 
 
 #: Packages whose code affects the counts of a shard.

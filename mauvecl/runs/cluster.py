@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -181,15 +181,14 @@ class DaskWorkers:
                 with contextlib.suppress(TimeoutError):
                     answer = submitted.result(timeout=RECOUNT_S)
                 if answer is None and submitted.status != "finished":
-                    raise ShardLost("its worker has left with its counts", failed=False)
+                    raise ShardLost("its worker has left with its counts")
             # Workers with older code answer without theirs.
             if isinstance(answer, tuple) and answer[1] == code_identity():
                 arrays: Arrays = answer[0]
                 return arrays
         error = submitted.exception() if submitted.status == "error" else None
-        if submitted.status in ("finished", "error") and self._find_strangers():
-            raise ShardLost("counted by a worker with other code", failed=False)
-        if isinstance(error, InputError | DeviceError):
+        strangers = submitted.status in ("finished", "error") and self._find_strangers()
+        if isinstance(error, InputError | DeviceError) and not strangers:
             # Another attempt would end as this one.
             raise DeviceError(f"cluster {self._where} failed at {task.shard}: {error}", "failed")
         if submitted.status in ("cancelled", "lost") and self._client.status != "running":
@@ -305,29 +304,24 @@ def dask_setup(worker: Any) -> None:
     os.setpgid(0, 0)
 
 
-_engine: Engine | None = None
 _one_at_a_time = threading.Lock()
-
-
 #: Requests by their bytes; each keeps what it has computed for earlier shards.
 _request: Callable[[bytes], Countable] = lru_cache(maxsize=4)(pickle.loads)
 
 
-def _engine_here(device: str | None, threads: int) -> Engine:
+@cache
+def _engine(device: str | None, threads: int) -> Engine:
     """Return the worker's engine, with PoCL limited to the threads that Dask assigns."""
     from mauvecl.device.engine import Engine
 
-    global _engine
-    if _engine is None:
-        for name in THREADS:
-            os.environ.setdefault(name, str(threads))
-        _engine = Engine(device)
-    return _engine
+    for name in THREADS:
+        os.environ.setdefault(name, str(threads))
+    return Engine(device)
 
 
 def _introduce(device: str | None, dask_worker: Any = None) -> tuple[tuple[str, str], DeviceRecord]:
     with _one_at_a_time:
-        return code_identity(), _engine_here(device, dask_worker.state.nthreads).device
+        return code_identity(), _engine(device, dask_worker.state.nthreads).device
 
 
 def _count(content: bytes, shard: Shard, device: str | None) -> tuple[Arrays, tuple[str, str]]:
@@ -335,5 +329,5 @@ def _count(content: bytes, shard: Shard, device: str | None) -> tuple[Arrays, tu
     from distributed import get_worker
 
     with _one_at_a_time:
-        engine = _engine_here(device, get_worker().state.nthreads)
+        engine = _engine(device, get_worker().state.nthreads)
         return engine.count(_request(content), shard), code_identity()

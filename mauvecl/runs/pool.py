@@ -59,21 +59,19 @@ class LocalWorkers:
 
     def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
         self._make, self._devices = make, list(devices)
-        self._ticks: list[Callable[[int], None]] = [lambda done: None] * len(devices)
         self._stopping = False
-        self._engines: list[Engine] = [self._open_engine(place) for place in range(len(devices))]
+        # The task that a thread counts.
+        self._current = threading.local()
+        self._engines: list[Engine] = [make(device, progress=self._report_progress) for device in devices]
         self._free: SimpleQueue[int] = SimpleQueue()
         for place in range(len(devices)):
             self._free.put(place)
         self._threads = ThreadPoolExecutor(len(devices))
 
-    def _open_engine(self, place: int) -> Engine:
-        def progress(done: int, total: int) -> None:
-            if self._stopping:
-                raise Stopped
-            self._ticks[place](done)
-
-        return self._make(self._devices[place], progress=progress)
+    def _report_progress(self, done: int, total: int) -> None:
+        if self._stopping:
+            raise Stopped
+        self._current.task.tick(done)
 
     @property
     def count(self) -> int:
@@ -96,8 +94,7 @@ class LocalWorkers:
     def _count(self, task: Task) -> Arrays:
         if self._stopping:
             raise Stopped
-        place = self._free.get()
-        self._ticks[place] = task.tick
+        place, self._current.task = self._free.get(), task
         engine = self._engines[place]
         try:
             return engine.count(task.request, task.shard, out=task.out)
@@ -105,7 +102,7 @@ class LocalWorkers:
             if self._stopping:
                 raise
             # A failed launch may have corrupted the context, so the next shard is counted in a new one.
-            self._engines[place] = self._open_engine(place)
+            self._engines[place] = self._make(self._devices[place], progress=self._report_progress)
             raise ShardLost(f"{engine.device_name}: {error}") from error
         finally:
             self._free.put(place)
@@ -272,7 +269,7 @@ class Pool:
                 try:
                     counted = future.result()
                 except ShardLost as lost:
-                    failures[task.name] += lost.failed
+                    failures[task.name] += 1
                     if failures[task.name] >= MAX_FAILURES:
                         fault = f"{task.shard} failed {MAX_FAILURES} times, the last time with: {lost}"
                         raise DeviceError(fault, "failed") from lost

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,11 +44,12 @@ CALIBRATION = {
     "read_noise_dn": "DN",
     "gain_dn_per_electron": "DN / electron",
 }
-COMMON_DRAWS = (
-    "row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
-    "arrays; rows of different number are independent"
-)
-NOMINAL = "the throughput is nominal, not a flight calibration"
+#: Attributes of every store and file.
+REMARKS = {
+    "draws": "row i of every array is drawn with the same random numbers, so that a flare is the only difference "
+    "between two arrays; rows of different number are independent",
+    "throughput": "the throughput is nominal, not a flight calibration",
+}
 
 
 def _describe(root: Any, scene: StoredScene, study: Study) -> None:
@@ -103,6 +104,8 @@ def signed(study: str) -> dict[str, str]:
     return {"study": study, "study_sha256": hashlib.sha256(study.encode()).hexdigest()}
 
 
+#: Error of a store.
+refusal = partial(InputError, key="store")
 #: Approximate size of a chunk, bytes.
 CHUNK_BYTES = 16 * 2**20
 
@@ -225,19 +228,17 @@ class Store:
                 if signed(attributes["study"]).items() <= attributes.items():
                     copies.setdefault(attributes["study"], file.relative_to(path))
         if not copies:
-            raise InputError(
+            raise refusal(
                 f"{str(path)!r} is not a store of spectra: give a folder that `mauvecl realise` wrote, with an intact "
-                "copy of its study",
-                key="store",
+                "copy of its study"
             )
         (text, file), *contradictions = copies.items()
         if contradictions:
             other_text, other_file = contradictions[0]
             keys = ", ".join(differing_keys(toml(text, path.name), toml(other_text, path.name)))
-            raise InputError(
+            raise refusal(
                 f"store {str(path)!r} must hold one study, but {str(file)!r} and {str(other_file)!r} differ in {keys}: "
-                "restore the file of the correct one",
-                key="store",
+                "restore the file of the correct one"
             )
         data = toml(text, path.name)
         store = cls(path, Study.build(read_version(data, path.name), path.name), of_version_1="version" not in data)
@@ -298,19 +299,16 @@ class Store:
             existing = Store.open(self.path).study
             differing = differing_keys(self.study.model_dump(mode="json"), existing.model_dump(mode="json"))
             if differing:
-                raise InputError(
+                raise refusal(
                     f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: "
-                    "use the same study or another place",
-                    key="store",
+                    "use the same study or another place"
                 )
             self.read_digests()
             return
         groups = {scene.group for scene in self.scenes}
         foreign = [p.name for p in self.path.iterdir() if p.name not in groups and not p.name.startswith(UNFINISHED)]
         if foreign:
-            raise InputError(
-                f"{str(self.path)!r} holds {min(foreign)!r} and no store: use an empty or a new folder", key="store"
-            )
+            raise refusal(f"{str(self.path)!r} holds {min(foreign)!r} and no store: use an empty or a new folder")
         # The root comes last, so that its presence means that the description is complete.
         files = self.description()
         for name in sorted(files, key=lambda name: name == root.name):
@@ -322,8 +320,8 @@ class Store:
             self.path.mkdir(parents=True, exist_ok=True)
             disk_bytes = shutil.disk_usage(self.path).total
         except OSError as error:
-            raise InputError(
-                f"store {str(self.path)!r} cannot be made ({error.strerror}): use a writable folder", key="store"
+            raise refusal(
+                f"store {str(self.path)!r} cannot be made ({error.strerror}): use a writable folder"
             ) from error
         if self.n_bytes > disk_bytes:
             raise InputError(
@@ -339,7 +337,7 @@ class Store:
         files: dict[str, Any] = {}
         root = zarr.open_group(zarr.storage.MemoryStore(files), mode="w", zarr_format=3)
         run: dict[str, Any] = signed(self.study.toml()) | {"seed": self.study.run.seed, "realisations": self.rows}
-        root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        root.attrs.update(run | {"mauvecl": VERSION} | REMARKS)
         for scene in self.scenes:
             _describe(root, scene, self.study)
         return {name: content.to_bytes() for name, content in files.items()}
@@ -397,27 +395,25 @@ class Store:
         """Yield every file and link in the folder, and whether it belongs to this store."""
         scenes = {scene.path: scene for scene in self.scenes}
         described = {*self.description(), *(f"{path}/{DIGESTS}" for path in scenes)}
-        for folder, folders, names in os.walk(self.path):
-            links = [name for name in folders if (Path(folder) / name).is_symlink()]
-            for name in sorted([*names, *links]):
-                path = Path(folder).relative_to(self.path) / name
-                key = str(path.with_name(name.removeprefix(UNFINISHED) or name))
-                # Twenty digits suffice for any chunk; int() of a very long name would be slow.
-                match = re.match("(.+)/c/([0-9]{1,20})/", key)
-                belongs = key in described
-                if match is not None and (scene := scenes.get(match[1])) is not None:
-                    number = int(match[2])
-                    belongs |= number in scene.chunk_numbers() and key == scene.chunk(number).key
-                yield str(path), belongs
+        for path in sorted(self.path.rglob("*")):
+            if path.is_dir() and not path.is_symlink():
+                continue
+            key = str(path.relative_to(self.path).with_name(path.name.removeprefix(UNFINISHED) or path.name))
+            # Twenty digits suffice for any chunk; int() of a very long name would be slow.
+            match = re.match("(.+)/c/([0-9]{1,20})/", key)
+            belongs = key in described
+            if match is not None and (scene := scenes.get(match[1])) is not None:
+                number = int(match[2])
+                belongs |= number in scene.chunk_numbers() and key == scene.chunk(number).key
+            yield str(path.relative_to(self.path)), belongs
 
     def clear(self) -> None:
         """Remove all files if no others exist; the study is last, so that an interrupted removal leaves a store."""
         files = list(self.files())
         foreign = [key for key, belongs in files if not belongs]
         if foreign:
-            raise InputError(
-                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {foreign[0]!r}",
-                key="store",
+            raise refusal(
+                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {foreign[0]!r}"
             )
         for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):
             (self.path / key).unlink(missing_ok=True)
@@ -432,6 +428,11 @@ def crc(data: bytes | NDArray[Any]) -> bytes:
     import google_crc32c
 
     return int(google_crc32c.value(data)).to_bytes(CRC_BYTES, "little")
+
+
+def is_intact(data: bytes) -> bool:
+    """Return whether the content of a chunk's file ends with its CRC."""
+    return crc(data[:-CRC_BYTES]) == data[-CRC_BYTES:]
 
 
 def digest(*parts: bytes | memoryview) -> str:
