@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from mauvecl.answers.change import ChangeAnswer
     from mauvecl.answers.plan import PlanAnswer
+    from mauvecl.answers.visible import VisibleAnswer
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.frames import Frames
     from mauvecl.web.closed_forms import ClosedForms, FieldValues
@@ -334,17 +335,13 @@ PLAN = Tab(
 @Chart(
     "hours", "Hours in which targets are seen, day by day", Axis(kind="dates"),
     Axis("hours in the day", limits=(-0.5, 24.5)), (Targets("hours", tips=("hours",)),),
-).data()  # fmt: skip
-def hours(closed: ClosedForms, answers: Answers) -> ChartData:
+).data("visible", "For each target, how many hours of each day it is seen.")  # fmt: skip
+def hours(closed: ClosedForms, answer: VisibleAnswer) -> ChartData:
     """Return the daily hours of visibility."""
-    question = closed.question
-    names = [target["name"] for target in question.targets]
-    if "visible" not in answers:
-        text = "For each target, how many hours of each day it is seen."
-        return ChartData(text, {"hours": [(name, [], []) for name in names]})
-    table = answers["visible"].by_day
+    table = answer.by_day
     lines, clauses = [], []
-    for name in names:
+    for target in closed.question.targets:
+        name = target["name"]
         rows = table[np.asarray(table["target"]) == name]
         hours = np.asarray(rows["hours"].to_value("h"))
         # Milliseconds, as browsers count time.
@@ -353,7 +350,7 @@ def hours(closed: ClosedForms, answers: Answers) -> ChartData:
             f"{name} on {np.count_nonzero(hours)} of {hours.size} days, {short(float(hours.sum()))} h in all and "
             f"{hours.max():.3g} h on its best day"
         )
-    return ChartData(f"From {question.start} on are seen: {'; '.join(clauses)}.", {"hours": lines})
+    return ChartData(f"From {closed.question.start} on are seen: {'; '.join(clauses)}.", {"hours": lines})
 
 
 VISIBILITY = Tab(

@@ -110,7 +110,7 @@ def _main() -> int:
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         words = json.dumps({name: value for name, value in values.items() if name not in arrays})
         out = io.BytesIO()
-        np.savez(out, words=np.array(words), **arrays)
+        np.savez(out, words=np.array(words), **arrays)  # type: ignore[arg-type]
     except InputError as error:
         print(error, file=sys.stderr)
         return _REFUSED
