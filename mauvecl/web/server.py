@@ -18,6 +18,7 @@ import time
 import traceback
 import webbrowser
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -92,17 +93,15 @@ def hosts(address: str, port: int, allowed: Sequence[str]) -> frozenset[str]:
 
 
 class PageApplication(Application):
-    """Application that refuses requests which do not come from pages of the allowed `hosts`."""
-
-    allowed: frozenset[str]
+    """Application that refuses requests which do not come from pages of the `hosts` in its settings."""
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
         """Return the handler of a request, or of a refusal: unknown names (DNS rebinding) and other servers' pages."""
-        origins, is_visitor = request.headers.get_list("Origin"), request.path == "/live"
-        status, message = 403, ""
-        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self.allowed]:
+        origins, allowed = request.headers.get_list("Origin"), self.settings["hosts"]
+        status, message, is_visitor = 403, "", request.path == "/live"
+        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in allowed]:
             message = "The page is not served under this host name; see `mauvecl serve --allow-origin`."
-        elif any(plain(re.sub(r"^https?://", "", origin.lower())) not in self.allowed for origin in origins):
+        elif any(plain(re.sub(r"^https?://", "", origin.lower())) not in allowed for origin in origins):
             message = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
         elif is_visitor and not origins:
             message = "Expected a connection from the page."
@@ -158,6 +157,8 @@ REQUEST_S = 20.0
 MAX_CONNECTIONS = 512
 #: Seconds after which unused pages are disconnected, and interval of this check.
 IDLE_S, SWEEP_S = 3600, 5
+#: Threads, besides the event loop, that compute closed forms, pictures and files for all visitors.
+CLOSED_FORMS = 2
 #: Seconds between pings of a connection, which is closed if it does not reply.
 PING_S = 20
 
@@ -182,8 +183,8 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
         websocket_ping_interval=PING_S,
         default_handler_class=RefusalHandler,
         log_function=lambda handler: None,
+        hosts=hosts(address, port, allowed),
     )
-    application.allowed = hosts(address, port, allowed)
     limits = {"max_body_size": BODY, "max_buffer_size": MESSAGE}
     server = BoundedServer(application, **limits, idle_connection_timeout=REQUEST_S, body_timeout=REQUEST_S)
     server.max_connections, server.streams = MAX_CONNECTIONS, []
@@ -224,6 +225,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     """Serve the page until interrupted; parameters and errors as for `make`."""
 
     async def run() -> None:
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(CLOSED_FORMS, "mauvecl-closed"))
         # Exit normally on SIGTERM, so that the folders of visitors are removed.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         make(address, port, allow_origin)

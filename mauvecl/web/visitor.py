@@ -19,7 +19,7 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
     from mauvecl.web.tab import Tab
 
-T = TypeVar("T")
 #: Number of simulations that the server computes at the same time; others wait.
 TOGETHER = 2
 #: Duration of a simulation, s, above which its memory is released; doing so stops all visitors for a moment.
@@ -146,8 +145,6 @@ class Job:
 log = logging.getLogger(__name__)
 #: Seconds between two reports of a simulation's progress.
 REPORT_S = 0.25
-#: Threads, besides the event loop, that compute closed forms, pictures and files for all visitors.
-_closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
 #: Number of simulated answers that the server keeps per visitor.
 MOST_ANSWERS = 12
 #: Number of requests of a visitor that the server works on at the same time.
@@ -277,11 +274,11 @@ class Visitor(WebSocketHandler):
             self._answering = self._begin(answer_all())
 
     async def _answer(self, message: dict[str, Any], state: State, tab: Tab) -> None:
-        closed = await _in_thread(self.closed, state, tab)
+        closed = await asyncio.to_thread(self.closed, state, tab)
         answers = self.answers(state)
-        self.send(**message, answer=await _in_thread(card, tab, closed, answers))
+        self.send(**message, answer=await asyncio.to_thread(card, tab, closed, answers))
         if self._next is None:
-            self.send(n=message["n"], **await _in_thread(content_of, tab, closed, answers))
+            self.send(n=message["n"], **await asyncio.to_thread(content_of, tab, closed, answers))
 
     def closed(self, state: State, tab: Tab) -> ClosedForms:
         """Return the closed forms of the part of a question that a tab reads; the last ones are cached."""
@@ -321,7 +318,7 @@ class Visitor(WebSocketHandler):
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a function without blocking other visitors."""
-        task = asyncio.get_running_loop().create_task(work)
+        task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
@@ -344,19 +341,19 @@ class Visitor(WebSocketHandler):
     async def _ask_solve(self, request: dict[str, Any]) -> None:
         """Send the limit of the quantity for which the question solves, and the chances with other payloads."""
         n = self._solving = request["n"]
-        closed = await _in_thread(self.closed, self.state(request["link"]), next(iter(TABS.values())))
+        closed = await asyncio.to_thread(self.closed, self.state(request["link"]), next(iter(TABS.values())))
         if n != self._solving:
             # The limit takes long for a bright star, and a later question waits.
             self.send(n=n, solved="")
             return
-        self.send(n=n, payloads=await _in_thread(other_payloads, closed))
-        self.send(n=n, solved=await _in_thread(solved, closed))
+        self.send(n=n, payloads=await asyncio.to_thread(other_payloads, closed))
+        self.send(n=n, solved=await asyncio.to_thread(solved, closed))
 
     async def _ask_pinned(self, request: dict[str, Any]) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""
         tab = tab_of(request)
-        closed = await _in_thread(ClosedForms.of, self.state(request["link"]).question(tab.reads), self._folder)
-        pictures = (await _in_thread(content_of, tab, closed, {}))["pictures"]
+        closed = await asyncio.to_thread(ClosedForms.of, self.state(request["link"]).question(tab.reads), self._folder)
+        pictures = (await asyncio.to_thread(content_of, tab, closed, {}))["pictures"]
         self.send(n=request["n"], pins={p.name: pictures[p.name]["sources"][p.pins] for p in tab.pictures if p.pins})
 
     # Draws and simulations
@@ -387,8 +384,8 @@ class Visitor(WebSocketHandler):
             raise InputError("a simulation is running already, or there is nothing to simulate")
         key = kind, self._key(state, reads_of(kind))
         question, tab = state.question(reads_of(kind)), SIMULATIONS[kind]
-        inputs = await _in_thread(self.inputs, state, tab)
-        closed = await _in_thread(ClosedForms.of, question, self._folder, chance=tab.chance, inputs=inputs)
+        inputs = await asyncio.to_thread(self.inputs, state, tab)
+        closed = await asyncio.to_thread(ClosedForms.of, question, self._folder, chance=tab.chance, inputs=inputs)
         if self.job is not None:
             raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
@@ -469,19 +466,14 @@ class Visitor(WebSocketHandler):
             question = state.question(reads_of(name) if name in SIMULATIONS else tab.reads)
             return study_file(QUESTIONS[name].study(question.case(self._folder).study), "study")
 
-        file, content = await _in_thread(make)
+        file, content = await asyncio.to_thread(make)
         self.send(content, n=request["n"], file=file)
 
     async def _ask_export(self, request: dict[str, Any]) -> None:
         """Send a tab's questions as commands and as Python programs."""
         tab = tab_of(request)
         question = self.state(request["link"]).question(tab.reads)
-        self.send(n=request["n"], taken=await _in_thread(commands_and_programs, tab, question, self._folder))
-
-
-async def _in_thread(work: Callable[..., T], *arguments: Any, **options: Any) -> T:
-    """Run a function in a thread."""
-    return await asyncio.get_running_loop().run_in_executor(_closed_forms, partial(work, *arguments, **options))
+        self.send(n=request["n"], taken=await asyncio.to_thread(commands_and_programs, tab, question, self._folder))
 
 
 def tab_of(request: dict[str, Any]) -> Tab:
