@@ -143,7 +143,7 @@ class InterpolatedForm:
         return np.asarray(self._inverse(-special.ndtri(probability)))
 
 
-#: Answers that are simulated, by name: of one question.
+#: Simulated answers to one question, by name.
 Answers = Mapping[str, Any]
 #: Name of the detection with the other choice of unknowns; the card shows both.
 OTHER = "detection otherwise"

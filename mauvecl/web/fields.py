@@ -40,7 +40,7 @@ REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000
 
 #: Choices of what is unknown: the usual unknowns, and nothing but the noise.
 REALISTIC, IDEAL = UNKNOWN = ("realistic", "ideal")
-#: Values of fields in links of version 1, which name the choice of unknowns in other words, with those of today.
+#: Values of fields in links of version 1, which have other names today, with these names.
 FORMER_VALUES = {
     "unknown": {"nothing": IDEAL, "the usual": REALISTIC},
     "instrument": {"mauve": FORMERLY_MAUVE} | FORMER_NAMES,
@@ -207,12 +207,12 @@ def star_words(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Field(Widget):
-    """Field of the page: a widget of a key, or of keys that `Question` sets."""
+    """Field of the page: a widget of a key, or of keys that `FieldValues` sets."""
 
     first: str  # text of a new page
     unit: str = ""
     read: Callable[[str], Any]  # converts text to the value; raises InputError with what is accepted
-    path: tuple[str, ...] = ()  # key of the study that takes the value; empty if `Question` converts it
+    path: tuple[str, ...] = ()  # key of the study that takes the value; empty if `FieldValues` converts it
     own_keys: tuple[str, ...] = ()  # keys and sections of the study that it sets without a path
     characters: int = MOST_CHARACTERS  # largest number
 
@@ -330,7 +330,7 @@ _KEYS = {
     for key, field in study_keys().items()
     for widget in found(field, Widget)
 }
-#: Fields by name, as in links and in `Question`; the default is a flare at the edge of detection.
+#: Fields by name, as in links and in `FieldValues`; the default is a flare at the edge of detection.
 FIELDS = dict(sorted((_OWN_FIELDS | _KEYS).items(), key=lambda item: item[1].place))
 
 
@@ -371,7 +371,7 @@ PRESETS: dict[str, dict[str, str]] = {
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
 #: A flag of the command line.
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
-#: A key within a message: words of prose hold no underscore.
+#: A key within a message; words of prose contain no underscore.
 _KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
 
 

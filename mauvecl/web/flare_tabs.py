@@ -424,7 +424,7 @@ MEASUREMENT = Tab(
 )
 
 
-#: Half-widths of the flares: as many as there are lines.
+#: Names of the half-widths of injected flares, one per line of the picture.
 LENGTHS = ("shortest", "middle", "longest")
 
 

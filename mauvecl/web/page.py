@@ -54,7 +54,7 @@ TABS: dict[str, Tab] = {
 }
 
 
-#: Questions that a button starts to simulate, with the first tab that has it.
+#: Questions that a button simulates, with the first tab that has the button.
 SIMULATIONS = {name: tab for tab in reversed(TABS.values()) for name in tab.simulations}
 
 

@@ -134,7 +134,7 @@ MOST = 1200
 
 
 class OneLine(logging.Formatter):
-    """Formatter of one bounded line: time, level, logger, message and, for exceptions, their lines in mauvecl."""
+    """Formatter that writes one line of bounded length, with the lines of mauvecl in the traceback of an exception."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""

@@ -65,11 +65,11 @@ def _changed(study: Study, **sections: dict[str, Any]) -> Study:
 
 @dataclass(frozen=True)
 class Simulation:
-    """Verbs that answer a question of the page, and the studies that they are asked."""
+    """Verbs that answer a question of the page, and the study that they receive."""
 
     #: Verbs that answer it. The page keeps the answer of the first under the question's name, others under their own.
     verbs: tuple[str, ...]
-    study: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
+    study: Callable[[Study], Study] = lambda study: study  # converts the study of the page
 
 
 def _fits(study: Study) -> Study:
@@ -202,7 +202,7 @@ class Tab:
 #: Keys that are stated even at their default, so that readers see what was assumed.
 STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
           "run.realisations", "run.seed")  # fmt: skip
-#: Keys without a flag of their own verb that it uses: unknowns are drawn by everything that observes.
+#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
 ALWAYS_USED = ("nuisances.", "observation.temperature_c")
 #: Longest value in a command; a longer one is in the study file.
 MOST_CHARACTERS = 500

@@ -52,7 +52,7 @@ def content_folder(folder: Path, content: bytes, files: Callable[[], Mapping[str
 
 #: Largest numbers of files and observations of an archive, and of bytes to which it unpacks.
 MOST_FILES, MOST_BYTES = 40, 64 * 2**20
-#: Bytes of a TOML file of it, and characters of a file's name, at most.
+#: Largest size of a TOML file in an archive, bytes, and largest number of characters of a file's name.
 MOST_TOML_BYTES, MOST_NAME = 2**18, 100
 #: Compression types that are read to the stated size and no further; others, such as LZMA, unpack to any size.
 BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -268,7 +268,7 @@ UPLOADS: Mapping[str, Upload] = {
 MAPPED = {"time": "Time", "flux": "Flux", "error": "Error", "quality": "Quality", "temperature": "Temperature"}
 #: Units and dates of times, chosen from a menu next to them.
 TIME_UNITS = ("s", "min", "h", "d", "jd", "mjd", "bjd", "btjd", "bkjd")
-#: Assets that visitors may try in place of a file of their own, by field, with what they are.
+#: Example files that visitors may try in place of their own, by field, with descriptions.
 EXAMPLES: Mapping[str, tuple[str, str]] = {
     "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)")
 }
@@ -286,9 +286,9 @@ def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bi
 
 #: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.
 MOST_RESULTS, MOST_UPLOADS = 256 * 2**20, 256 * 2**20
-#: Objects that are counted of a value; arrays, which take most of the memory, are near its top.
+#: Largest number of objects of a value that are counted; arrays, which take most of the memory, come early.
 MOST_OBJECTS = 20_000
-#: Objects that belong to the program.
+#: Types of objects that belong to the program and not to a value.
 PROGRAM = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from mauvecl.answers.verbs import VERBS
@@ -163,12 +164,26 @@ REFUSED: dict[str, dict[str, Any]] = {
 DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
 
 
-class Visitor(WebSocketHandler):
-    """WebSocket connection of a page.
+class Request(BaseModel):
+    """Message of a page, whose entries depend on what it asks; answers have the same number ``n``."""
 
-    Messages are JSON: ``ask`` names the request, ``n`` is its number, and ``link`` contains the fields. Answers have
-    the same ``n``; of several pending questions, only the last is answered.
-    """
+    ask: str
+    n: int = 0
+    link: str = ""  # with the fields
+    tab: str = ""
+    kind: str = ""  # of a simulation
+    field: str = ""  # of an upload
+    name: str = ""  # of a file
+    ending: str = ""
+
+    @property
+    def front(self) -> Tab:
+        """The named tab, or the first one."""
+        return TABS.get(self.tab, next(iter(TABS.values())))
+
+
+class Visitor(WebSocketHandler):
+    """WebSocket connection of a page; of several pending questions, only the last is answered."""
 
     #: All visitors with an open connection.
     connected: set[Visitor] = set()  # noqa: RUF012
@@ -180,11 +195,11 @@ class Visitor(WebSocketHandler):
         self.used = time.monotonic()
         self.job: Job | None = None
         self._drawing: Job | None = None
-        self._next: dict[str, Any] | None = None
+        self._next: Request | None = None
         self._answering: asyncio.Task[None] | None = None
         self._solving = 0
         self._tasks: set[asyncio.Task[None]] = set()
-        self._announced: dict[str, Any] | None = None
+        self._announced: Request | None = None
         self._digests: dict[str, str] = {}
         self._home = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
         self._folder = Path(self._home.name)
@@ -231,18 +246,15 @@ class Visitor(WebSocketHandler):
             self._read_upload(self._announced, message)
             return
         try:
-            # A message need not hold both.
-            request = {"n": 0, "link": ""} | json.loads(message)
-            answer = getattr(self, f"_ask_{request['ask']}")
-            if not (isinstance(request["n"], int) and isinstance(request["link"], str)):
-                raise TypeError
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            request = Request.model_validate_json(message)
+            answer = getattr(self, f"_ask_{request.ask}")
+        except (ValidationError, AttributeError):
             log.warning("a message is not a valid request: %s", shortened(str(message)))
             self.close(1003, "a message must be a question as the page asks it")
             return
         if (work := answer(request)) is None:
             return
-        reply = {"n": request["n"]} | REFUSED.get(request["ask"], {})
+        reply = {"n": request.n} | REFUSED.get(request.ask, {})
         if len(self._tasks) < MOST_TASKS:
             self._begin(self._report_errors(work, **reply))
         else:
@@ -255,15 +267,15 @@ class Visitor(WebSocketHandler):
         """Enter the values of a link."""
         return State(link, UPLOAD_SHELF.of(self, "upload"))
 
-    def _ask_answer(self, request: dict[str, Any]) -> None:
+    def _ask_answer(self, request: Request) -> None:
         """Send the answer and a tab's pictures; a later question replaces a waiting one."""
 
         async def answer_all() -> None:
             while self._next is not None and self.ws_connection is not None:
                 request, self._next = self._next, None
-                state, tab = self.state(request["link"]), tab_of(request)
+                state, tab = self.state(request.link), request.front
                 faults = state.faults_of(tab.reads)
-                message = {"n": request["n"], "stray": state.stray, "faults": faults, "known": known_values(state)}
+                message = {"n": request.n, "stray": state.stray, "faults": faults, "known": known_values(state)}
                 if faults:
                     self.send(**message)
                 else:
@@ -338,10 +350,10 @@ class Visitor(WebSocketHandler):
             log.exception("no answer")
             self.send(**message, refused=OWN_FAULT)
 
-    async def _ask_solve(self, request: dict[str, Any]) -> None:
+    async def _ask_solve(self, request: Request) -> None:
         """Send the limit of the quantity for which the question solves, and the chances with other payloads."""
-        n = self._solving = request["n"]
-        closed = await asyncio.to_thread(self.closed, self.state(request["link"]), next(iter(TABS.values())))
+        n = self._solving = request.n
+        closed = await asyncio.to_thread(self.closed, self.state(request.link), next(iter(TABS.values())))
         if n != self._solving:
             # The limit takes long for a bright star, and a later question waits.
             self.send(n=n, solved="")
@@ -349,18 +361,18 @@ class Visitor(WebSocketHandler):
         self.send(n=n, payloads=await asyncio.to_thread(other_payloads, closed))
         self.send(n=n, solved=await asyncio.to_thread(solved, closed))
 
-    async def _ask_pinned(self, request: dict[str, Any]) -> None:
+    async def _ask_pinned(self, request: Request) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""
-        tab = tab_of(request)
-        closed = await asyncio.to_thread(ClosedForms.of, self.state(request["link"]).question(tab.reads), self._folder)
+        tab = request.front
+        closed = await asyncio.to_thread(ClosedForms.of, self.state(request.link).question(tab.reads), self._folder)
         pictures = (await asyncio.to_thread(content_of, tab, closed, {}))["pictures"]
-        self.send(n=request["n"], pins={p.name: pictures[p.name]["sources"][p.pins] for p in tab.pictures if p.pins})
+        self.send(n=request.n, pins={p.name: pictures[p.name]["sources"][p.pins] for p in tab.pictures if p.pins})
 
     # Draws and simulations
 
-    async def _ask_draw(self, request: dict[str, Any]) -> None:
+    async def _ask_draw(self, request: Request) -> None:
         """Draw one exposure with the flare, in place of one that is being drawn."""
-        state, tab = self.state(request["link"]), tab_of(request)
+        state, tab = self.state(request.link), request.front
         key = self._key(state, tab.reads), tab.chance
         closed: ClosedForms | None = RESULTS.get(self, "closed", key)
         if closed is None:
@@ -375,11 +387,11 @@ class Visitor(WebSocketHandler):
             # Another draw took its place, or a simulation will report the error.
             return
         if RESULTS.get(self, "closed", key) is closed:
-            self.send(n=request["n"], **content_of(tab, closed, self.answers(state) | {"draw": spectrum}))
+            self.send(n=request.n, **content_of(tab, closed, self.answers(state) | {"draw": spectrum}))
 
-    async def _ask_simulate(self, request: dict[str, Any]) -> None:
+    async def _ask_simulate(self, request: Request) -> None:
         """Simulate, report progress, and send the answer."""
-        n, kind, state = request["n"], request.get("kind"), self.state(request["link"])
+        n, kind, state = request.n, request.kind, self.state(request.link)
         if self.job is not None or kind not in SIMULATIONS or state.faults_of(reads_of(kind)):
             raise InputError("a simulation is running already, or there is nothing to simulate")
         key = kind, self._key(state, reads_of(kind))
@@ -406,27 +418,27 @@ class Visitor(WebSocketHandler):
         finally:
             self.job = None
 
-    def _ask_cancel(self, request: dict[str, Any]) -> None:
+    def _ask_cancel(self, request: Request) -> None:
         if self.job is not None:
             self.job.cancel()
 
     # Files from and to the visitor
 
-    def _ask_upload(self, request: dict[str, Any]) -> None:
+    def _ask_upload(self, request: Request) -> None:
         """Expect a file in the next message."""
-        if request.get("field") in UPLOADS:
+        if request.field in UPLOADS:
             self._announced = request
 
-    def _read_upload(self, request: dict[str, Any], content: bytes) -> None:
+    def _read_upload(self, request: Request, content: bytes) -> None:
         """Read an uploaded file in a thread; its field is empty until then."""
-        field, name, state = request["field"], str(request.get("name")), self.state(request["link"])
+        field, name, state = request.field, request.name, self.state(request.link)
         self._announced, upload = None, UPLOADS[field]
         UPLOAD_SHELF.drop(self, "upload", field)
         options = tuple(state.entered[name] for name in upload.fields)
         self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
 
         async def read() -> None:
-            reply: dict[str, Any] = {"n": request["n"], "field": field}
+            reply: dict[str, Any] = {"n": request.n, "field": field}
             try:
                 work = READER.submit(lambda: upload.read(name, content, state.question(upload.fields).values))
                 UPLOAD_SHELF.keep(self, "upload", field, await asyncio.wrap_future(work), len(UPLOADS))
@@ -442,22 +454,21 @@ class Visitor(WebSocketHandler):
 
         self._begin(read())
 
-    async def _ask_columns(self, request: dict[str, Any]) -> None:
+    async def _ask_columns(self, request: Request) -> None:
         """Send the names of the columns of the visitor's frames; none if they are no table."""
         file, names = UPLOAD_SHELF.get(self, "upload", "frames"), tuple[str, ...]()
         if file is not None:
             work = READER.submit(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content})
             names = (await asyncio.wrap_future(work)).names
-        self.send(n=request["n"], columns=names)
+        self.send(n=request.n, columns=names)
 
-    async def _ask_file(self, request: dict[str, Any]) -> None:
+    async def _ask_file(self, request: Request) -> None:
         """Send a table, document or study."""
-        tab_name, name, ending = (str(request.get(key)) for key in ("tab", "name", "ending"))
-        state = self.state(request["link"])
+        name, state = request.name, self.state(request.link)
 
         def make() -> tuple[str, bytes]:
-            if (tab := TABS.get(tab_name)) is not None:
-                return as_file(tab, name, ending, self.closed(state, tab), self.answers(state))
+            if (tab := TABS.get(request.tab)) is not None:
+                return as_file(tab, name, request.ending, self.closed(state, tab), self.answers(state))
             # The page asks for the study of a question by its name alone.
             tab = next((tab for tab in TABS.values() if name in tab.questions), None)
             if tab is None:
@@ -467,18 +478,13 @@ class Visitor(WebSocketHandler):
             return study_file(QUESTIONS[name].study(question.case(self._folder).study), "study")
 
         file, content = await asyncio.to_thread(make)
-        self.send(content, n=request["n"], file=file)
+        self.send(content, n=request.n, file=file)
 
-    async def _ask_export(self, request: dict[str, Any]) -> None:
+    async def _ask_export(self, request: Request) -> None:
         """Send a tab's questions as commands and as Python programs."""
-        tab = tab_of(request)
-        question = self.state(request["link"]).question(tab.reads)
-        self.send(n=request["n"], taken=await asyncio.to_thread(commands_and_programs, tab, question, self._folder))
-
-
-def tab_of(request: dict[str, Any]) -> Tab:
-    """Return the tab of a request, or the first one."""
-    return TABS.get(str(request.get("tab")), next(iter(TABS.values())))
+        question = self.state(request.link).question(request.front.reads)
+        taken = await asyncio.to_thread(commands_and_programs, request.front, question, self._folder)
+        self.send(n=request.n, taken=taken)
 
 
 def content_of(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
