@@ -91,8 +91,6 @@ class FieldValues:
         number, tails = values["realisations"]
         statistics = list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]]))
         data["run"] |= {"realisations": number, "tails": tails, "statistics": statistics}
-        if values["targets"]:
-            data.setdefault("plan", {})["targets"] = list(values["targets"])
         return data
 
     def _value(self, name: str, folder: Path) -> Any:
@@ -106,7 +104,7 @@ class FieldValues:
             **{key: values["sky"] == text for key, (parent, text) in ASKED_UNDER.items() if parent == "sky"},
             "second_area": values["second_temperature_k"] is not None,
             **dict.fromkeys(("pointing_duration", "pointing_depth"), values["pointing_rate"] is not None),
-            "hours": bool(values["targets"]),
+            **dict.fromkeys(("hours", "targets"), bool(values["targets"])),
         }
         value = uploads.get(name) if page_field.kind in ("file", "upload") else values[name]
         if value is None or not conditions.get(name, True):

@@ -316,7 +316,7 @@ _OWN_FIELDS = {
         hint="Stars by name, such as eps Eri or AU Mic, or coordinates such as 53.23 -9.46. What is known of a star "
         "need not be entered; paste a list of names, or a CSV table with columns such as name, ra, dec, V, "
         "spectral_type, distance_pc, mass_msun and age_myr.", group="Campaign", characters=MOST_TARGETS * 100,
-        kind="targets", own_keys=("plan.targets",),
+        kind="targets", path=("plan", "targets"),
     ),
     "realisations": Field(
         label="Realisations", first="100000",
@@ -381,7 +381,7 @@ def _fields() -> dict[str, str]:
     names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
     flags = {flag: names[key] for key, _, option in keys_of() if key in names for flag in option.names}
     names |= {FIELDS[name].path[-1]: name for name in names.values()}
-    return names | {name: name for name in FIELDS} | flags | {"tails": "realisations", "plan.targets": "targets"}
+    return names | {name: name for name in FIELDS} | flags | {"tails": "realisations"}
 
 
 def field_of(key: str | None) -> str | None:
