@@ -275,7 +275,8 @@ class Visitor(WebSocketHandler):
                 request, self._next = self._next, None
                 state, tab = self.state(request.link), request.front
                 faults = state.faults_of(tab.reads)
-                message = {"n": request.n, "stray": state.stray, "faults": faults, "known": known_values(state)}
+                known = known_values(state)
+                message: dict[str, Any] = {"n": request.n, "stray": state.stray, "faults": faults, "known": known}
                 if faults:
                     self.send(**message)
                 else:
