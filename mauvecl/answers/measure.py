@@ -27,7 +27,7 @@ from mauvecl.host.arrays import Arrays, Float, true_runs
 from mauvecl.host.stars import flare as spectra
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.noise.scene import drawn_factors
-from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.checkpoint import checkpointed
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, interval_columns, number, percent, table_of
 from mauvecl.schema.errors import InputError, Message
@@ -543,7 +543,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         count = min(BATCH, study.measure.fits - start)
         # The number changes with the arrays that a fit keeps.
         depends_on = ("measure", 2, quiet, flare, unknown, models, study.text(), start, count)
-        batches.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
+        batches.append(checkpointed(checkpoint, depends_on, partial(fitted, start, count)))
     selected = np.concatenate([arrays["detected"] for arrays in batches])
     measured = []
     for k, forecast in enumerate(expected):
@@ -585,7 +585,7 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
     depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
-    raw = kept(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
+    raw = checkpointed(checkpoint, depends_on, lambda: {"frames": staring.raw(draw)})["frames"]
     joint = _joint_fit(case, raw, unknown) if question.joint_fit else None
     bins, perfect, unmeasured, skipped = None, None, "", question.skipped_nm
     if (snr := question.snr_per_bin) is not None:

@@ -24,7 +24,7 @@ from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE, Particles, Thermal
 from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.noise.unknowns import COURSES
-from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.checkpoint import checkpointed
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, interval_columns, number, percent
 from mauvecl.schema.errors import InputError, Message, of_kind, printable, together
@@ -289,7 +289,7 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
         }
 
     depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
-    arrays = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
+    arrays = checkpointed(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
     method = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
         f"{observation.window_s / 60:.0f} min, found above {float(arrays['threshold']):.2f} sigma, "

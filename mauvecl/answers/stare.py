@@ -29,7 +29,7 @@ from mauvecl.host import VERSION
 from mauvecl.host.arrays import Arrays, Float
 from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.tables.units import offline
-from mauvecl.runs.checkpoint import Checkpoint, kept
+from mauvecl.runs.checkpoint import Checkpoint, checkpointed
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.schema.fields import DAY_S
@@ -427,7 +427,7 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     def draw(components: Any) -> Any:
         arguments = components, staring.stare, 1, seed, staring.flare
         request = StaresRequest(*arguments, start=q.number, method="pixels", processes=processes)
-        return kept(checkpoint, ("frames", request), lambda: stares.reduced(request))["values"][0]
+        return checkpointed(checkpoint, ("frames", request), lambda: stares.reduced(request))["values"][0]
 
     light = draw_light_curves(staring, q.bands_nm, draw)
     searched = _search(case, draw, checkpoint) if q.search else {}
@@ -452,7 +452,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
             tail = false_alarms.sampled_rate(survey, study.run.seed)
             return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
 
-        tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
+        tail = checkpointed(checkpoint, ("threshold", survey, study.text()), computed)
     except InputError as error:
         return {"unsearched": Message(f"{case.label} is not searched: {error}.", "not searched")}
     threshold = float(tail["threshold"])

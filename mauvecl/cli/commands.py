@@ -361,7 +361,12 @@ class Command:
             session = Session(
                 self.verb.name, study, flag_values, resources, draws=self.draws, notes=messages, **options
             )
-            self.run(session, **values)
+            try:
+                self.run(session, **values)
+            except InputError:
+                # No answer shows them.
+                session.say(session.notes)
+                raise
             session.report_lost()
 
     def _options(self) -> dict[str, tuple[Any, Any]]:

@@ -22,18 +22,7 @@ from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_folder, check_size, parsing, read_bytes, write_whole
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.pool import PREPARED, Pool
-from mauvecl.runs.store import (
-    CALIBRATION,
-    COMMON_DRAWS,
-    CRC_BYTES,
-    NOMINAL,
-    Chunk,
-    Store,
-    StoredScene,
-    crc,
-    digest,
-    exposure_attributes,
-)
+from mauvecl.runs.store import CALIBRATION, REMARKS, Chunk, Store, StoredScene, digest, exposure_attributes, is_intact
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, missing_package
@@ -67,13 +56,13 @@ def draw(
     Without single frames the shape is (count, n_pixel), else (count, n_frame, n_pixel), of uint16 or int32. The study
     gives seed, mode, recipe and processes.
     """
-    how = Case(study).draw_options | {"start": start, "count": count, "seed": study.run.seed}
+    options = Case(study).draw_options | {"start": start, "count": count, "seed": study.run.seed}
     if scene.frames is None:
-        return engine.realise(scene.expectation, out=out, **how)
+        return engine.realise(scene.expectation, out=out, **options)
     rows = np.empty((count, *scene.row), scene.dtype) if out is None else out
     single = replace(scene.expectation, n_frames=1)
     for place, frame in enumerate(scene.frames):
-        rows[:, place] = engine.realise(single, first_frame=frame, **how)
+        rows[:, place] = engine.realise(single, first_frame=frame, **options)
     return rows
 
 
@@ -153,10 +142,10 @@ def _completed(
     with locked(store.path, "store"):
         if restart and any(store.path.iterdir()):
             Store.open(store.path).clear()
-        begun = (store.path / "zarr.json").exists()
+        existed = (store.path / "zarr.json").exists()
         store.make()
         todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
-        if begun and not resume and todo:
+        if existed and not resume and todo:
             raise InputError(
                 f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks: use "
                 "`resume=True` to draw the others, or another place",
@@ -227,15 +216,15 @@ FAULT_COLUMNS = (
 @validated
 def state(store: Store, chunk: Chunk) -> str:
     """Return ``good``, or the fault of a chunk's file; see `Fault`."""
-    place, size = store.path / chunk.key, chunk.n_bytes
-    if not place.exists():
+    file, size = store.path / chunk.key, chunk.n_bytes
+    if not file.exists():
         return "missing"
     try:
-        data = read_bytes(place, "chunk") if check_size(place, "chunk") == size else b""
+        data = read_bytes(file, "chunk") if check_size(file, "chunk") == size else b""
     except InputError:
         # Too large, or no regular file.
         return "damaged"
-    if len(data) != size or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
+    if len(data) != size or not is_intact(data):
         return "damaged"
     listed = store.digests.get(chunk.key)
     if listed is None:
@@ -297,16 +286,16 @@ def verify(
                 progress(number, total)
         if repair:
             store.sort_digests()
-        faults += [Fault(key, "not of this store", False) for key, own in store.files() if not own]
+        faults += [Fault(key, "not of this store", False) for key, belongs in store.files() if not belongs]
     return faults
 
 
 def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: bool, redraw: bool) -> Fault | None:
-    seen = state(store, chunk)
-    if seen == "good" and not redraw:
+    fault = state(store, chunk)
+    if fault == "good" and not redraw:
         return None
-    if seen != "good" and not repair:
-        return Fault(chunk.key, seen, False)
+    if fault != "good" and not repair:
+        return Fault(chunk.key, fault, False)
     assert engine is not None
     rows = draw(store.study, chunk.scene, engine, chunk.start, chunk.stop - chunk.start)
     drawn = digest(*store.encode(chunk, rows))
@@ -316,13 +305,13 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
             f"with {drawn}: its study or its list is wrong; use `redraw=True` with `repair=True` to trust the study",
             key="redraw",
         )
-    if seen == "good":
+    if fault == "good":
         if drawn == store.digests[chunk.key]:
             return None
-        seen = "differs"
+        fault = "differs"
     if repair:
         store.write(chunk, rows)
-    return Fault(chunk.key, seen, repair)
+    return Fault(chunk.key, fault, repair)
 
 
 #: Attributes of a star that stores of earlier versions do not have.
@@ -333,27 +322,28 @@ OTHERWISE_IN_VERSION_1 = ("study", "study_sha256", "instrument", "provenance")
 
 def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
     """Compare groups, descriptions of arrays and calibration with those of the study."""
-    left_out = ("mauvecl", *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
+    ignored = ("mauvecl", *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
 
-    def without(described: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-        attributes = described.get("attributes", {})
-        return described | {"attributes": {key: value for key, value in attributes.items() if key not in names}}
+    def without(description: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+        attributes = description.get("attributes", {})
+        return description | {"attributes": {key: value for key, value in attributes.items() if key not in names}}
 
     for name, content in sorted(store.description().items()):
-        there = store.path / name
+        file = store.path / name
+        fault = "damaged" if file.exists() else "missing"
         try:
-            data = read_bytes(there, "description")
+            data = read_bytes(file, "description")
             if name.endswith("zarr.json"):
-                existing, made = (without(json.loads(text), left_out) for text in (data, content))
-                same, seen = existing in (made, without(made, LATER_ATTRIBUTES)), "foreign"
-            else:
-                same, seen = data == content, "damaged"
+                existing, expected = (without(json.loads(text), ignored) for text in (data, content))
+                fault = "good" if existing in (expected, without(expected, LATER_ATTRIBUTES)) else "foreign"
+            elif data == content:
+                fault = "good"
         except (ValueError, TypeError, AttributeError, RecursionError):
-            same, seen = False, "damaged" if there.exists() else "missing"
-        if not same:
+            pass
+        if fault != "good":
             if repair:
-                write_whole(there, content)
-            yield Fault(name, seen, repair)
+                write_whole(file, content)
+            yield Fault(name, fault, repair)
 
 
 @validated
@@ -370,10 +360,10 @@ def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
     import xarray
 
     store = Store.open(path)
-    there = store.scene(scene)
-    group = xarray.open_zarr(store.path, group=there.group, chunks=None, consolidated=False)
-    data = group[there.name].assign_coords(wavelength=group["wavelength_nm"])
-    return data if there.frames is None else data.assign_coords(frame=group["frame"])
+    stored = store.scene(scene)
+    group = xarray.open_zarr(store.path, group=stored.group, chunks=None, consolidated=False)
+    data = group[stored.name].assign_coords(wavelength=group["wavelength_nm"])
+    return data if stored.frames is None else data.assign_coords(frame=group["frame"])
 
 
 #: Largest size of the spectra in a file, bytes; larger sets belong in a store.
@@ -428,10 +418,10 @@ class Selection:
         """Read the spectra of an array."""
         import zarr
 
-        place = self.store.path / scene.path
-        check_folder(place, "file")
+        folder = self.store.path / scene.path
+        check_folder(folder, "file")
         with parsing(f"array {scene.path} of store {str(self.store.path)!r}", "use `mauvecl verify` to check it"):
-            rows = np.asarray(zarr.open_array(place, mode="r")[self.first : self.stop])
+            rows = np.asarray(zarr.open_array(folder, mode="r")[self.first : self.stop])
         if rows.shape != (self.stop - self.first, *scene.row) or rows.dtype != scene.dtype:
             raise InputError(
                 f"array {scene.path} has the shape {rows.shape} and the type {rows.dtype}, but its study needs "
@@ -463,15 +453,15 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
     if path.suffix not in ENDINGS:
         raise InputError.of("file", path.name, f"a name ending in {', '.join(ENDINGS)}")
     if path.exists() and not (replace and path.is_file()):
-        others = "another name, or `replace=True`" if path.is_file() else "the name of a file"
-        raise InputError(f"export {str(path)!r} exists already: use {others}", key="file")
+        remedy = "another name, or `replace=True`" if path.is_file() else "the name of a file"
+        raise InputError(f"export {str(path)!r} exists already: use {remedy}", key="file")
     # Written to memory first, because the HDF5 library aborts the process on a full disk.
-    packed = io.BytesIO()
+    content = io.BytesIO()
     if path.suffix == ".fits":
-        _fits(selection).writeto(packed, checksum=True)
+        _fits(selection).writeto(content, checksum=True)
     else:
-        _hdf5(selection, packed)
-    write_whole(path, packed.getbuffer(), shared=True)
+        _hdf5(selection, content)
+    write_whole(path, content.getbuffer(), shared=True)
     return path
 
 
@@ -483,13 +473,13 @@ def _fits(selection: Selection) -> HDUList:
     primary.header["ORIGIN"] = (f"mauvecl {VERSION}", "simulated, not observed")
     primary.header["SEED"] = (str(store.study.run.seed), "of the random numbers")
     primary.header["FIRSTROW"] = (selection.first, "realisation of the first row of each image")
-    for line in (COMMON_DRAWS, NOMINAL):
+    for line in REMARKS.values():
         primary.header["COMMENT"] = f"{line[0].upper()}{line[1:]}."
     primary.header["HISTORY"] = "The table STUDY holds the study that gives these spectra again."
-    parts: list[ImageHDU | BinTableHDU] = []
+    extensions: list[ImageHDU | BinTableHDU] = []
     for group in dict.fromkeys(scene.group for scene in selection.scenes):
-        here = [scene for scene in selection.scenes if scene.group == group]
-        x, n = here[0].expectation, here[0].expectation.wavelength_nm.size
+        scenes = [scene for scene in selection.scenes if scene.group == group]
+        x, n = scenes[0].expectation, scenes[0].expectation.wavelength_nm.size
         # The -TAB axis requires all wavelengths in one cell, of shape (1, n_pixel): one row, whose columns are vectors.
         columns = [fits.Column("COORDS", f"{n}D", unit="nm", dim=f"(1,{n})", array=x.wavelength_nm.reshape(1, n, 1))]
         for key, unit in CALIBRATION.items():
@@ -497,12 +487,12 @@ def _fits(selection: Selection) -> HDUList:
             columns.append(fits.Column(key.upper(), f"{n}D", unit=unit, array=getattr(x, key).reshape(1, n)))
         name = f"{group}-calibration".upper().replace("-", "_")
         table = fits.BinTableHDU.from_columns(columns, name=name)
-        parts += [*(_image(selection, scene, table.name) for scene in here), table]
+        extensions += [*(_image(selection, scene, table.name) for scene in scenes), table]
     # Its lines may exceed the 72 characters of a card. FITS is restricted to ASCII; TOML strings accept escapes.
     text = re.sub(r"[^\x00-\x7f]", lambda letter: f"\\U{ord(letter[0]):08X}", store.study.toml())
     lines = text.splitlines()
     column = fits.Column("LINE", f"{max(map(len, lines))}A", array=lines)
-    return fits.HDUList([primary, *parts, fits.BinTableHDU.from_columns([column], name="STUDY")])
+    return fits.HDUList([primary, *extensions, fits.BinTableHDU.from_columns([column], name="STUDY")])
 
 
 def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
@@ -538,16 +528,16 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     return hdu
 
 
-def _hdf5(selection: Selection, place: io.BytesIO) -> None:
+def _hdf5(selection: Selection, content: io.BytesIO) -> None:
     try:
         import h5py
     except ImportError as error:
         raise missing_package("h5py", "an HDF5 file", "bulk") from error
 
     store = selection.store
-    with h5py.File(place, "w") as file:
+    with h5py.File(content, "w") as file:
         file.attrs.update({"mauvecl": VERSION, "study": store.study.toml(), "seed": str(store.study.run.seed)})
-        file.attrs.update({"first_row": selection.first, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        file.attrs.update({"first_row": selection.first} | REMARKS)
         for scene in selection.scenes:
             group = file.require_group(scene.group)
             if "wavelength_nm" not in group:

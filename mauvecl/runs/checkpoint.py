@@ -38,33 +38,27 @@ from mauvecl.schema.errors import InputError
 
 
 @contextlib.contextmanager
-def locked(folder: Path, what: str) -> Iterator[None]:
+def locked(folder: Path, name: str) -> Iterator[None]:
     """Lock a folder for this process; the operating system releases the lock however the process ends."""
-
-    def unusable(why: str) -> InputError:
-        return InputError(f"{what} {str(folder)!r} {why}", key="lock")
-
-    try:
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except OSError as error:
-        raise unusable(f"cannot be opened ({error.strerror}): use a readable folder") from error
-    try:
+    with ExitStack() as stack:
         try:
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            stack.callback(os.close, handle)
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise unusable("is being written by another process: wait until it ends") from error
         except OSError as error:
-            raise unusable(f"cannot be locked ({error.strerror}): use a file system with locks") from error
+            reason = f"cannot be locked ({error.strerror}): use a readable folder of a file system with locks"
+            if isinstance(error, BlockingIOError):
+                reason = "is being written by another process: wait until it ends"
+            raise InputError(f"{name} {str(folder)!r} {reason}", key="lock") from error
         yield
-    finally:
-        os.close(handle)
 
 
 def differing_keys(ours: Any, theirs: Any) -> list[str]:
     """Return the dotted keys at which two nested structures differ."""
-    mine, other = dict(_flat(ours)), dict(_flat(theirs))
+    our_values, their_values = dict(_flat(ours)), dict(_flat(theirs))
     missing = object()
-    return sorted(key for key in mine.keys() | other.keys() if mine.get(key, missing) != other.get(key, missing))
+    keys = our_values.keys() | their_values.keys()
+    return sorted(key for key in keys if our_values.get(key, missing) != their_values.get(key, missing))
 
 
 def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -87,8 +81,8 @@ MAX_SHARDS = 2**13
 
 def shards(request: Countable) -> list[Shard]:
     """Divide a request into shards at multiples of a power of two, independently of the workers."""
-    wanted = max(SHARD_WORK // request.work, request.realisations // MAX_SHARDS)
-    size = 1 << (max(wanted, request.least).bit_length() - 1)
+    count = max(SHARD_WORK // request.work, request.realisations // MAX_SHARDS, request.least)
+    size = 1 << (count.bit_length() - 1)
     first, end = request.start, request.start + request.realisations
     cuts = [first, *range(first - first % size + size, end, size), end]
     return [Shard(part, a, b - a) for part in range(request.parts) for a, b in itertools.pairwise(cuts)]
@@ -115,14 +109,7 @@ class Stopped(Exception):  # noqa: N818
 
 
 class ShardLost(Exception):  # noqa: N818
-    """Raised by workers that could not count a shard, which the pool then submits again.
-
-    If `failed` is true it counts as a failure of the shard, of which there may be `MAX_FAILURES`.
-    """
-
-    def __init__(self, reason: object, *, failed: bool = True) -> None:
-        super().__init__(str(reason))
-        self.failed = failed
+    """Raised by workers that could not count a shard, which the pool then submits again up to `MAX_FAILURES` times."""
 
 
 #: Packages whose code affects the counts of a shard.
@@ -150,13 +137,13 @@ def fingerprint(request: object) -> str:
     The number of realisations is excluded, since runs of different length share shards.
     """
     if not isinstance(request, tuple):
-        kind, values = _parts(request)
+        kind, values = _json_content(request)
         request = kind, {name: value for name, value in values.items() if name not in _OF_RUN}
-    text = json.dumps(request, default=_parts, sort_keys=True)
+    text = json.dumps(request, default=_json_content, sort_keys=True)
     return hashlib.sha256(f"form {FORM} {text}".encode()).hexdigest()[:32]
 
 
-def _parts(value: Any) -> Any:
+def _json_content(value: Any) -> Any:
     """Return what JSON can hold of an object: its class and fields, the digest of an array, or its text."""
     if isinstance(value, np.ndarray):
         digest = hashlib.sha256(np.ascontiguousarray(value).tobytes())
@@ -164,7 +151,7 @@ def _parts(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, BaseModel) or is_dataclass(value):
-        names = [*type(value).model_fields] if isinstance(value, BaseModel) else [each.name for each in fields(value)]
+        names = [*type(value).model_fields] if isinstance(value, BaseModel) else [field.name for field in fields(value)]
         return type(value).__name__, {name: getattr(value, name) for name in names if name not in _DESCRIPTIVE}
     return repr(value)
 
@@ -196,18 +183,18 @@ class Checkpoint:
         held: bool = False,
     ) -> None:
         self.parent, self.folder, self.verb, self.study = folder, folder / FOLDER, verb, study
-        self._resume, self._restart, self._patience_s, self._is_held = resume, restart, patience_s, held
+        self._resume, self._restart, self._patience_s, self._is_locked = resume, restart, patience_s, held
         self.damaged = 0  # number of unusable files
         self.messages: list[str] = []  # remarks for the user
-        self._held: list[tuple[str, Arrays]] = []
+        self._unwritten: list[tuple[str, Arrays]] = []
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
         """Lock the output folder, and check that an unfinished run in it is to be resumed and is of this study."""
         with ExitStack() as stack:
-            if not self._is_held:
+            if not self._is_locked:
                 stack.enter_context(locked(self.parent, "output folder"))
-            self._look()
+            self._check_files()
             self._stack = stack.pop_all()
         self._started, self._written = time.monotonic(), bool(self._files())
         return self
@@ -217,9 +204,10 @@ class Checkpoint:
         with self._stack, contextlib.suppress(InputError):
             if kind is not None:
                 # After an interruption or error, write pending shards unless the run was short.
-                self._write_held()
+                self._write()
 
-    def _look(self) -> None:
+    def _check_files(self) -> None:
+        """Discard, continue or refuse an unfinished run in the folder."""
         if self._restart:
             self._remove()
         if not self._files():
@@ -267,22 +255,22 @@ class Checkpoint:
     def put(self, name: str, shard: Arrays) -> None:
         """Keep a shard, and write it to disk once the run has lasted `patience_s`."""
         with self._lock:
-            self._held.append((name, shard))
-            self._write_held()
+            self._unwritten.append((name, shard))
+            self._write()
 
-    def _write_held(self) -> None:
+    def _write(self) -> None:
         if not self._written and time.monotonic() - self._started < self._patience_s:
             return
-        if not self._written and self._held:
+        if not self._written and self._unwritten:
             self._write_manifest()
             self._written = True
-        while self._held:
-            name, shard = self._held[0]
+        while self._unwritten:
+            name, shard = self._unwritten[0]
             body = io.BytesIO()
             np.savez(body, **shard)  # type: ignore[arg-type]
             data = body.getvalue()
             write_whole(self.folder / f"{name}.npz", data, _named(name, data))
-            self._held.pop(0)
+            self._unwritten.pop(0)
 
     @property
     def kept(self) -> int:
@@ -291,18 +279,18 @@ class Checkpoint:
 
     def forget(self) -> None:
         """Remove the checkpoint, which is no longer needed once the result is written."""
-        self._held = []
+        self._unwritten = []
         self._remove()
 
     def _files(self) -> list[Path]:
         """Return the files in the folder that belong to a checkpoint, by name."""
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
-        own = [name for name in names if SHARD_NAME.fullmatch(name) or name == MANIFEST]
-        if own == [MANIFEST] and _intact(self.folder / MANIFEST) is None:
+        names = [name for name in names if SHARD_NAME.fullmatch(name) or name == MANIFEST]
+        if names == [MANIFEST] and _intact(self.folder / MANIFEST) is None:
             raise InputError(
                 f"{str(self.folder / MANIFEST)!r} is not mauvecl's: use another output folder", key="folder"
             )
-        return [self.folder / name for name in own]
+        return [self.folder / name for name in names]
 
     def _remove(self) -> None:
         """Remove the checkpoint's files, and the folder if it is then empty."""
@@ -322,7 +310,7 @@ class Checkpoint:
         write_whole(self.folder / MANIFEST, text.encode())
 
 
-def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], Arrays]) -> Arrays:
+def checkpointed(checkpoint: Checkpoint | None, question: object, compute: Callable[[], Arrays]) -> Arrays:
     """Return the arrays of a computation, from the checkpoint if an earlier run has finished it.
 
     The question is everything on which the result depends, as for `fingerprint`.

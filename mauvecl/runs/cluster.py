@@ -13,8 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,15 +37,6 @@ if TYPE_CHECKING:
 PATIENCE_S, WORKER_PATIENCE_S = 30.0, 120.0
 #: Interval between counts of the workers, s, and largest number of requests kept on the workers.
 RECOUNT_S, MAX_REQUESTS = 5.0, 32
-
-
-@dataclass(eq=False)
-class _Attempt:
-    """A shard that is awaited."""
-
-    awaited: Future[Arrays]
-    task: Task
-    workers: list[str] | None  # those that may count it; None for all
 
 
 @validated
@@ -75,12 +65,12 @@ class DaskWorkers:
             import distributed
         except ImportError as error:
             raise missing_package("dask", "a cluster", "cluster") from error
-        self._where, self._device, self._sends = where, device, 0
+        self._where, self._device, self._n_submitted = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
-        # Futures of requests by their keys, and of submitted tasks.
-        self._given: dict[str, DaskFuture[Any]] = {}
-        self._sent: dict[DaskFuture[Any], _Attempt] = {}
+        # Futures of requests by their keys, and for each submitted shard the future that the pool awaits.
+        self._requests: dict[str, DaskFuture[Any]] = {}
+        self._submitted: dict[DaskFuture[Any], Future[Arrays]] = {}
         # Addresses of workers with other code, which may have joined after the start.
         self._strangers: set[str] = set()
         with contextlib.ExitStack() as stack:
@@ -105,25 +95,20 @@ class DaskWorkers:
                     )
             self._open = stack.pop_all()
         self._devices = [record for _, record in introduced.values()]
-        self._counted = len(introduced), time.monotonic()
+        self._n_workers, self._counted_at_s = len(introduced), time.monotonic()
 
     @property
     def count(self) -> int:
-        """Recent number of workers; attempts whose workers have all left end, since Dask gives them to no others."""
-        if time.monotonic() > self._counted[1] + RECOUNT_S:
+        """Number of workers some seconds ago, at least 1."""
+        if time.monotonic() > self._counted_at_s + RECOUNT_S:
             try:
-                present = self._client.nthreads()
+                self._n_workers = max(len(self._client.nthreads()), 1)
             except OSError as error:
-                raise self._gone() from error
-            self._counted = max(len(present), 1), time.monotonic()
-            with self._lock:
-                sent = [key for key, it in self._sent.items() if it.workers and not present.keys() & it.workers]
-                left = [self._sent.pop(key) for key in sent]
-            for attempt in left:
-                attempt.awaited.set_exception(ShardLost("its workers have left", failed=False))
-        return self._counted[0]
+                raise self._scheduler_ended() from error
+            self._counted_at_s = time.monotonic()
+        return self._n_workers
 
-    def _gone(self) -> DeviceError:
+    def _scheduler_ended(self) -> DeviceError:
         return DeviceError(f"the scheduler of cluster {self._where} ended before the work was done", "lost")
 
     def describe(self) -> list[DeviceRecord]:
@@ -132,33 +117,34 @@ class DaskWorkers:
 
     def submit(self, task: Task) -> Future[Arrays]:
         """Submit a shard to any free worker; raw spectra are returned, and the task's `out` is not used."""
-        awaited: Future[Arrays] = Future()
+        counts: Future[Arrays] = Future()
         with self._lock:
             if self._closing:
-                awaited.set_exception(Stopped())
-                return awaited
-            self._sends += 1
+                counts.set_exception(Stopped())
+                return counts
+            self._n_submitted += 1
             try:
-                if task.key not in self._given:
+                if task.key not in self._requests:
                     # A task instead of scattered data, since the scheduler repeats it if its worker is lost. Bytes,
                     # because a worker with other code might read and write a request differently.
-                    content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
-                    self._given[task.key] = self._client.submit(bytes, content, key=key)
-                    if len(self._given) > MAX_REQUESTS:
-                        del self._given[next(iter(self._given))]
-                # Workers with our code; all if none has other code, or those with our code have left.
-                present = self._client.nthreads() if self._strangers else ()
-                ours = [worker for worker in present if worker not in self._strangers] or None
-                attempt, key = _Attempt(awaited, task, ours), f"mauvecl-{task.name}-{self._sends}"
-                given = self._given[task.key], task.shard, self._device
-                sent = self._client.submit(_count, *given, key=key, workers=ours, pure=False)
+                    content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._n_submitted}"
+                    self._requests[task.key] = self._client.submit(bytes, content, key=key)
+                    if len(self._requests) > MAX_REQUESTS:
+                        del self._requests[next(iter(self._requests))]
+                arguments = self._requests[task.key], task.shard, self._device
+                key, options = f"mauvecl-{task.name}-{self._n_submitted}", dict[str, Any]()
+                if self._strangers:
+                    # Dask gives the shard to strangers only if all others have left.
+                    ours = [worker for worker in self._client.nthreads() if worker not in self._strangers]
+                    options = {"workers": ours, "allow_other_workers": True}
+                submitted = self._client.submit(_count, *arguments, key=key, pure=False, **options)
             except (OSError, RuntimeError) as error:
                 # Dask raises either if its client has lost the scheduler.
-                awaited.set_exception(self._gone().with_traceback(error.__traceback__))
-                return awaited
-            self._sent[sent] = attempt
-        sent.add_done_callback(partial(self._came, attempt))
-        return awaited
+                counts.set_exception(self._scheduler_ended().with_traceback(error.__traceback__))
+                return counts
+            self._submitted[submitted] = counts
+        submitted.add_done_callback(partial(self._finish, counts, task))
+        return counts
 
     def _find_strangers(self) -> bool:
         """Ask all workers for their code, and return whether more of them have other code than before."""
@@ -172,58 +158,58 @@ class DaskWorkers:
             self._strangers |= strangers
         return new
 
-    def _came(self, attempt: _Attempt, sent: DaskFuture[Any]) -> None:
+    def _finish(self, counts: Future[Arrays], task: Task, submitted: DaskFuture[Any]) -> None:
+        """Set the result or the exception of a shard that has ended."""
         with self._lock:
-            if self._sent.pop(sent, None) is None:
+            if self._submitted.pop(submitted, None) is None:
                 # The result is no longer needed.
                 return
         try:
-            attempt.awaited.set_result(self._sums(attempt, sent))
+            counts.set_result(self._result(task, submitted))
         except BaseException as error:
             # The connection may break between the end of a shard and the transfer of its counts.
-            broken = self._gone().with_traceback(error.__traceback__)
-            attempt.awaited.set_exception(broken if isinstance(error, OSError) else error)
+            broken = self._scheduler_ended().with_traceback(error.__traceback__)
+            counts.set_exception(broken if isinstance(error, OSError) else error)
 
-    def _sums(self, attempt: _Attempt, sent: DaskFuture[Any]) -> Arrays:
-        """Return the counts of a task that has ended, or raise why there are none."""
-        if sent.status == "finished":
+    def _result(self, task: Task, submitted: DaskFuture[Any]) -> Arrays:
+        """Return the counts of a shard that has ended, or raise why there are none."""
+        if submitted.status == "finished":
             answer: Any = None
-            # Dask would wait until the task is repeated, which never happens if all workers that may do so have left;
-            # it calls the functions of all finished tasks in one thread, so that every other shard would wait, too.
+            # Dask would wait until the task is repeated. It calls the functions of all finished tasks in one thread, so
+            # every other shard would wait, too.
             while answer is None:
                 with contextlib.suppress(TimeoutError):
-                    answer = sent.result(timeout=RECOUNT_S)
-                if answer is None and sent.status != "finished":
-                    raise ShardLost("its worker has left with its counts", failed=False)
+                    answer = submitted.result(timeout=RECOUNT_S)
+                if answer is None and submitted.status != "finished":
+                    raise ShardLost("its worker has left with its counts")
             # Workers with older code answer without theirs.
             if isinstance(answer, tuple) and answer[1] == code_identity():
-                sums: Arrays = answer[0]
-                return sums
-        error = sent.exception() if sent.status == "error" else None
-        if sent.status in ("finished", "error") and self._find_strangers():
-            raise ShardLost("counted by a worker with other code", failed=False)
-        if isinstance(error, InputError | DeviceError):
+                arrays: Arrays = answer[0]
+                return arrays
+        error = submitted.exception() if submitted.status == "error" else None
+        strangers = submitted.status in ("finished", "error") and self._find_strangers()
+        if isinstance(error, InputError | DeviceError) and not strangers:
             # Another attempt would end as this one.
-            raise DeviceError(f"cluster {self._where} failed at {attempt.task.shard}: {error}", "failed")
-        if sent.status in ("cancelled", "lost") and self._client.status != "running":
-            raise self._gone()
+            raise DeviceError(f"cluster {self._where} failed at {task.shard}: {error}", "failed")
+        if submitted.status in ("cancelled", "lost") and self._client.status != "running":
+            raise self._scheduler_ended()
         with self._lock:
             # The next attempt sends the request again, which may be lost, too.
-            self._given.pop(attempt.task.key, None)
-        other = "workers with other code" if sent.status == "finished" else "workers that have left"
-        raise ShardLost(f"cluster {self._where}: {error or other}")
+            self._requests.pop(task.key, None)
+        reason = "workers with other code" if submitted.status == "finished" else "workers that have left"
+        raise ShardLost(f"cluster {self._where}: {error or reason}")
 
     def stop(self) -> None:
         """Cancel submitted shards; workers of other machines complete the shard in progress."""
         with self._lock:
             self._closing = True
-            sent, self._sent = self._sent, {}
+            submitted, self._submitted = self._submitted, {}
         # Set the exception here, because neither Dask nor a cancelled future wakes concurrent.futures.wait.
-        for attempt in sent.values():
-            attempt.awaited.set_exception(Stopped())
-        if sent:
+        for counts in submitted.values():
+            counts.set_exception(Stopped())
+        if submitted:
             with contextlib.suppress(OSError, RuntimeError, TimeoutError):
-                self._client.cancel(list(sent))
+                self._client.cancel(list(submitted))
         # Kill workers of this machine, since completing a shard takes seconds.
         for nanny in getattr(self._client.cluster, "workers", {}).values():
             nanny.auto_restart = False
@@ -234,7 +220,7 @@ class DaskWorkers:
     def close(self) -> None:
         """Stop work in progress, and disconnect from the workers; those of this machine end."""
         self.stop()
-        self._given.clear()
+        self._requests.clear()
         self._open.close()
 
 
@@ -246,21 +232,25 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
     for name in LOGS:
         # Errors reach the user as exceptions.
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    how: dict[str, Any]
     with contextlib.ExitStack() as stack:
-        word, _, number = where.partition(":")
-        if word == "local":
+        scheme, _, number = where.partition(":")
+        if scheme == "local":
             if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
                 raise InputError.of("cluster", where, "local:N with N from 1 to 1024")
-            # The pool counts failures and submits shards again, so that it can report them.
-            how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
-            # No HTTP pages, since they have no authentication.
-            how |= {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-            stack.enter_context(dask.config.set(how | {"logging": dict.fromkeys(LOGS, "critical")}))
+            settings: dict[str, Any] = {
+                # The pool counts failures and submits shards again, so that it can report them.
+                "distributed.scheduler.allowed-failures": 0,
+                "distributed.admin.tick.limit": "1h",
+                # No HTTP pages, since they have no authentication.
+                "distributed.scheduler.http.routes": [],
+                "distributed.worker.http.routes": [],
+                "logging": dict.fromkeys(LOGS, "critical"),
+            }
+            stack.enter_context(dask.config.set(settings))
             cluster = stack.enter_context(_local_cluster(int(number), distributed))
-            how = {"address": cluster, "security": cluster.security}
+            options = {"address": cluster, "security": cluster.security}
         elif "://" in where and _is_address(where):
-            how = {"address": where}
+            options = {"address": where}
         elif "://" not in where and is_file(Path(where)):
             with parsing(f"scheduler file {shortened(where)}", "give JSON"):
                 scheduler = json.loads(read_text(Path(where), "scheduler file"))
@@ -269,11 +259,11 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
                 raise InputError(
                     f"scheduler file {shortened(where)} names no address: use one that Dask wrote", key="cluster"
                 )
-            how = {"scheduler_file": where}
+            options = {"scheduler_file": where}
         else:
             raise InputError.of("cluster", where, "local:N, an address such as tcp://host:8786, or a scheduler file")
         try:
-            client = stack.enter_context(distributed.Client(**how, timeout=PATIENCE_S, set_as_default=False))
+            client = stack.enter_context(distributed.Client(**options, timeout=PATIENCE_S, set_as_default=False))
         except (OSError, ValueError, TimeoutError) as error:
             raise DeviceError(f"no scheduler answered at {where} within {PATIENCE_S:g} s: start one") from error
         yield client
@@ -296,8 +286,8 @@ def _local_cluster(n_workers: int, distributed: Any) -> Any:
 
 def _is_address(where: str) -> bool:
     """Return whether an address has a scheme of Dask, a host and a port."""
-    found = re.fullmatch(r"(tcp|tls|ucxx?|wss?)://([\w.-]+|\[[\w:.%]+\]):(\d{1,5})/?", where, flags=re.ASCII)
-    return found is not None and 0 < int(found[3]) < 2**16
+    match = re.fullmatch(r"(tcp|tls|ucxx?|wss?)://([\w.-]+|\[[\w:.%]+\]):(\d{1,5})/?", where, flags=re.ASCII)
+    return match is not None and 0 < int(match[3]) < 2**16
 
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
@@ -314,29 +304,24 @@ def dask_setup(worker: Any) -> None:
     os.setpgid(0, 0)
 
 
-_engine: Engine | None = None
 _one_at_a_time = threading.Lock()
-
-
 #: Requests by their bytes; each keeps what it has computed for earlier shards.
 _request: Callable[[bytes], Countable] = lru_cache(maxsize=4)(pickle.loads)
 
 
-def _engine_here(device: str | None, threads: int) -> Engine:
+@cache
+def _engine(device: str | None, threads: int) -> Engine:
     """Return the worker's engine, with PoCL limited to the threads that Dask assigns."""
     from mauvecl.device.engine import Engine
 
-    global _engine
-    if _engine is None:
-        for name in THREADS:
-            os.environ.setdefault(name, str(threads))
-        _engine = Engine(device)
-    return _engine
+    for name in THREADS:
+        os.environ.setdefault(name, str(threads))
+    return Engine(device)
 
 
 def _introduce(device: str | None, dask_worker: Any = None) -> tuple[tuple[str, str], DeviceRecord]:
     with _one_at_a_time:
-        return code_identity(), _engine_here(device, dask_worker.state.nthreads).device
+        return code_identity(), _engine(device, dask_worker.state.nthreads).device
 
 
 def _count(content: bytes, shard: Shard, device: str | None) -> tuple[Arrays, tuple[str, str]]:
@@ -344,5 +329,5 @@ def _count(content: bytes, shard: Shard, device: str | None) -> tuple[Arrays, tu
     from distributed import get_worker
 
     with _one_at_a_time:
-        engine = _engine_here(device, get_worker().state.nthreads)
+        engine = _engine(device, get_worker().state.nthreads)
         return engine.count(_request(content), shard), code_identity()

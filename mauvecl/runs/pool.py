@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 MAX_FAILURES = 8
 #: Submitted shards per worker: one being counted and one waiting.
 SHARDS_PER_WORKER = 2
-#: Time after which the workers are counted again even if no shard is counted, s.
-LOOK_S = 5.0
+#: Time after which the workers are counted again even if no shard is finished, s.
+RECOUNT_S = 5.0
 #: Items of `map_in_order` in progress beyond the number of workers, which are prepared while devices count others.
 PREPARED = 1
 
@@ -59,21 +59,19 @@ class LocalWorkers:
 
     def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
         self._make, self._devices = make, list(devices)
-        self._ticks: list[Callable[[int], None]] = [lambda done: None] * len(devices)
         self._stopping = False
-        self._engines: list[Engine] = [self._made(place) for place in range(len(devices))]
+        # The task that a thread counts.
+        self._current = threading.local()
+        self._engines: list[Engine] = [make(device, progress=self._report_progress) for device in devices]
         self._free: SimpleQueue[int] = SimpleQueue()
         for place in range(len(devices)):
             self._free.put(place)
         self._threads = ThreadPoolExecutor(len(devices))
 
-    def _made(self, place: int) -> Engine:
-        def progress(done: int, total: int) -> None:
-            if self._stopping:
-                raise Stopped
-            self._ticks[place](done)
-
-        return self._make(self._devices[place], progress=progress)
+    def _report_progress(self, done: int, total: int) -> None:
+        if self._stopping:
+            raise Stopped
+        self._current.task.tick(done)
 
     @property
     def count(self) -> int:
@@ -96,8 +94,7 @@ class LocalWorkers:
     def _count(self, task: Task) -> Arrays:
         if self._stopping:
             raise Stopped
-        place = self._free.get()
-        self._ticks[place] = task.tick
+        place, self._current.task = self._free.get(), task
         engine = self._engines[place]
         try:
             return engine.count(task.request, task.shard, out=task.out)
@@ -105,7 +102,7 @@ class LocalWorkers:
             if self._stopping:
                 raise
             # A failed launch may have corrupted the context, so the next shard is counted in a new one.
-            self._engines[place] = self._made(place)
+            self._engines[place] = self._make(self._devices[place], progress=self._report_progress)
             raise ShardLost(f"{engine.device_name}: {error}") from error
         finally:
             self._free.put(place)
@@ -209,9 +206,9 @@ class Pool:
         """Reduce all stares of a request; see `Stares.reduced`."""
         from mauvecl.flares.stare_scene import joined
 
-        found: dict[int, Arrays] = {}
-        self._add_up(request, lambda _, shard: found.update({int(shard["start"]): shard}))
-        return joined(request, [found[start] for start in sorted(found)])
+        by_start: dict[int, Arrays] = {}
+        self._add_up(request, lambda _, shard: by_start.update({int(shard["start"]): shard}))
+        return joined(request, [by_start[start] for start in sorted(by_start)])
 
     def realise(
         self, expectation: Expectation, *, count: Realisations, out: NDArray[Any] | None = None, **how: Any
@@ -237,7 +234,7 @@ class Pool:
             self._of += len(todo)
         self._report_progress()
 
-        def left() -> Iterator[Task]:
+        def missing() -> Iterator[Task]:
             """Add shards of the checkpoint, and yield the others."""
             for shard in todo:
                 task = Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}"))
@@ -248,7 +245,7 @@ class Pool:
                     add(shard.part, resumed)
                     self._finished(task, resumed=True)
 
-        for task, counted in self._counted(left()):
+        for task, counted in self._counted(missing()):
             add(task.shard.part, counted)
             if self.checkpoint is not None:
                 self.checkpoint.put(task.name, counted)
@@ -266,13 +263,13 @@ class Pool:
                 waiting[self.workers.submit(task)] = task
             if not waiting:
                 return
-            # Workers that are counted again meanwhile may have left.
-            for future in wait(waiting, LOOK_S, FIRST_COMPLETED).done:
+            # The number of workers may change while no shard is finished.
+            for future in wait(waiting, RECOUNT_S, FIRST_COMPLETED).done:
                 task = waiting.pop(future)
                 try:
                     counted = future.result()
                 except ShardLost as lost:
-                    failures[task.name] += lost.failed
+                    failures[task.name] += 1
                     if failures[task.name] >= MAX_FAILURES:
                         fault = f"{task.shard} failed {MAX_FAILURES} times, the last time with: {lost}"
                         raise DeviceError(fault, "failed") from lost
@@ -285,9 +282,9 @@ class Pool:
     def _tick(self, name: str, done: int) -> None:
         with self._lock:
             self._partly[name] = done
-            aside, self._meanwhile = self._meanwhile, None
-        if aside is not None:
-            threading.Thread(target=aside, name="mauvecl-aside", daemon=True).start()
+            meanwhile, self._meanwhile = self._meanwhile, None
+        if meanwhile is not None:
+            threading.Thread(target=meanwhile, name="mauvecl-meanwhile", daemon=True).start()
         self._report_progress()
 
     def _finished(self, task: Task, *, resumed: bool = False) -> None:

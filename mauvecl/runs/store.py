@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,11 +44,12 @@ CALIBRATION = {
     "read_noise_dn": "DN",
     "gain_dn_per_electron": "DN / electron",
 }
-COMMON_DRAWS = (
-    "row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
-    "arrays; rows of different number are independent"
-)
-NOMINAL = "the throughput is nominal, not a flight calibration"
+#: Attributes of every store and file.
+REMARKS = {
+    "draws": "row i of every array is drawn with the same random numbers, so that a flare is the only difference "
+    "between two arrays; rows of different number are independent",
+    "throughput": "the throughput is nominal, not a flight calibration",
+}
 
 
 def _describe(root: Any, scene: StoredScene, study: Study) -> None:
@@ -58,8 +59,8 @@ def _describe(root: Any, scene: StoredScene, study: Study) -> None:
     x, group = scene.expectation, root.require_group(scene.group)
 
     def store(name: str, values: NDArray[Any], unit: str, dimension: str = "pixel") -> None:
-        how: Any = {"chunks": values.shape, "compressors": [Crc32cCodec()], "dimension_names": [dimension]}
-        group.create_array(name, data=values, **how).attrs["units"] = unit
+        options: Any = {"chunks": values.shape, "compressors": [Crc32cCodec()], "dimension_names": [dimension]}
+        group.create_array(name, data=values, **options).attrs["units"] = unit
 
     if scene.name == "quiescent":
         group.attrs.update({"star": scene.star, **scene.at})
@@ -103,6 +104,8 @@ def signed(study: str) -> dict[str, str]:
     return {"study": study, "study_sha256": hashlib.sha256(study.encode()).hexdigest()}
 
 
+#: Error of a store.
+refusal = partial(InputError, key="store")
 #: Approximate size of a chunk, bytes.
 CHUNK_BYTES = 16 * 2**20
 
@@ -218,26 +221,24 @@ class Store:
         """Open an existing store; at least one copy of its study is intact, and intact copies are the same."""
         path = Path(path)
         copies: dict[str, Path] = {}
-        for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
+        for file in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
             # Only intact copies count: those whose digest is correct.
             with suppress(ValueError, LookupError, TypeError, AttributeError, RecursionError):
-                attributes = json.loads(read_bytes(place, "description"))["attributes"]
+                attributes = json.loads(read_bytes(file, "description"))["attributes"]
                 if signed(attributes["study"]).items() <= attributes.items():
-                    copies.setdefault(attributes["study"], place.relative_to(path))
+                    copies.setdefault(attributes["study"], file.relative_to(path))
         if not copies:
-            raise InputError(
+            raise refusal(
                 f"{str(path)!r} is not a store of spectra: give a folder that `mauvecl realise` wrote, with an intact "
-                "copy of its study",
-                key="store",
+                "copy of its study"
             )
-        (text, first), *others = copies.items()
-        if others:
-            other, second = others[0]
-            keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
-            raise InputError(
-                f"store {str(path)!r} must hold one study, but {str(first)!r} and {str(second)!r} differ in {keys}: "
-                "restore the file of the correct one",
-                key="store",
+        (text, file), *contradictions = copies.items()
+        if contradictions:
+            other_text, other_file = contradictions[0]
+            keys = ", ".join(differing_keys(toml(text, path.name), toml(other_text, path.name)))
+            raise refusal(
+                f"store {str(path)!r} must hold one study, but {str(file)!r} and {str(other_file)!r} differ in {keys}: "
+                "restore the file of the correct one"
             )
         data = toml(text, path.name)
         store = cls(path, Study.build(read_version(data, path.name), path.name), of_version_1="version" not in data)
@@ -247,7 +248,7 @@ class Store:
     @cached_property
     def scenes(self) -> list[StoredScene]:
         """Arrays of spectra: every star and sweep value, without and with each flare."""
-        stored = []
+        scenes = []
         for number, case in enumerate(cases(self.study), 1):
             chosen = case.study.bulk.chosen(case.quiet.n_frames)
             # The amplitude is an attribute of the flare's array.
@@ -255,15 +256,15 @@ class Store:
             name = full_label(case.label, swept)
             for k, (amplitude, x) in enumerate(zip((0.0, *case.amplitudes), (case.quiet, *case.flares), strict=True)):
                 array = f"flare-{k}" if k else "quiescent"
-                stored.append(StoredScene(f"star-{number}", array, name, amplitude, x, chosen, swept, self.rows))
-        return stored
+                scenes.append(StoredScene(f"star-{number}", array, name, amplitude, x, chosen, swept, self.rows))
+        return scenes
 
     def scene(self, path: str) -> StoredScene:
         """Return an array by path, such as ``star-1/flare-2``."""
-        stored = next((scene for scene in self.scenes if scene.path == path), None)
-        if stored is None:
-            raise InputError.of("scenes", path, f"one of {', '.join(s.path for s in self.scenes)}")
-        return stored
+        by_path = {scene.path: scene for scene in self.scenes}
+        if path not in by_path:
+            raise InputError.of("scenes", path, f"one of {', '.join(by_path)}")
+        return by_path[path]
 
     @property
     def rows(self) -> int:
@@ -295,40 +296,37 @@ class Store:
         """Write the description of the arrays, or check that an existing one is of the same study."""
         root = self.path / "zarr.json"
         if root.exists():
-            there = Store.open(self.path).study
-            differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
+            existing = Store.open(self.path).study
+            differing = differing_keys(self.study.model_dump(mode="json"), existing.model_dump(mode="json"))
             if differing:
-                raise InputError(
+                raise refusal(
                     f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}: "
-                    "use the same study or another place",
-                    key="store",
+                    "use the same study or another place"
                 )
             self.read_digests()
             return
-        ours = {scene.group for scene in self.scenes}
-        other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
-        if other:
-            raise InputError(
-                f"{str(self.path)!r} holds {min(other)!r} and no store: use an empty or a new folder", key="store"
-            )
+        groups = {scene.group for scene in self.scenes}
+        foreign = [p.name for p in self.path.iterdir() if p.name not in groups and not p.name.startswith(UNFINISHED)]
+        if foreign:
+            raise refusal(f"{str(self.path)!r} holds {min(foreign)!r} and no store: use an empty or a new folder")
         # The root comes last, so that its presence means that the description is complete.
-        made = self.description()
-        for name in sorted(made, key=lambda name: name == root.name):
-            write_whole(self.path / name, made[name])
+        files = self.description()
+        for name in sorted(files, key=lambda name: name == root.name):
+            write_whole(self.path / name, files[name])
 
     def make_folder(self) -> None:
         """Make the folder if needed; raises InputError if its file system is smaller than the spectra."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            room = shutil.disk_usage(self.path).total
+            disk_bytes = shutil.disk_usage(self.path).total
         except OSError as error:
-            raise InputError(
-                f"store {str(self.path)!r} cannot be made ({error.strerror}): use a writable folder", key="store"
+            raise refusal(
+                f"store {str(self.path)!r} cannot be made ({error.strerror}): use a writable folder"
             ) from error
-        if self.n_bytes > room:
+        if self.n_bytes > disk_bytes:
             raise InputError(
                 f"the spectra need {self.n_bytes / 2**30:.4g} GiB, but the disk of {str(self.path)!r} has "
-                f"{room / 2**30:.4g} GiB",
+                f"{disk_bytes / 2**30:.4g} GiB",
                 key="run.realisations",
             )
 
@@ -339,7 +337,7 @@ class Store:
         files: dict[str, Any] = {}
         root = zarr.open_group(zarr.storage.MemoryStore(files), mode="w", zarr_format=3)
         run: dict[str, Any] = signed(self.study.toml()) | {"seed": self.study.run.seed, "realisations": self.rows}
-        root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        root.attrs.update(run | {"mauvecl": VERSION} | REMARKS)
         for scene in self.scenes:
             _describe(root, scene, self.study)
         return {name: content.to_bytes() for name, content in files.items()}
@@ -360,28 +358,28 @@ class Store:
     def sort_digests(self) -> None:
         """Write the lists of digests in the order of their chunks, which may have been written in another."""
         for scene in self.scenes:
-            place, start = self.path / scene.path / DIGESTS, f"{scene.path}/"
-            names = [key.removeprefix(start) for key in self.digests if key.startswith(f"{start}c/")]
+            file, prefix = self.path / scene.path / DIGESTS, f"{scene.path}/"
+            names = [key.removeprefix(prefix) for key in self.digests if key.startswith(f"{prefix}c/")]
             names.sort(key=lambda name: int(name.split("/")[1]))
-            text = "".join(f"{_line(name, self.digests[start + name])}\n" for name in names).encode()
-            if names and place.read_bytes() != text:
-                write_whole(place, text)
+            text = "".join(f"{_line(name, self.digests[prefix + name])}\n" for name in names).encode()
+            if names and file.read_bytes() != text:
+                write_whole(file, text)
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
         """Encode a chunk by Zarr's codecs `bytes` and `crc32c`, padding the last chunk with zeros."""
         missing = chunk.scene.chunk_rows - len(rows)
         rows = np.pad(rows, [(0, missing), *[(0, 0)] * len(chunk.scene.row)]) if missing else rows
-        whole = np.ascontiguousarray(rows, chunk.scene.dtype)
-        return memoryview(whole.data).cast("B"), crc(whole)
+        rows = np.ascontiguousarray(rows, chunk.scene.dtype)
+        return memoryview(rows.data).cast("B"), crc(rows)
 
     def write(self, chunk: Chunk, rows: NDArray[Any]) -> None:
         """Write a chunk atomically, and then its digest to its array's list, for which threads wait for each other."""
         data, check = self.encode(chunk, rows)
         write_whole(self.path / chunk.key, data, check)
         written = self.digests[chunk.key] = digest(data, check)
-        place = self.path / chunk.scene.path / DIGESTS
-        what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
-        with self._listing, writing(what, NO_ROOM, key="store"), place.open("ab", buffering=0) as file:
+        digests = self.path / chunk.scene.path / DIGESTS
+        name = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
+        with self._listing, writing(name, NO_ROOM, key="store"), digests.open("ab", buffering=0) as file:
             # A single short write, which first ends a line that a full disk has cut short.
             file.write(f"\n{_line(chunk.name, written)}\n".encode())
 
@@ -397,26 +395,25 @@ class Store:
         """Yield every file and link in the folder, and whether it belongs to this store."""
         scenes = {scene.path: scene for scene in self.scenes}
         described = {*self.description(), *(f"{path}/{DIGESTS}" for path in scenes)}
-        for folder, folders, names in os.walk(self.path):
-            here = Path(folder).relative_to(self.path)
-            linked = [name for name in folders if (Path(folder) / name).is_symlink()]
-            for name in sorted([*names, *linked]):
-                whole = str(here / name.removeprefix(UNFINISHED))
-                # Twenty digits suffice for any chunk; int() of a very long name would be slow.
-                chunk = re.match("(.+)/c/([0-9]{1,20})/", whole)
-                own = whole in described
-                if chunk is not None and (scene := scenes.get(chunk[1])) is not None:
-                    own |= int(chunk[2]) in scene.chunk_numbers() and whole == scene.chunk(int(chunk[2])).key
-                yield str(here / name), own
+        for path in sorted(self.path.rglob("*")):
+            if path.is_dir() and not path.is_symlink():
+                continue
+            key = str(path.relative_to(self.path).with_name(path.name.removeprefix(UNFINISHED) or path.name))
+            # Twenty digits suffice for any chunk; int() of a very long name would be slow.
+            match = re.match("(.+)/c/([0-9]{1,20})/", key)
+            belongs = key in described
+            if match is not None and (scene := scenes.get(match[1])) is not None:
+                number = int(match[2])
+                belongs |= number in scene.chunk_numbers() and key == scene.chunk(number).key
+            yield str(path.relative_to(self.path)), belongs
 
     def clear(self) -> None:
         """Remove all files if no others exist; the study is last, so that an interrupted removal leaves a store."""
         files = list(self.files())
-        other = [key for key, own in files if not own]
-        if other:
-            raise InputError(
-                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {other[0]!r}",
-                key="store",
+        foreign = [key for key, belongs in files if not belongs]
+        if foreign:
+            raise refusal(
+                f"a store that is removed must hold no other files, but {str(self.path)!r} holds {foreign[0]!r}"
             )
         for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):
             (self.path / key).unlink(missing_ok=True)
@@ -431,6 +428,11 @@ def crc(data: bytes | NDArray[Any]) -> bytes:
     import google_crc32c
 
     return int(google_crc32c.value(data)).to_bytes(CRC_BYTES, "little")
+
+
+def is_intact(data: bytes) -> bool:
+    """Return whether the content of a chunk's file ends with its CRC."""
+    return crc(data[:-CRC_BYTES]) == data[-CRC_BYTES:]
 
 
 def digest(*parts: bytes | memoryview) -> str:

@@ -61,7 +61,7 @@ class FieldValues:
         return "your own star" if "star" in self.uploads else star_words(self.star)
 
     def case(self, folder: Path) -> Case:
-        """Return the question as a case, whose files are in a folder; a flare as observed has the amplitude of that."""
+        """Return the question as a case, whose files are in a folder; an observed flare has its own amplitude."""
         uploaded: Source | None = self.uploads.get("star")
         # An uploaded spectrum is not read from its file at every change.
         loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
@@ -86,13 +86,11 @@ class FieldValues:
         if "change_file" in self.uploads and SPECTRUM not in values["changes"]:
             data["change"]["of"] = (*values["changes"], SPECTRUM)
         points = self.uploads.get("own_unknown", values["own_unknown"])
-        own = {"own": {"points": points}} if points else {}
-        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": own}
+        spectrum = {"own": {"points": points}} if points else {}
+        data["nuisances"] = {"usual": values["unknown"] == REALISTIC, "own": spectrum}
         number, tails = values["realisations"]
         statistics = list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]]))
         data["run"] |= {"realisations": number, "tails": tails, "statistics": statistics}
-        if values["targets"]:
-            data.setdefault("plan", {})["targets"] = list(values["targets"])
         return data
 
     def _value(self, name: str, folder: Path) -> Any:
@@ -103,10 +101,10 @@ class FieldValues:
             **dict.fromkeys(itertools.chain(*WITH_FILE.values()), False),
             **dict.fromkeys(("continue_at_k", "flare_quiescent", "as_observed"), "flare_file" in uploads),
             "change_band": "change_file" in uploads,
-            **{key: values["sky"] == text for key, (other, text) in ASKED_UNDER.items() if other == "sky"},
+            **{key: values["sky"] == text for key, (parent, text) in ASKED_UNDER.items() if parent == "sky"},
             "second_area": values["second_temperature_k"] is not None,
             **dict.fromkeys(("pointing_duration", "pointing_depth"), values["pointing_rate"] is not None),
-            "hours": bool(values["targets"]),
+            **dict.fromkeys(("hours", "targets"), bool(values["targets"])),
         }
         value = uploads.get(name) if page_field.kind in ("file", "upload") else values[name]
         if value is None or not conditions.get(name, True):
@@ -143,7 +141,7 @@ class InterpolatedForm:
         return np.asarray(self._inverse(-special.ndtri(probability)))
 
 
-#: Answers that are simulated, by name: of one question.
+#: Simulated answers to one question, by name.
 Answers = Mapping[str, Any]
 #: Name of the detection with the other choice of unknowns; the card shows both.
 OTHER = "detection otherwise"
@@ -156,20 +154,20 @@ class ClosedForms:
     question: FieldValues
     case: Case
     #: Content of the visitor's files, as arguments of the verb by name.
-    given: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, question: FieldValues, folder: Path, *, chance: bool = True, given: Mapping[str, Any] | None = None
+        cls, question: FieldValues, folder: Path, *, chance: bool = True, inputs: Mapping[str, Any] | None = None
     ) -> ClosedForms:
-        """Answer a question; `folder` holds the visitor's files for the study, and `given` their contents.
+        """Answer a question; `folder` holds the visitor's files for the study, and `inputs` their contents.
 
-        A star may be too bright for the `chance` of detection.
+        Without the `chance` of detection, the star may be too bright for a detection.
         """
         case = question.case(folder)
         # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.
         values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
-        closed = cls(replace(question, values=values), case, given or {})
+        closed = cls(replace(question, values=values), case, inputs or {})
         if chance:
             _ = closed.odds
         return closed
@@ -207,7 +205,7 @@ class ClosedForms:
         changes: dict[str, dict[str, Any]] = {"nuisances": {"usual": unknown == REALISTIC}}
         if question["instrument"] != self.question.instrument:
             changes["observation"] = {"instrument": question["instrument"]}
-        sections = {key: getattr(self.case.study, key).model_copy(update=one) for key, one in changes.items()}
+        sections = {key: getattr(self.case.study, key).model_copy(update=keys) for key, keys in changes.items()}
         case = self.case.with_sections(**sections)
         return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
@@ -217,7 +215,7 @@ class ClosedForms:
         return InterpolatedForm(self.odds.null)
 
     @cached_property
-    def seen(self) -> InterpolatedForm:
+    def flaring(self) -> InterpolatedForm:
         """Distribution of the statistic with the flare, for pictures."""
         return InterpolatedForm(self.odds.flaring)
 
@@ -273,7 +271,7 @@ class Chance(NamedTuple):
 
     unknown: str  # choice of the field
     value: float  # NaN if there is none
-    how: str  # whether it is a closed form or simulated, and its interval; or the reason why there is none
+    origin: str  # whether it is a closed form or simulated, and its interval; or the reason why there is none
 
 
 def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
@@ -285,21 +283,21 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             answer: DetectAnswer | None = answers.get("detection" if assumed is closed else OTHER)
             if answer is not None:
                 (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
-                value, drawn = float(row["probability"]), f"of {closed.question.realisations[0]:,} simulated"
-                how = f"{chance_range(row['low'], row['high'])}, {drawn}"
+                value, count = float(row["probability"]), closed.question.realisations[0]
+                origin = f"{chance_range(row['low'], row['high'])}, of {count:,} simulated"
             else:
-                value, how = assumed.chance, "in closed form"
+                value, origin = assumed.chance, "in closed form"
                 if not (assumed.case.study.nuisances.usual or assumed.slow or value != value):
-                    # Computed at once.
+                    # This takes no time.
                     lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
                     ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), sky=True)]
-                    how += f"; {chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower "
-                    how += "or higher"
+                    percent = f"{100 * THROUGHPUT:g} %"
+                    origin += f"; {chance_range(min(ends), max(ends))} if the throughput is {percent} lower or higher"
         except InputError as error:
             if unknown == closed.question.unknown:
                 raise
-            value, how = float("nan"), sentence(error)
-        all_chances.append(Chance(unknown, value, how))
+            value, origin = float("nan"), sentence(error)
+        all_chances.append(Chance(unknown, value, origin))
     return all_chances
 
 
@@ -313,25 +311,26 @@ LIMITS: dict[str, tuple[str, Callable[[float], str], str, str]] = {
 
 def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
-    q, asked = closed.question, closed.case.study.limit
-    before, in_words, none, some = LIMITS[asked.of]
+    q, limit = closed.question, closed.case.study.limit
+    before, in_words, without_limit, by_simulation = LIMITS[limit.of]
     clauses: dict[str, str] = {}
     near: float | None = None
-    # The ideal limit is found at once, and the realistic one near it.
+    # The ideal limit is found quickly, and the realistic one near it.
     for unknown in (IDEAL, REALISTIC):
         try:
             assumed = closed.assuming(unknown)
             near = None if assumed.slow else LimitSearch(assumed.case, assumed.question.statistic).root(near)
             value = "" if near is None else f"{before.format(band=q.band)} {in_words(near)}"
-            clauses[unknown] = value or f"{some} that takes a simulation"
+            clauses[unknown] = value or f"{by_simulation} that takes a simulation"
         except InputError:
-            clauses[unknown] = none
-    flares = "flares" if asked.of == "amplitude" else f"flares of {q.amplitude_percent:g} %"
-    at = "" if asked.of == "magnitude" else f" at {q.band} = {q.magnitude:g}"
-    first = clauses[REALISTIC]
-    # The size belongs to the flares, what is exposed to their detection.
-    where = f" {first}{at} are detected" if asked.of == "amplitude" else f"{at} are detected {first}"
-    return f"{100 * asked.power:g} % of {flares}{where}, and {clauses[IDEAL]} if everything but the noise were known."
+            clauses[unknown] = without_limit
+    flares = "flares" if limit.of == "amplitude" else f"flares of {q.amplitude_percent:g} %"
+    at = "" if limit.of == "magnitude" else f" at {q.band} = {q.magnitude:g}"
+    realistic = clauses[REALISTIC]
+    # An amplitude belongs to the flares, a magnitude or an exposure to their detection.
+    detected = f" {realistic}{at} are detected" if limit.of == "amplitude" else f"{at} are detected {realistic}"
+    ideal = f"{clauses[IDEAL]} if everything but the noise were known"
+    return f"{100 * limit.power:g} % of {flares}{detected}, and {ideal}."
 
 
 def other_payloads(closed: ClosedForms) -> str:

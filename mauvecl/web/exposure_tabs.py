@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the noise of a pixel by origin."""
     series = budget_series(closed.quiet)
-    power = {part: float(np.nansum(series[part.key][1] ** 2)) for part in BUDGET.series[1:] if part.key in series}
-    most = max(power, key=lambda name: power[name])
-    share = 100 * power[most] / (sum(power.values()) or 1.0)
-    return ChartData(f"Most of the noise's power comes from {most.called}: {share:.0f} % over all pixels.", series)
+    power = {line: float(np.nansum(series[line.key][1] ** 2)) for line in BUDGET.series[1:] if line.key in series}
+    largest = max(power, key=lambda line: power[line])
+    share = 100 * power[largest] / (sum(power.values()) or 1.0)
+    return ChartData(f"Most of the noise's power comes from {largest.called}: {share:.0f} % over all pixels.", series)
 
 
 NOISE = Tab(
     name="noise",
     title="Noise",
-    about="Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star.",
+    about="Where the noise comes from, pixel by pixel, without a flare; for pinned scenarios, the photons of the star.",
     pictures=(budget,),
     questions=("snr",),
     files={"noise-budget": None},
@@ -154,7 +154,7 @@ def telescope(closed: ClosedForms, answers: Answers) -> ChartData:
     # A jump or line of the flare adds wavelengths.
     nm = flare.wavelength_nm[(flare.wavelength_nm >= 190) & (flare.wavelength_nm <= 710)]
     light = [np.interp(nm, source.wavelength_nm, source.flux_flam) for source in (star, flare)]
-    # Logarithms show nothing of zero.
+    # Logarithmic axes cannot show zeros.
     quiet, flaring = (np.where(flux > 0, flux, np.nan) for flux in light)
     rise = np.nanmax(flaring / quiet)
     text = f"The flare multiplies the star's light by up to {short(rise)} between 190 and 710 nm."
@@ -233,9 +233,9 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
 ).data()  # fmt: skip
 def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the distributions of the statistic without and with the flare, and the threshold."""
-    q, cut, chance = closed.question, closed.odds.threshold, closed.chance
+    q, threshold, chance = closed.question, closed.odds.threshold, closed.chance
     series: dict[str, Any] = {}
-    for name, form in (("null", closed.null), ("flare", closed.seen)):
+    for name, form in (("null", closed.null), ("flare", closed.flaring)):
         edges = np.linspace(form.mean - 5 * form.std, form.mean + 5 * form.std, 161)
         beyond = form.sf(edges)
         density = np.maximum(beyond[:-1] - beyond[1:], 0.0)
@@ -248,13 +248,13 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
             edges, counts = star.detection.histogram(q.statistic, flare, bins=80)
             series[name] = edges[:-1], edges[1:], counts / max(counts.max(), 1)
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
-        cut, chance = float(row["threshold"]), float(row["probability"])
-    series["threshold"] = cut if cut == cut else None
-    share = f"{chance_text(chance)} of flares lie above the threshold of {cut:.4g}"
+        threshold, chance = float(row["threshold"]), float(row["probability"])
+    series["threshold"] = threshold if threshold == threshold else None
+    share = f"{chance_text(chance)} of flares lie above the threshold of {threshold:.4g}"
     text = (
         f"Without a flare {q.statistic} lies at {with_error(closed.null.mean, closed.null.std)}, with it at "
-        f"{with_error(closed.seen.mean, closed.seen.std)}; "
-        f"{share if cut == cut else 'no threshold has this false-alarm probability'}."
+        f"{with_error(closed.flaring.mean, closed.flaring.std)}; "
+        f"{share if threshold == threshold else 'no threshold has this false-alarm probability'}."
     )
     return ChartData(text, series, {"x axis": {"axis_label": statistic_label(q.statistic)}})
 
@@ -273,7 +273,7 @@ def trade(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the detection probability against the false-alarm probability."""
     q = closed.question
     faps = np.logspace(-6, 0, 121)[:-1]
-    chances = closed.seen.sf(closed.null.isf(faps))
+    chances = closed.flaring.sf(closed.null.isf(faps))
     series: dict[str, Any] = {"closed form": (faps, chances), "own": ([q.fap], [closed.chance])}
     if "detection" in answers:
         fap, _, *ends = roc_columns(answers["detection"].stars[0].detection.roc(q.statistic))
@@ -302,29 +302,29 @@ DETECTION = Tab(
 def costs(closed: ClosedForms) -> list[Cost]:
     """Return the flare's matched S/N with unknowns, alone and together."""
     # Without a sky its brightness is no unknown. Those without a default prior are projected out.
-    chosen = {}
+    choices = {}
     for name, row in NUISANCES.items():
         if np.any(row.spectrum(closed.quiet)):
             spread = "free" if row.sd is None or np.isinf(row.sd) else row.sd
-            alone = NuisanceChoice.model_validate({"usual": False, name: spread})
-            chosen[spoken(alone).removeprefix("the ")] = alone
-    chosen["all the usual together"] = NuisanceChoice()
+            choice = NuisanceChoice.model_validate({"usual": False, name: spread})
+            choices[spoken(choice).removeprefix("the ")] = choice
+    choices["all the usual together"] = NuisanceChoice()
     if closed.case.study.nuisances.own:
-        chosen["your own spectrum"] = NuisanceChoice(usual=False, own=closed.case.study.nuisances.own)
+        choices["your own spectrum"] = NuisanceChoice(usual=False, own=closed.case.study.nuisances.own)
     flare, comparison = closed.flare, closed.case.study.run.comparison()
-    return [unknown_cost(name, closed.quiet, flare, choice, comparison) for name, choice in chosen.items()]
+    return [unknown_cost(name, closed.quiet, flare, choice, comparison) for name, choice in choices.items()]
 
 
 def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
-    for column, called, colour, width, alpha, form in (
+    for column, label, colour, width, alpha, form in (
         ("known", "everything known", "flare", 0.85, 0.35, "band"),
         ("marginal", "marginalised over it", "flare", 0.55, 1.0, "bar"),
         ("plain", "unknown, and not looked for", "text", 0.2, 1.0, "bar"),
     ):
-        look: dict[str, Any] = {"color": canvas.ink[colour], "alpha": alpha, "name": called}
-        made = canvas.plot.hbar("name", right=column, height=width, source=source, **look)
-        canvas.legend.append((called, canvas.ink[colour], form, ""))
-        canvas.tooltips(made, (called, column), along="hline")
+        style: dict[str, Any] = {"color": canvas.ink[colour], "alpha": alpha, "name": label}
+        bars = canvas.plot.hbar("name", right=column, height=width, source=source, **style)
+        canvas.legend.append((label, canvas.ink[colour], form, ""))
+        canvas.tooltips(bars, (label, column), along="hline")
     canvas.plot.x_range.start = 0
 
 
@@ -347,8 +347,8 @@ def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
 def table_of_costs(closed: ClosedForms, answers: Answers) -> View:
     """Return the S/N of the flare with each unknown, and the chance to detect it."""
     rows, fap = costs(closed), closed.question.fap
-    known = Cost("nothing: everything is known", *[rows[0].known] * 3)
-    cells = [(row.of, row.plain, row.marginal, float(power(row.marginal, fap))) for row in (known, *rows)]
+    without = Cost("nothing: everything is known", *[rows[0].known] * 3)
+    cells = [(row.of, row.plain, row.marginal, float(power(row.marginal, fap))) for row in (without, *rows)]
     names = ("unknown", "plain", "marginalised", "detected")
     table = [dict(zip(names, row, strict=True)) for row in cells]
     return View("", [column for column in COLUMNS if column.name in names], table)

@@ -40,7 +40,7 @@ REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000
 
 #: Choices of what is unknown: the usual unknowns, and nothing but the noise.
 REALISTIC, IDEAL = UNKNOWN = ("realistic", "ideal")
-#: Values of fields in links of version 1, which name the choice of unknowns in other words, with those of today.
+#: Values of fields in links of version 1, which have other names today, with these names.
 FORMER_VALUES = {
     "unknown": {"nothing": IDEAL, "the usual": REALISTIC},
     "instrument": {"mauve": FORMERLY_MAUVE} | FORMER_NAMES,
@@ -91,22 +91,22 @@ class Choice:
     """One of several words."""
 
     options: tuple[str, ...]
-    made: Callable[[str], Any] = str
+    convert: Callable[[str], Any] = str
 
     def __call__(self, text: str) -> Any:
         """Parse the value; an error states what is accepted."""
         if text not in self.options:
             raise InputError(f"{shortened(text)} is not a choice: use one of {', '.join(self.options)}")
-        return self.made(text)
+        return self.convert(text)
 
 
-def read_points(text: str, what: str) -> tuple[tuple[float, float], ...]:
-    """Read the spectrum of a nuisance parameter: lines of nm and DN of the exposure; `what` names it in messages."""
-    points = columns(what, text, "nm and DN", "nm")
+def read_points(text: str, name: str) -> tuple[tuple[float, float], ...]:
+    """Read the spectrum of a nuisance parameter: lines of nm and DN of the exposure; `name` stands in messages."""
+    points = columns(name, text, "nm and DN", "nm")
     if not 2 <= len(points) <= MOST_POINTS:
-        raise InputError(f"{what} must have 2 to {MOST_POINTS} pairs of nm and DN, but has {len(points)}")
+        raise InputError(f"{name} must have 2 to {MOST_POINTS} pairs of nm and DN, but has {len(points)}")
     if not np.isfinite(points).all() or (np.diff(points[:, 0]) <= 0).any():
-        raise InputError(f"{what} must have pairs in ascending order of nm")
+        raise InputError(f"{name} must have pairs in ascending order of nm")
     return tuple((float(nm), float(dn)) for nm, dn in points)
 
 
@@ -194,9 +194,9 @@ def neighbours(text: str) -> str | None:
 
 def star_words(name: str) -> str:
     """Describe a star of the library by its type and the star of its spectrum."""
-    found = named_star(name, own=False)
-    name, entry = found.nearest, embedded(found.nearest)
-    if isinstance(found.light, ModelStar):
+    known = named_star(name, own=False)
+    name, entry = known.nearest, embedded(known.nearest)
+    if isinstance(known.light, ModelStar):
         return f"a {name.replace('body', 'body of').replace('law', 'law of index')}"
     star = name if entry is None else entry["star"]
     if star == name:
@@ -207,12 +207,12 @@ def star_words(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Field(Widget):
-    """Field of the page: a widget of a key, or of keys that `Question` sets."""
+    """Field of the page: a widget of a key, or of keys that `FieldValues` sets."""
 
     first: str  # text of a new page
     unit: str = ""
     read: Callable[[str], Any]  # converts text to the value; raises InputError with what is accepted
-    path: tuple[str, ...] = ()  # key of the study that takes the value; empty if `Question` converts it
+    path: tuple[str, ...] = ()  # key of the study that takes the value; empty if `FieldValues` converts it
     own_keys: tuple[str, ...] = ()  # keys and sections of the study that it sets without a path
     characters: int = MOST_CHARACTERS  # largest number
 
@@ -235,7 +235,7 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     default, unit = field.get_default(), first(field, Unit) or Unit("")
     text = as_typed(default * widget.scale if isinstance(default, float) else default, truth=("no", "yes"))
     optional = text == "" if widget.first is None else not widget.first
-    own = {
+    texts = {
         "label": widget.label or getattr(first(field, Help), "text", ""),
         "group": widget.group or HEADINGS.get(".".join(path[:-1]), ""),
         "first": text if widget.first is None else widget.first,
@@ -243,7 +243,7 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
         "read": _reader(field, widget, unit.name, optional=optional),
         "characters": MOST_TABLE if widget.kind == "table" else MOST_CHARACTERS,
     }
-    return Field(**(vars(widget) | own), path=path)
+    return Field(**(vars(widget) | texts), path=path)
 
 
 #: Readers of fields by the kind of their widget.
@@ -316,7 +316,7 @@ _OWN_FIELDS = {
         hint="Stars by name, such as eps Eri or AU Mic, or coordinates such as 53.23 -9.46. What is known of a star "
         "need not be entered; paste a list of names, or a CSV table with columns such as name, ra, dec, V, "
         "spectral_type, distance_pc, mass_msun and age_myr.", group="Campaign", characters=MOST_TARGETS * 100,
-        kind="targets", own_keys=("plan.targets",),
+        kind="targets", path=("plan", "targets"),
     ),
     "realisations": Field(
         label="Realisations", first="100000",
@@ -330,7 +330,7 @@ _KEYS = {
     for key, field in study_keys().items()
     for widget in metadata_of(field, Widget)
 }
-#: Fields by name, as in links and in `Question`; the default is a flare at the edge of detection.
+#: Fields by name, as in links and in `FieldValues`; the default is a flare at the edge of detection.
 FIELDS = dict(sorted((_OWN_FIELDS | _KEYS).items(), key=lambda item: item[1].place))
 
 
@@ -371,17 +371,17 @@ PRESETS: dict[str, dict[str, str]] = {
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
 #: A flag of the command line.
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
-#: A key within a message: words of prose hold no underscore.
+#: A key within a message; words of prose contain no underscore.
 _KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
 
 
 @cache
 def _fields() -> dict[str, str]:
-    """Return the field of each key of the study, whole and without its section, of each own name, and of each flag."""
+    """Return the field of each key of the study, with and without its section, of each field's name and each flag."""
     names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
     flags = {flag: names[key] for key, _, option in keys_of() if key in names for flag in option.names}
     names |= {FIELDS[name].path[-1]: name for name in names.values()}
-    return names | {name: name for name in FIELDS} | flags | {"tails": "realisations", "plan.targets": "targets"}
+    return names | {name: name for name in FIELDS} | flags | {"tails": "realisations"}
 
 
 def field_of(key: str | None) -> str | None:
@@ -410,9 +410,9 @@ def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
 
 def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:
     """Return the values that a message proposes for fields, as pairs of field and text."""
-    each = REMEDY.finditer(str(error))
-    named = ((field_of(keys.get(match["key"], match["key"])), match["value"]) for match in each)
-    return [(name, value) for name, value in named if name is not None and value]
+    matches = REMEDY.finditer(str(error))
+    pairs = ((field_of(keys.get(match["key"], match["key"])), match["value"]) for match in matches)
+    return [(name, value) for name, value in pairs if name is not None and value]
 
 
 def _label(key: str, keys: Mapping[str, str]) -> str:

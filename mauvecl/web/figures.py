@@ -78,7 +78,7 @@ class Canvas:
             min_height=60,
             min_width=60,
             min_border=2,
-            # Half of a label at the end of the axis, which is else moved over its neighbour.
+            # Room for half of a label at the end of the axis, which Bokeh otherwise moves over its neighbour.
             min_border_right=14,
             # The wheel alone scrolls the page; two fingers zoom.
             tools=[models.BoxZoomTool(), models.WheelZoomTool(modifiers={"ctrl": True}), models.ResetTool()],
@@ -132,8 +132,8 @@ class Canvas:
         if isinstance(series, Rule):
             # Its position is set later.
             dimension: Literal["height", "width"] = "height" if series.along == "x" else "width"
-            look: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
-            self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **look))
+            style: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
+            self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **style))
         if isinstance(series, Rule | Listed):
             self._list(series)
             return
@@ -147,15 +147,15 @@ class Canvas:
             if series.draw is not None:
                 series.draw(self, source)
             return
-        made = self._drawn(series, source)
+        renderer = self._drawn(series, source)
         hidden = series.show in self.chart.shows
-        made.name, made.visible = series.called, not hidden
-        made.tags = [series.show] if hidden or series.show == "pins" else []
+        renderer.name, renderer.visible = series.called, not hidden
+        renderer.tags = [series.show] if hidden or series.show == "pins" else []
         self._list(series)
         if series.tips:
-            self.tooltips(made, *zip(series.tips, ("x", "y")[-len(series.tips) :], strict=True))
+            self.tooltips(renderer, *zip(series.tips, ("x", "y")[-len(series.tips) :], strict=True))
         if isinstance(series, Dots) and series.alone:
-            self.plot.y_range.update(renderers=[made])
+            self.plot.y_range.update(renderers=[renderer])
 
     def _drawn(self, series: Series, source: models.ColumnDataSource) -> Any:
         """Return the renderer of a series."""
@@ -193,21 +193,21 @@ class Canvas:
             form = "dash" if series.dash else series.form
             self.legend.append((series.called, self.ink.get(series.colour, series.colour), form, series.show))
 
-    def tooltips(self, made: Any, *lines: tuple[str, str], along: Literal["hline", "vline"] = "vline") -> None:
-        """Add a tooltip with the name of what is drawn and columns in four significant digits."""
+    def tooltips(self, renderer: Any, *lines: tuple[str, str], along: Literal["hline", "vline"] = "vline") -> None:
+        """Add a tooltip with the name of a renderer and columns in four significant digits."""
         columns = [column for _, column in lines]
         rows = "".join(f"<div>{name}: <b>@{column}{{%.4g}}</b></div>" for name, column in lines)
-        over = made
-        if isinstance(made.glyph, models.Step):
+        target = renderer
+        if isinstance(renderer.glyph, models.Step):
             # BokehJS finds no steps below the pointer.
-            over = self.plot.line("x", "y", source=made.data_source, line_alpha=0)
+            target = self.plot.line("x", "y", source=renderer.data_source, line_alpha=0)
         self.plot.add_tools(
             models.HoverTool(
-                renderers=[over],
-                mode="mouse" if isinstance(made.glyph, models.Scatter) else along,
+                renderers=[target],
+                mode="mouse" if isinstance(renderer.glyph, models.Scatter) else along,
                 point_policy="snap_to_data",
                 line_policy="nearest",
-                tooltips=f"<b>{made.name}</b>{rows}",
+                tooltips=f"<b>{renderer.name}</b>{rows}",
                 formatters={f"@{column}": "printf" for column in columns},
             )
         )
@@ -215,16 +215,17 @@ class Canvas:
     def _mark(self) -> None:
         """Add marks of spectral lines."""
         colour = self.ink["text"]
-        for name, places in MARKS.items():
-            more = name in MORE_MARKS
-            how: dict[str, Any] = {"tags": ["more marks" if more else "marks"], "visible": not more}
+        for name, wavelengths_nm in MARKS.items():
+            hidden = name in MORE_MARKS
+            shared: dict[str, Any] = {"tags": ["more marks" if hidden else "marks"], "visible": not hidden}
             line: dict[str, Any] = {"line_color": colour, "line_alpha": 0.35, "line_width": 1, "line_dash": "dotted"}
-            for place in places:
-                self.plot.add_layout(Span(dimension="height", location=place, **line, **how))
+            for nm in wavelengths_nm:
+                self.plot.add_layout(Span(dimension="height", location=nm, **line, **shared))
             self.plot.add_layout(
                 Label(
-                    x=sum(places) / len(places), y=0, y_units="screen", y_offset=2, x_offset=3, text=name, angle=1.5708,
-                    text_font="system-ui", text_font_size="10px", text_color=colour, text_alpha=0.8, **how,
+                    x=sum(wavelengths_nm) / len(wavelengths_nm), y=0, y_units="screen", y_offset=2, x_offset=3,
+                    text=name, angle=1.5708, text_font="system-ui", text_font_size="10px", text_color=colour,
+                    text_alpha=0.8, **shared,
                 )
             )  # fmt: skip
 

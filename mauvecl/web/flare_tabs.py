@@ -49,25 +49,25 @@ FIRST, HALVINGS, CHANGE = 9, 5, 0.1
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours"}
 
 
-def _kept(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -> T:
-    """Return a map or curve, which is kept for the values of the question, and `more`, on which it depends."""
+def _cached(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -> T:
+    """Return a map or curve, cached for the values of the question, and `more`, on which it depends."""
     question = closed.question
     values = (value for name, value in question.values.items() if name not in FREE)
     key = (*values, *(star.digest for name, star in question.uploads.items() if name == "star"), *more)
     # Of all visitors, without the closed forms, which take tens of MB.
-    found: T | None = RESULTS.get(None, make.__name__, key)
-    if found is None:
-        found = make(closed)
-        RESULTS.keep(None, make.__name__, key, found, 32)
-    return found
+    value: T | None = RESULTS.get(None, make.__name__, key)
+    if value is None:
+        value = make(closed)
+        RESULTS.keep(None, make.__name__, key, value, 32)
+    return value
 
 
 def _curve(closed: ClosedForms) -> tuple[Float, Float]:
     """Return magnitudes and probabilities, with more points where these change."""
 
     def exact(magnitudes: Float) -> list[float]:
-        each = (closed.at(light, np.ones(1)) for light in 10 ** (-0.4 * (magnitudes - closed.question.magnitude)))
-        return [forms[0].probability if forms else 0.0 for forms in each]
+        lights = 10 ** (-0.4 * (magnitudes - closed.question.magnitude))
+        return [forms[0].probability if (forms := closed.at(light, np.ones(1))) else 0.0 for light in lights]
 
     x = np.linspace(*MAGNITUDES, FIRST)
     y = np.array(exact(x))
@@ -76,7 +76,7 @@ def _curve(closed: ClosedForms) -> tuple[Float, Float]:
         new = (x[steep] + x[steep + 1]) / 2
         x, y = np.insert(x, steep + 1, new), np.insert(y, steep + 1, exact(new))
     fine = np.linspace(*MAGNITUDES, 241)
-    # Probits are smooth; those of what rounds to 0 or 1 are not known.
+    # Probits are smooth, but infinite for probabilities that round to 0 or 1.
     probits = special.ndtri(np.clip(y, 1e-15, 1 - 1e-15))
     return fine, np.asarray(special.ndtr(PchipInterpolator(x, probits)(fine)))
 
@@ -95,16 +95,17 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
     forms[0], forms[2] = -30.0, 3.0
     for i, light in enumerate(10 ** (-0.4 * (x - closed.question.magnitude))):
         for j, outcome in enumerate(closed.at(light, 10**y / closed.question.amplitude_percent)):
-            unit, seen = outcome.null.std, outcome.flaring
-            part = max((seen.mean - outcome.null.mean) / unit, 1e-9)
-            cut = (outcome.threshold - outcome.null.mean) / unit
-            forms[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
+            null, flaring = outcome.null, outcome.flaring
+            rise = max((flaring.mean - null.mean) / null.std, 1e-9)
+            threshold = (outcome.threshold - null.mean) / null.std
+            forms[:, j, i] = np.log(rise), np.log(flaring.std / null.std), threshold, flaring.third / flaring.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
-    part, spread, cut, skewness = PchipInterpolator(y, PchipInterpolator(x, forms, axis=2)(fine[0]), axis=1)(fine[1])
+    along_x = PchipInterpolator(x, forms, axis=2)(fine[0])
+    rise, spread, threshold, skewness = PchipInterpolator(y, along_x, axis=1)(fine[1])
     # At low skewness the distribution is normal.
     shape = 4 / np.maximum(skewness, 1e-4) ** 2
-    off = np.sqrt(shape) * (cut - np.exp(part)) / np.exp(spread)
-    return *fine, special.gammaincc(shape, np.maximum(shape + off, 0.0))
+    offset = np.sqrt(shape) * (threshold - np.exp(rise)) / np.exp(spread)
+    return *fine, special.gammaincc(shape, np.maximum(shape + offset, 0.0))
 
 
 @Chart(
@@ -124,32 +125,33 @@ def curve(closed: ClosedForms, answers: Answers) -> ChartData:
     series: dict[str, Any] = {"own": ([q.magnitude], [closed.chance]), "power": power}
     text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
     if not closed.slow:
-        x, y = series["closed form"] = _kept(_curve, closed, q.amplitude_percent)
+        x, y = series["closed form"] = _cached(_curve, closed, q.amplitude_percent)
         text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
     if "limit" in answers:
-        limits = [limit for limit in answers["limit"].limits if limit.statistic == q.statistic]
         before, in_words, *_ = LIMITS[closed.case.study.limit.of]
-        for one in limits:
+        for limit in answers["limit"].limits:
+            if limit.statistic != q.statistic:
+                continue
             # Points of another quantity than the axis's are reported in words only.
-            if one.of == "magnitude":
-                points = [(p.value, p.probability.value) for p in (*one.points, one.check)]
+            if limit.of == "magnitude":
+                points = [(p.value, p.probability.value) for p in (*limit.points, limit.check)]
                 series["simulated"] = np.array(points).T
-            value, low, high = map(in_words, (one.value.value, one.value.low, one.value.high))
-            limit = f"{before.format(band=q.band)} {value} [{low} to {high}]"
-            text += f" Simulated: {100 * power:g} % are detected {limit}."
+            value, low, high = map(in_words, (limit.value.value, limit.value.low, limit.value.high))
+            interval = f"{before.format(band=q.band)} {value} [{low} to {high}]"
+            text += f" Simulated: {100 * power:g} % are detected {interval}."
     return ChartData(text, series)
 
 
 def _reach(x: Float, y: Float, power: float, band: str) -> str:
     """Return the words for the faintest magnitude at which a probability is reached."""
-    seen = np.nonzero(y >= power)[0]
-    if not seen.size:
+    detected = np.nonzero(y >= power)[0]
+    if not detected.size:
         return f"at no magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}."
-    last = int(seen[-1])
+    last = int(detected[-1])
     if last == x.size - 1:
         return f"at least to {band} = {MAGNITUDES[1]:g}."
-    part = (y[last] - power) / (y[last] - y[last + 1])
-    return f"to {band} = {x[last] + part * (x[last + 1] - x[last]):.2f}, in closed form."
+    fraction = (y[last] - power) / (y[last] - y[last + 1])
+    return f"to {band} = {x[last] + fraction * (x[last + 1] - x[last]):.2f}, in closed form."
 
 
 def _draw_map(canvas: Canvas, source: ColumnDataSource) -> None:
@@ -197,7 +199,7 @@ def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
     series: dict[str, Any] = {"own": ([q.magnitude], [np.log10(q.amplitude_percent)])}
     text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
     if not closed.slow:
-        x, y, p = _kept(_map, closed)
+        x, y, p = _cached(_map, closed)
         series |= _map_series(x, y, p)
         share = 100 * float(np.mean(p >= 0.5))
         text = (
@@ -205,29 +207,29 @@ def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
             f"{MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} and amplitudes of {PERCENTS[0]:g} to {PERCENTS[1]:g} %."
         )
     if "map" in answers:
-        got = answers["map"]
-        at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
-        series["simulated"] = at_x.ravel(), at_y.ravel(), got.probability[0].ravel()
+        simulated = answers["map"]
+        at_x, at_y = np.meshgrid(np.array(simulated.x, float), np.log10(100 * np.array(simulated.y, float)))
+        series["simulated"] = at_x.ravel(), at_y.ravel(), simulated.probability[0].ravel()
         text += f" {at_x.size} cells are simulated."
     return ChartData(text, series)
 
 
 def _map_series(x: Float, y: Float, p: Float) -> dict[str, Any]:
-    """Return the data of a map, its contours, and their names, each at another part of its line: lines are close."""
+    """Return the data of a map, of its contours, and of their labels, which stand at different parts of the lines."""
     half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
     wide, high = x[-1] - x[0] + 2 * half_x, y[-1] - y[0] + 2 * half_y
     percent = np.repeat(10 ** y[:, None], x.size, axis=1)
-    contours, labels = contour_generator(x, y, p), []
-    lines: dict[float, list[Any]] = {level: list(contours.lines(level)) for level in LABELLED}
-    for level, part in LABELLED.items():
+    generator, labels = contour_generator(x, y, p), []
+    lines: dict[float, list[Any]] = {level: list(generator.lines(level)) for level in LABELLED}
+    for level, position in LABELLED.items():
         if lines[level]:
             longest = max(lines[level], key=len)
-            at = longest[np.argsort(longest[:, 0])][int(part * (len(longest) - 1))]
-            labels.append((float(at[0]), float(at[1]), f"{100 * level:g} %"))
+            point = longest[np.argsort(longest[:, 0])][int(position * (len(longest) - 1))]
+            labels.append((float(point[0]), float(point[1]), f"{100 * level:g} %"))
 
     def columns(*levels: float) -> list[list[list[float]]]:
-        each = [line for level in levels for line in lines[level]]
-        return [[line[:, axis].tolist() for line in each] for axis in (0, 1)]
+        contours = [line for level in levels for line in lines[level]]
+        return [[line[:, axis].tolist() for line in contours] for axis in (0, 1)]
 
     return {
         "map": ([p], [percent], [x[0] - half_x], [y[0] - half_y], [wide], [high]),
@@ -265,11 +267,11 @@ MOST_DOTS = 500
 def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
     """Return the forecast with the flare's own model for each of `ASSUMED`."""
     case = closed.case
-    own = dict(list(models_of(case).items())[-1:])
+    own_model = dict(list(models_of(case).items())[-1:])
     measurements = {}
     for name, nuisances in ASSUMED.items():
         assumed = case.with_sections(nuisances=nuisances)
-        (measurements[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own)
+        (measurements[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own_model)
     return measurements
 
 
@@ -279,9 +281,8 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
     (
         # Errors with other unknowns may be the same: dashes show the curve below.
         *(
-            Line(called, colour, name, width=2, dash="dashed" * (name == "free"),
-                 tips=("amplitude (%)", f"{called} (%)"))
-            for called, name, colour in zip(ASSUMED, NAMES, ("flare", "star", "sky"), strict=True)
+            Line(label, colour, name, width=2, dash="dashed" * (name == "free"), tips=("amplitude (%)", f"{label} (%)"))
+            for label, name, colour in zip(ASSUMED, NAMES, ("flare", "star", "sky"), strict=True)
         ),
         Own(),
     ),
@@ -290,15 +291,15 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
 def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the relative error of the temperature against the amplitude of the flare."""
     # Fewer amplitudes than in files suffice.
-    own, factors, series = 100 * closed.case.study.flare.amplitudes[0], FACTORS[::3], dict[str, Any]()
+    percent, factors, series = 100 * closed.case.study.flare.amplitudes[0], FACTORS[::3], dict[str, Any]()
     for name, measurement in zip(NAMES, expected(closed).values(), strict=True):
         ahead = measurement.forecasts(factors, measurement.unknown)
-        series[name] = own * factors, [100 * f.errors[0] / f.values[0] for f in ahead]
+        series[name] = percent * factors, [100 * f.errors[0] / f.values[0] for f in ahead]
     all_known, *_, free = expected(closed).values()
-    which = "temperature" if isinstance(all_known.fitted, FlareModel) else "lower temperature"
-    series["own"] = [own], [100 * all_known.ahead.errors[0] / all_known.ahead.values[0]]
+    quantity = "temperature" if isinstance(all_known.fitted, FlareModel) else "lower temperature"
+    series["own"] = [percent], [100 * all_known.ahead.errors[0] / all_known.ahead.values[0]]
     text = (
-        f"With everything known the {which} has a standard error of {short(all_known.ahead.errors[0])} K, with dark "
+        f"With everything known the {quantity} has a standard error of {short(all_known.ahead.errors[0])} K, with dark "
         f"level and star unknown one of {short(free.ahead.errors[0])} K."
     )
     return ChartData(text, series)
@@ -324,8 +325,8 @@ def region(closed: ClosedForms, answers: Answers) -> ChartData:
     series: dict[str, Any] = {"own": ([best[0]], [100 * best[1]])}
     if "measure" in answers:
         # The last fits are those of the flare's own model.
-        some = answers["measure"].flares[-1].found.estimates[:MOST_DOTS]
-        series["fits"] = some[:, 0], 100 * some[:, 1]
+        estimates = answers["measure"].flares[-1].found.estimates[:MOST_DOTS]
+        series["fits"] = estimates[:, 0], 100 * estimates[:, 1]
     one_temperature = isinstance(all_known.fitted, FlareModel)
     for name, measurement in (("known", all_known), ("free", free)):
         kelvin, low, high = measurement.region(RISES["95 %"]) if one_temperature else _ellipse(best, measurement.ahead)
@@ -378,15 +379,15 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
         near = (since > -NEAR[0]) & (since < NEAR[1])
         for name, fit in (("true", stare_fit.joint.true), ("joint", stare_fit.joint.fitted)):
             series[name] = stare.middle_s[near], fit.kelvin[near]
-        found = stare_fit.joint.found
-        each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
-        words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
+        fits = stare_fit.joint.found
+        rows = zip(fits.names[:4], fits.units, fits.estimates[0], fits.errors[0], strict=False)
+        words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in rows]
     if stare_fit.unmeasured:
         words.append(stare_fit.unmeasured)
     elif stare_fit.drawn is not None:
-        bins, found = stare_fit.drawn, stare_fit.drawn.found
-        x, kelvin = (bins.start_s + bins.end_s) / 2, found.estimates[:, 0]
-        ends = (np.where(np.isfinite(end), end, kelvin) for end in (found.low[-1, :, 0], found.high[-1, :, 0]))
+        bins, fits = stare_fit.drawn, stare_fit.drawn.found
+        x, kelvin = (bins.start_s + bins.end_s) / 2, fits.estimates[:, 0]
+        ends = (np.where(np.isfinite(end), end, kelvin) for end in (fits.low[-1, :, 0], fits.high[-1, :, 0]))
         series |= {"estimates": (x, kelvin), "bins": (x, *ends)}
         two = not isinstance(next(iter(expected(closed).values())).fitted, FlareModel)
         words.append(f"{x.size} bins of frames{', each fitted with one temperature' if two else ''}")
@@ -395,13 +396,13 @@ def course(closed: ClosedForms, answers: Answers) -> ChartData:
 
 def measured(closed: ClosedForms, answers: Answers) -> View:
     """Return the errors of each quantity, and the counts of simulated fits."""
-    each = expected(closed)
-    first, *_ = each.values()
-    errors = [measurement.ahead.errors for measurement in each.values()]
+    measurements = expected(closed)
+    first, *_ = measurements.values()
+    errors = [measurement.ahead.errors for measurement in measurements.values()]
     rows = zip(first.ahead.names, first.ahead.units, first.truth, *errors, strict=True)
-    table = [dict(zip(("quantity", "unit", "truth", *each), row, strict=True)) for row in rows]
+    table = [dict(zip(("quantity", "unit", "truth", *measurements), row, strict=True)) for row in rows]
     verb = {column.name: column for column in COLUMNS}
-    of_error = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
+    of_error = [replace(verb["error"], name=name, heading=f"error, {name}") for name in measurements]
     columns = [verb["quantity"], verb["unit"], verb["truth"], *of_error]
     if "measure" in answers:
         counts = records(answers["measure"].flares[-1].rows())
@@ -423,7 +424,7 @@ MEASUREMENT = Tab(
 )
 
 
-#: Half-widths of the flares: as many as there are lines.
+#: Names of the half-widths of injected flares, one per line of the picture.
 LENGTHS = ("shortest", "middle", "longest")
 
 
@@ -434,11 +435,11 @@ LENGTHS = ("shortest", "middle", "longest")
     (
         *(
             series
-            for k, called in enumerate(LENGTHS)
+            for k, length in enumerate(LENGTHS)
             for series in (
-                Area(f"{called} flares", called, f"band {k}", listed=False),
-                Line(f"{called} flares", called, f"line {k}", width=2,
-                     tips=("amplitude (%)", f"found of the {called}")),
+                Area(f"{length} flares", length, f"band {k}", listed=False),
+                Line(f"{length} flares", length, f"line {k}", width=2,
+                     tips=("amplitude (%)", f"found of the {length}")),
             )
         ),
         Rule("amplitude of your question", "own", "own"),
@@ -453,15 +454,15 @@ def shares(closed: ClosedForms, answers: Answers) -> ChartData:
             "orbit, and searches it."
         )
         return ChartData(text, series)
-    injected, parts = answers["completeness"].stars[0].injected, []
+    injected, clauses = answers["completeness"].stars[0].injected, []
     for k, width in enumerate(injected.half_widths_s):
         x, share = 100 * injected.sizes, injected.completeness[k]
         series[f"line {k}"] = x, share
         series[f"band {k}"] = x, injected.completeness_low[k], injected.completeness_high[k]
-        seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
-        parts.append(f"{chance_text(seen)} of those of half-width {short(width)} s")
+        completeness = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
+        clauses.append(f"{chance_text(completeness)} of those of half-width {short(width)} s")
     peak = f"{closed.question.amplitude_percent:g} %"
-    return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", series)
+    return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(clauses)}.", series)
 
 
 COMPLETENESS = Tab(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from mauvecl.answers.change import ChangeAnswer
     from mauvecl.answers.plan import PlanAnswer
+    from mauvecl.answers.visible import VisibleAnswer
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.frames import Frames
     from mauvecl.web.closed_forms import ClosedForms, FieldValues
@@ -41,7 +42,7 @@ NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
 @light_curves.LIGHT_CURVE.data()
 def light_curve(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the light curve, its quiescent level, and the events."""
-    frames: Frames | None = closed.given.get("frames")
+    frames: Frames | None = closed.inputs.get("frames")
     if frames is None:
         return ChartData(NO_FRAMES)
     text, answer = f"{frames.n_frames} frames of {frames.name}. Analyse searches them for flares.", None
@@ -75,7 +76,7 @@ def _image(canvas: Canvas, source: ColumnDataSource) -> None:
 ).data()  # fmt: skip
 def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return every spectrum against time, in standard deviations from the median."""
-    frames: Frames | None = closed.given.get("frames")
+    frames: Frames | None = closed.inputs.get("frames")
     if frames is None or frames.wavelength_nm is None:
         return ChartData("A light curve has no spectra." if frames else NO_FRAMES)
     nm = frames.wavelength_nm
@@ -125,7 +126,7 @@ ANALYSE = Tab(
     files=dict.fromkeys(("events", "measured", "frames", "noise", "limits", "completeness"), "analyse"),
     documents={"analyse.html": "analyse"},
     needs="frames",
-    given=read_frames,
+    read_inputs=read_frames,
     words=name_of("frames", "no file of frames yet"),
 )
 
@@ -138,7 +139,7 @@ def read_observations(question: FieldValues) -> dict[str, Any]:
     for row in archive.rows:
         mapping = files[str(row.mapping)] if row.mapping else None
         frames.append(read_frames_of(files[str(row.frames)], mapping))
-        if sum(some.flux.size for some in frames) > MOST_VALUES:
+        if sum(file.flux.size for file in frames) > MOST_VALUES:
             fault = f"the archive holds more than {MOST_VALUES} raw values; give fewer, or use the command line"
             raise InputError(fault, key="observations")
         if row.spectrum is None:
@@ -158,7 +159,7 @@ CALIBRATE = Tab(
     files=dict.fromkeys(("calibrate", "fits", "throughput", "dark"), "calibrate"),
     documents={"instrument.zip": "calibrate"},
     needs="observations",
-    given=read_observations,
+    read_inputs=read_observations,
     words=name_of("observations", "no observations yet"),
 )
 
@@ -167,17 +168,17 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
     """Return the chart of the smallest changes of some units, with the factor from each to that of the axis."""
 
     def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
-        here = [row for row in answer.changes if row.change.unit in units]
-        sizes = [units[row.change.unit] * row.smallest.one for row in here]
+        rows = [row for row in answer.changes if row.change.unit in units]
+        sizes = [units[row.change.unit] * row.smallest.one for row in rows]
         words = [f"{spectra.shown_name(row.change.name)} {'hidden' if np.isinf(size) else f'{size:.3g}'}"
-                 for row, size in zip(here, sizes, strict=True)]  # fmt: skip
-        own = [size for size in sizes if not np.isinf(size)]
+                 for row, size in zip(rows, sizes, strict=True)]  # fmt: skip
+        finite = [size for size in sizes if not np.isinf(size)]
         text = (
             f"Smallest changes between {answer.study.change.visits} visits, in {label}: "
             f"{'; '.join(words) or 'none of this kind'}."
         )
         lines = spectra.along_magnitude(answer, units)
-        return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(own), own)})
+        return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(finite), finite)})
 
     axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
     changes = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
@@ -223,9 +224,10 @@ def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
     x, y = (values.ravel() for values in np.meshgrid(r.periods_d, r.amplitudes))
     wide, high = (np.sqrt(points[1] / points[0]) for points in (r.periods_d, r.amplitudes))
     share = row.shares("value").ravel()
-    each = [(row.error, row.change) for row in answer.periods]
     errors = "; ".join(
-        f"{spectra.shown_name(of.name)} {error * (1 if of.unit else 100):.3g} {of.unit or '%'}" for error, of in each
+        f"{spectra.shown_name(row.change.name)} {row.error * (1 if row.change.unit else 100):.3g} "
+        f"{row.change.unit or '%'}"
+        for row in answer.periods
     )
     text = (
         f"{r.time_d.size} visits within {np.ptp(r.time_d):.0f} days recover {100 * np.mean(share):.0f} % of the "
@@ -252,7 +254,7 @@ PERIODS = Tab(
 )
 
 
-#: Ends of the axes, erg, the same for all questions; what is shown of `Planned.by_energy`.
+#: Limits of the energy axes, erg, the same for all questions; columns of `Planned.by_energy` in the pictures.
 ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 
 
@@ -281,13 +283,13 @@ ENERGY = Axis("bolometric energy of the flare (erg)", log=True, limits=ENERGIES)
 ).data("plan", "The share of flares that are found on each target, against their energy.")  # fmt: skip
 def recovered(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     """Return the fraction of flares that the search recovers against their energy."""
-    parts = [
+    clauses = [
         f"{row['target']}: half of the flares at {_energy(row['E50'])}, 90 % at {_energy(row['E90'])}"
         if row["seen"] > 0
         else f"{row['target']} is never seen"
         for row in answer.table
     ]
-    return ChartData(f"Recovered: {'; '.join(parts)}.", {"recovered": [columns[:3] for columns in _columns(answer)]})
+    return ChartData(f"Recovered: {'; '.join(clauses)}.", {"recovered": [columns[:3] for columns in _columns(answer)]})
 
 
 @Chart(
@@ -296,16 +298,16 @@ def recovered(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
 ).data("plan", "The number of flares expected to be found on each target.")  # fmt: skip
 def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     """Return the numbers of recovered flares above an energy."""
-    lines, parts = [], []
+    lines, clauses = [], []
     for row, (name, energy, recovered, above) in zip(answer.table, _columns(answer), strict=True):
         # Each step of the rate is recovered as at its middle.
         steps = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
         flares = np.append(np.cumsum(steps[::-1])[::-1], 0.0) + (above[-1] * recovered[-1] if above.size else 0.0)
         lines.append((name, energy, np.where(flares > 0, flares, np.nan)[: energy.size]))
         number = f"{row['expected']:.3g} flares" if np.isfinite(row["expected"]) else "no rates are known"
-        seen = f"{row['target']} in {short(row['hours'].value)} h: {number}"
-        parts.append(seen if row["seen"] > 0 else f"{row['target']} is never seen")
-    return ChartData(f"Expected to be recovered: {'; '.join(parts)}.", {"found": lines})
+        text = f"{row['target']} in {short(row['hours'].value)} h: {number}"
+        clauses.append(text if row["seen"] > 0 else f"{row['target']} is never seen")
+    return ChartData(f"Expected to be recovered: {'; '.join(clauses)}.", {"found": lines})
 
 
 def columns_of_plan(question: FieldValues) -> list[list[str]]:
@@ -333,26 +335,22 @@ PLAN = Tab(
 @Chart(
     "hours", "Hours in which targets are seen, day by day", Axis(kind="dates"),
     Axis("hours in the day", limits=(-0.5, 24.5)), (Targets("hours", tips=("hours",)),),
-).data()  # fmt: skip
-def hours(closed: ClosedForms, answers: Answers) -> ChartData:
+).data("visible", "For each target, how many hours of each day it is seen.")  # fmt: skip
+def hours(closed: ClosedForms, answer: VisibleAnswer) -> ChartData:
     """Return the daily hours of visibility."""
-    question = closed.question
-    names = [target["name"] for target in question.targets]
-    if "visible" not in answers:
-        text = "For each target, how many hours of each day it is seen."
-        return ChartData(text, {"hours": [(name, [], []) for name in names]})
-    table = answers["visible"].by_day
-    lines, parts = [], []
-    for name in names:
+    table = answer.by_day
+    lines, clauses = [], []
+    for target in closed.question.targets:
+        name = target["name"]
         rows = table[np.asarray(table["target"]) == name]
         hours = np.asarray(rows["hours"].to_value("h"))
         # Milliseconds, as browsers count time.
         lines.append((name, np.asarray(rows["day"], "datetime64[ms]").astype(float), hours))
-        parts.append(
+        clauses.append(
             f"{name} on {np.count_nonzero(hours)} of {hours.size} days, {short(float(hours.sum()))} h in all and "
             f"{hours.max():.3g} h on its best day"
         )
-    return ChartData(f"From {question.start} on are seen: {'; '.join(parts)}.", {"hours": lines})
+    return ChartData(f"From {closed.question.start} on are seen: {'; '.join(clauses)}.", {"hours": lines})
 
 
 VISIBILITY = Tab(

@@ -54,7 +54,7 @@ TABS: dict[str, Tab] = {
 }
 
 
-#: Questions that a button starts to simulate, with the first tab that has it.
+#: Questions that a button simulates, with the first tab that has the button.
 SIMULATIONS = {name: tab for tab in reversed(TABS.values()) for name in tab.simulations}
 
 
@@ -69,7 +69,7 @@ NOMINAL = "The throughput is nominal"
 CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
             "outside the prior"}  # fmt: skip
 #: Answers whose messages are shown, since they include those of the others.
-TOLD = ("detection", "measure")
+WITH_MESSAGES = ("detection", "measure")
 
 
 def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
@@ -94,10 +94,10 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "notes": _notes(messages),
         "simulated": sorted(name for name in answers if name not in ("snr", "draw", OTHER)),
         "files": [
-            f"{each.name} {name}"
-            for each in TABS.values()
-            for name in (*each.files, *each.documents)
-            if each.offers(name, answers)
+            f"{other.name} {name}"
+            for other in TABS.values()
+            for name in (*other.files, *other.documents)
+            if other.offers(name, answers)
         ],
     }
     return plain | (_with_chance(str(plain["headline"]), closed, answers) if tab.chance else {})
@@ -106,22 +106,22 @@ def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
 def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the entries of a card with the chance of detection; its headline is by default that of the closed form."""
     q, x = closed.question, closed.quiet
-    cut, both = closed.odds.threshold, chances(closed, answers)
-    shown = {chance.unknown: chance_text(chance.value) for chance in both}
-    (chosen,) = (chance for chance in both if chance.unknown == q.unknown)
+    threshold, of_choices = closed.odds.threshold, chances(closed, answers)
+    shown = {chance.unknown: chance_text(chance.value) for chance in of_choices}
+    (chosen,) = (chance for chance in of_choices if chance.unknown == q.unknown)
     if not headline and chosen.value == chosen.value:
-        ideal = q.unknown == REALISTIC and all(chance.value == chance.value for chance in both)
-        seen = shown[q.unknown] + (f" ({shown[IDEAL]} {IF_KNOWN})" if ideal else "")
-        seen = chance_of_flare(closed.case.study, closed.case.label, closed.case.amplitudes[0], x, seen)
-        headline = f"{seen}, by the estimate before a simulation."
-    told = [message for name in TOLD if name in answers for message in answers[name].messages]
+        ideal = q.unknown == REALISTIC and all(chance.value == chance.value for chance in of_choices)
+        text = shown[q.unknown] + (f" ({shown[IDEAL]} {IF_KNOWN})" if ideal else "")
+        text = chance_of_flare(closed.case.study, closed.case.label, closed.case.amplitudes[0], x, text)
+        headline = f"{text}, by the estimate before a simulation."
+    messages = [message for name in WITH_MESSAGES if name in answers for message in answers[name].messages]
     facts = []
     if "detection" in answers:
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
-        cut = float(row["threshold"])
+        threshold = float(row["threshold"])
         facts.append(("In closed form", chance_text(closed.chance)))
     facts += [
-        ("Threshold", f"{cut:.4g}" if cut == cut else "none"),
+        ("Threshold", f"{threshold:.4g}" if threshold == threshold else "none"),
         ("Expected with flare", f"{round(closed.odds.flaring.mean, 6) + 0.0:.4g}"),
         ("Best S/N per pixel", short(x.snr().max())),
         ("Best S/N per element", short(x.snr_per_element().max())),
@@ -133,25 +133,25 @@ def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[s
     return {
         "headline": headline,
         "numbers": [
-            {"unknown": of, "title": TITLES[of], "shown": shown[of], "value": None if p != p else p, "interval": how}
-            for of, p, how in both
+            {"unknown": of, "title": TITLES[of], "shown": shown[of], "value": None if p != p else p, "interval": origin}
+            for of, p, origin in of_choices
         ],
         "chosen": q.unknown,
         "shown": shown[q.unknown],
         "words": words,
         "facts": facts,
         # The card shows both chances itself.
-        "notes": _notes(m for m in (*told, *closed.messages) if m not in of_kind(told, BOTH_CHANCES)),
+        "notes": _notes(m for m in (*messages, *closed.messages) if m not in of_kind(messages, BOTH_CHANCES)),
     }
 
 
 def _notes(messages: Iterable[str]) -> list[tuple[str, str]]:
     """Return messages once each, and whether each is a danger to the answer or mere information."""
-    once = [m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]
-    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in once]
+    distinct = [m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]
+    return [(note(m), "danger" if getattr(m, "kind", "") in CHANGING else "info") for m in distinct]
 
 
-def _several(text: str) -> tuple[str, ...]:
+def _simulation_names(text: str) -> tuple[str, ...]:
     """Parse names of simulations, without repetitions."""
     names = [name for name in text.split(",") if name]
     if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
@@ -164,7 +164,7 @@ MOST_LINKED = 8192
 #: Entries of a link in addition to the question.
 SEEN = {
     "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
-    "simulated": Field(label="Simulated", hint="", first="", read=_several),
+    "simulated": Field(label="Simulated", hint="", first="", read=_simulation_names),
 }
 #: All entries of a link, and their values on a new page.
 ENTRIES = FIELDS | SEEN
@@ -174,27 +174,27 @@ FIRST = {name: field.read(field.first) for name, field in ENTRIES.items()}
 class State:
     """State of a page that a link gives: the text of each field in `entered`, valid or not, and the visitor's files.
 
-    `stray` is the message on entries of the link that are no fields, or that the page has no field to correct.
+    `stray` is the message on entries of the link that are no fields, or that no field of the page can correct.
     """
 
     def __init__(self, link: str = "", uploads: Mapping[str, Any] | None = None) -> None:
         self.uploads, self.stray, query = dict(uploads or {}), "", link.removeprefix("?")
         if len(query) > MOST_LINKED:
             query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
-        given = dict(parse_qsl(query, keep_blank_values=True, errors="replace"))
-        if strange := sorted(given.keys() - ENTRIES.keys()):
-            self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
-        if given.get("unknown") in FORMER_VALUES["unknown"]:
+        texts = dict(parse_qsl(query, keep_blank_values=True, errors="replace"))
+        if unknown := sorted(texts.keys() - ENTRIES.keys()):
+            self.stray = f"The link holds {shortened(', '.join(unknown))}, which is no field here; it was left out."
+        if texts.get("unknown") in FORMER_VALUES["unknown"]:
             self.stray += " The link is of version 1: its payload and unknowns have other names today."
-            given |= {
-                name: words.get(given[name], given[name]) for name, words in FORMER_VALUES.items() if name in given
-            }
+            for name, values in FORMER_VALUES.items():
+                if name in texts:
+                    texts[name] = values.get(texts[name], texts[name])
         self.entered = {name: field.first for name, field in ENTRIES.items()}
         self._values, self._invalid = dict(FIRST), dict[str, str]()
         for name, field in ENTRIES.items():
-            if name not in given:
+            if name not in texts:
                 continue
-            text = given[name]
+            text = texts[name]
             self.entered[name] = text[: field.characters]
             try:
                 if len(text) > field.characters:
@@ -211,7 +211,7 @@ class State:
 
     def faults_of(self, names: Collection[str]) -> dict[str, str]:
         """Return the error messages of some fields, with those of values that cannot be together."""
-        faults = {name: why for name, why in self._invalid.items() if name in names}
+        faults = {name: message for name, message in self._invalid.items() if name in names}
         checks: dict[str, Callable[[], Any]] = {}
         if "fap" not in self._invalid:
             checks["realisations"] = lambda: check_fap(self._values["fap"], *self._values["realisations"])
@@ -227,40 +227,40 @@ class State:
                     faults[name] = sentence(error)
         return faults
 
-    def asked(self, names: Collection[str]) -> tuple[str, ...]:
+    def texts(self, names: Collection[str]) -> tuple[str, ...]:
         """Return the text of the named fields, on which an answer depends."""
         return tuple(self.entered[name] for name in FIELDS if name in names)
 
     def question(self, names: Collection[str] = tuple(FIELDS)) -> FieldValues:
-        """Return the question, whose other fields have their first values."""
+        """Return the question of the named fields; all others have their first values."""
         faults = self.faults_of(names)
         if faults:
-            all_of_them = "; ".join(f"{ENTRIES[name].label}: {why}" for name, why in faults.items())
-            raise InputError(all_of_them, key=next(iter(faults)))
+            messages = (f"{ENTRIES[name].label}: {message}" for name, message in faults.items())
+            raise InputError("; ".join(messages), key=next(iter(faults)))
         values = {name: (self._values if name in names else FIRST)[name] for name in FIELDS}
-        holding = [name for name in UPLOADS if name in names and self.entered[name] == UPLOADS[name].entered]
-        return FieldValues(values, {name: self.uploads[name] for name in holding})
+        uploaded = [name for name in UPLOADS if name in names and self.entered[name] == UPLOADS[name].entered]
+        return FieldValues(values, {name: self.uploads[name] for name in uploaded})
 
 
-def known(state: State) -> dict[str, Any]:
+def known_values(state: State) -> dict[str, Any]:
     """Return the known values of the star and of each target, and the values that can be entered for it.
 
     The star has ``about`` in words, ``given``, texts of fields, and ``offer``, the words of a button that enters them;
     ``targets`` has texts by the columns of the table for each row.
     """
-    about: dict[str, Any] = {"about": "", "given": {}, "offer": ""}
-    text = state.entered["star"]
-    star = None if text == UPLOADED else resolve(text, own=False)
+    known: dict[str, Any] = {"about": "", "given": {}, "offer": ""}
+    name = state.entered["star"]
+    star = None if name == UPLOADED else resolve(name, own=False)
     if star is not None and star.entry is not None:
         magnitude = f"{star.entry.magnitude:g}"
-        given = {"magnitude": magnitude, "band": "V", "target": star.name}
-        about = {"about": star.entry.about, "given": given, "offer": f"Use V = {magnitude}"}
+        texts = {"magnitude": magnitude, "band": "V", "target": star.name}
+        known = {"about": star.entry.about, "given": texts, "offer": f"Use V = {magnitude}"}
     elif star is not None and star.light is None:
-        about["about"] = listed_note(text)
+        known["about"] = listed_note(name)
     rows: tuple[dict[str, Any], ...] = ()
     with contextlib.suppress(InputError):
         rows = targets(state.entered["targets"], check=False)
-    return {"star": about, "targets": list(map(_target, rows))}
+    return {"star": known, "targets": list(map(_target, rows))}
 
 
 def _target(row: dict[str, Any]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -21,11 +22,11 @@ from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
 MEMORY_MIB = 1536
-#: Seconds that it may take, by the clock and of a processor.
+#: Seconds that it may take, by the clock and of processor time.
 SECONDS = 20
-#: Content that a file of a visitor's may unpack to, MiB.
+#: Largest size to which a visitor's file may unpack, MiB.
 CONTENT_MIB = 64
-#: Readers at the same time; other visitors wait for their turn, but no longer than `SECONDS`.
+#: Number of readers at the same time; other visitors wait for their turn, but no longer than `SECONDS`.
 TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
@@ -48,10 +49,10 @@ def read_limited(kind: Callable[..., T], reader: Callable[..., T], files: Mappin
         answer = _read_apart(reader, files, options)
     finally:
         _turns.release()
-    with np.load(io.BytesIO(answer), allow_pickle=False) as read:
-        words = json.loads(str(read["words"]))
+    with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
+        words = json.loads(str(arrays["words"]))
         values = {name: tuple(value) if isinstance(value, list) else value for name, value in words.items()}
-        return kind(**values, **{name: read[name] for name in read.files if name != "words"})
+        return kind(**values, **{name: arrays[name] for name in arrays.files if name != "words"})
 
 
 def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options: dict[str, Any]) -> bytes:
@@ -64,16 +65,16 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
         # The reading process starts in another folder than that of the package.
         "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
     }
-    named = f"{reader.__module__}:{reader.__qualname__}"
-    words = json.dumps({"reader": named, "file": next(iter(files)), "options": options})
+    name = f"{reader.__module__}:{reader.__qualname__}"
+    words = json.dumps({"reader": name, "file": next(iter(files)), "options": options})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
     command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), words]
-    smaller, other = EXPECTED_FRAMES if named.startswith("mauvecl.observations.") else EXPECTED_SPECTRUM
+    smaller, expected = EXPECTED_FRAMES if name.startswith("mauvecl.observations.") else EXPECTED_SPECTRUM
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
-        for name, content in files.items():
-            (Path(folder) / name).write_bytes(content)
+        for file, content in files.items():
+            (Path(folder) / file).write_bytes(content)
         try:
-            done = subprocess.run(
+            process = subprocess.run(
                 command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
             )
         except subprocess.TimeoutExpired as error:
@@ -81,14 +82,14 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
         except OSError as error:
             fault = f"the upload cannot be read now ({error.strerror}): try again later"
             raise InputError(fault, key="upload") from error
-    if done.returncode == 0:
-        return done.stdout
+    if process.returncode == 0:
+        return process.stdout
     reasons = {
         # The reader prints its error as a sentence.
-        _REFUSED: done.stderr.decode("utf-8", "replace").strip(),
+        _REFUSED: process.stderr.decode("utf-8", "replace").strip(),
         _NO_ROOM: f"the upload takes more than {MEMORY_MIB} MiB of memory to read; give {smaller}",
     }
-    raise InputError(reasons.get(done.returncode, f"the upload ended its reader; give {other}"), key="upload")
+    raise InputError(reasons.get(process.returncode, f"the upload ended its reader; give {expected}"), key="upload")
 
 
 def _main() -> int:
@@ -96,22 +97,20 @@ def _main() -> int:
     import resource
 
     memory_mib, seconds, words = sys.argv[1:]
-    asked = json.loads(words)
+    request = json.loads(words)
     # Memory, time and files are limited permanently.
     limits = {"AS": int(memory_mib) << 20, "CPU": int(seconds), "FSIZE": 64 << 20, "CORE": 0, "NPROC": 0}
     for name, value in limits.items():
-        kind = getattr(resource, f"RLIMIT_{name}")
-        _, hard = resource.getrlimit(kind)
-        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        resource.setrlimit(kind, (value, value))
+        # A lower limit of the server's holds as well.
+        with contextlib.suppress(ValueError):
+            resource.setrlimit(getattr(resource, f"RLIMIT_{name}"), (value, value))
     try:
-        content = resolve_name(asked["reader"])(Path(asked["file"]), **asked["options"])
+        content = resolve_name(request["reader"])(Path(request["file"]), **request["options"])
         values = {field.name: getattr(content, field.name) for field in fields(content)}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        rest = json.dumps({name: value for name, value in values.items() if name not in arrays})
+        words = json.dumps({name: value for name, value in values.items() if name not in arrays})
         out = io.BytesIO()
-        save: Any = np.savez
-        save(out, words=np.array(rest), **arrays)
+        np.savez(out, words=np.array(words), **arrays)  # type: ignore[arg-type]
     except InputError as error:
         print(error, file=sys.stderr)
         return _REFUSED

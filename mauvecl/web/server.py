@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import gc
-import gzip
 import hashlib
 import ipaddress
 import json
@@ -18,8 +17,9 @@ import tempfile
 import time
 import traceback
 import webbrowser
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from mako.lookup import TemplateLookup
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
 from tornado.iostream import IOStream
-from tornado.web import Application, HTTPError, RequestHandler
+from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
 from mauvecl.answers.verbs import GROUPS
 from mauvecl.host import VERSION
@@ -42,7 +42,7 @@ from mauvecl.web.closed_forms import TITLES, ClosedForms
 from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
-from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, release_memory, shown
+from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, content_of, release_memory
 
 if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
@@ -88,29 +88,27 @@ def hosts(address: str, port: int, allowed: Sequence[str]) -> frozenset[str]:
             "visitors' browsers will show, such as https://mauve.example.org",
             key="address",
         )
-    own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
-    return frozenset(plain(host) for host in (*named, *(netloc(host, port) for host in own)))
+    addresses = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
+    return frozenset(plain(host) for host in (*named, *(netloc(address, port) for address in addresses)))
 
 
 class PageApplication(Application):
-    """Application that refuses requests which do not come from pages of the allowed `hosts`."""
-
-    allowed: frozenset[str]
+    """Application that refuses requests which do not come from pages of the `hosts` in its settings."""
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
         """Return the handler of a request, or of a refusal: unknown names (DNS rebinding) and other servers' pages."""
-        origins, talks = request.headers.get_list("Origin"), request.path == "/live"
-        status, why = 403, ""
-        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self.allowed]:
-            why = "The page is not served under this host name; see `mauvecl serve --allow-origin`."
-        elif any(plain(re.sub(r"^https?://", "", given.lower())) not in self.allowed for given in origins):
-            why = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
-        elif talks and not origins:
-            why = "Expected a connection from the page."
-        elif (talks or request.path == "/") and len(Visitor.here) >= MAX_VISITORS:
-            status, why = 503, "Too many visitors are here at the moment; please come again in some minutes."
-        if why:
-            return self.get_handler_delegate(request, ContentHandler, {"status": status, "why": why})
+        origins, allowed = request.headers.get_list("Origin"), self.settings["hosts"]
+        status, message, is_visitor = 403, "", request.path == "/live"
+        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in allowed]:
+            message = "The page is not served under this host name; see `mauvecl serve --allow-origin`."
+        elif any(plain(re.sub(r"^https?://", "", origin.lower())) not in allowed for origin in origins):
+            message = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
+        elif is_visitor and not origins:
+            message = "Expected a connection from the page."
+        elif (is_visitor or request.path == "/") and len(Visitor.connected) >= MAX_VISITORS:
+            status, message = 503, "Too many visitors are here at the moment; please come again in some minutes."
+        if message:
+            return self.get_handler_delegate(request, RefusalHandler, {"status": status, "message": message})
         return super().find_handler(request, **kwargs)
 
 
@@ -125,8 +123,8 @@ class BoundedServer(HTTPServer):
         self.streams = [stream for stream in self.streams if not stream.closed()]
         if len(self.streams) >= self.max_connections:
             # There are fewer pages than connections.
-            pages = {id(page.ws_connection.stream) for page in Visitor.here if page.ws_connection is not None}
-            next(other for other in self.streams if id(other) not in pages).close()
+            pages = {id(page.ws_connection.stream) for page in Visitor.connected if page.ws_connection is not None}
+            next(oldest for oldest in self.streams if id(oldest) not in pages).close()
         self.streams.append(stream)
         super().handle_stream(stream, address)
 
@@ -136,7 +134,7 @@ MOST = 1200
 
 
 class OneLine(logging.Formatter):
-    """Formatter of one bounded line: time, level, logger, message and, for exceptions, their lines in mauvecl."""
+    """Formatter that writes one line of bounded length, with the lines of mauvecl in the traceback of an exception."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
@@ -159,6 +157,8 @@ REQUEST_S = 20.0
 MAX_CONNECTIONS = 512
 #: Seconds after which unused pages are disconnected, and interval of this check.
 IDLE_S, SWEEP_S = 3600, 5
+#: Threads, besides the event loop, that compute closed forms, pictures and files for all visitors.
+CLOSED_FORMS = 2
 #: Seconds between pings of a connection, which is closed if it does not reply.
 PING_S = 20
 
@@ -169,24 +169,22 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     Raises InputError if the address is invalid or accepts other machines without an origin, and OSError if the port is
     taken.
     """
-
-    def asked_figure(handler: RequestHandler, theme: str, name: str) -> bytes | None:
-        return figure(theme, name, "".join(sorted(set(handler.get_query_argument("log", ""))))[:2])
-
     application = PageApplication(
         [
-            (r"/", ContentHandler, {"content": lambda _: front()}),
+            (r"/", FrontHandler),
             (r"/live", Visitor),
-            (r"/figures/([a-z]+)/([a-z]+)\.json", ContentHandler, {"content": asked_figure}),
-            (r"/(favicon\.svg)", ContentHandler, {"content": lambda _, name: asset(name)}),
-            (r"/assets/([a-z0-9.-]+)", ContentHandler, {"content": lambda _, name: asset(name)}),
+            (r"/figures/([a-z]+)/([a-z]+)\.json", FigureHandler),
+            (r"/(favicon\.svg)", AssetHandler, {"path": ASSETS}),
+            (r"/assets/(bokeh\.min\.js)", AssetHandler, {"path": Path(bokeh.__file__).parent / "server/static/js"}),
+            (r"/assets/([a-z0-9-]+\.(?:js|css|svg|fits))", AssetHandler, {"path": ASSETS}),
         ],
+        compress_response=True,
         websocket_max_message_size=MESSAGE,
         websocket_ping_interval=PING_S,
-        default_handler_class=ContentHandler,
+        default_handler_class=RefusalHandler,
         log_function=lambda handler: None,
+        hosts=hosts(address, port, allowed),
     )
-    application.allowed = hosts(address, port, allowed)
     limits = {"max_body_size": BODY, "max_buffer_size": MESSAGE}
     server = BoundedServer(application, **limits, idle_connection_timeout=REQUEST_S, body_timeout=REQUEST_S)
     server.max_connections, server.streams = MAX_CONNECTIONS, []
@@ -200,7 +198,7 @@ def close_unused() -> None:
         Visitor.has_left = False
         READER.submit(release_memory)
     now = time.monotonic()
-    for visitor in list(Visitor.here):
+    for visitor in list(Visitor.connected):
         if now - visitor.used > IDLE_S and visitor.job is None:
             visitor.close(UNUSED, "not used for a long time")
 
@@ -210,15 +208,14 @@ def warm() -> None:
     with tempfile.TemporaryDirectory() as folder:
         closed = ClosedForms.of(State().question(), Path(folder))
     for tab in TABS.values():
-        shown(tab, closed, {})
+        content_of(tab, closed, {})
     Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
-    # What every visitor requests; pictures of other tabs follow on request. The page's digest packs the other assets.
-    for content in (front(), asset("bokeh.min.js")):
-        packed(content or b"")
+    # What every visitor requests; pictures of other tabs follow on request.
+    front()
     for picture in next(iter(TABS.values())).pictures:
         usual = "".join(axis.lower() for axis in picture.logs if axis.isupper())
         for theme in INKS:
-            packed(figure(theme, picture.name, usual) or b"")
+            figure(theme, picture.name, usual)
     # Objects that exist now are permanent, so garbage collection need not scan them again.
     gc.collect()
     gc.freeze()
@@ -228,6 +225,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     """Serve the page until interrupted; parameters and errors as for `make`."""
 
     async def run() -> None:
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(CLOSED_FORMS, "mauvecl-closed"))
         # Exit normally on SIGTERM, so that the folders of visitors are removed.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         make(address, port, allow_origin)
@@ -244,7 +242,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
             await asyncio.Event().wait()
         finally:
             # Simulations would keep the process until they end.
-            for visitor in list(Visitor.here):
+            for visitor in list(Visitor.connected):
                 visitor.on_close()
 
     # Warnings and errors of all libraries have one format; bokeh and tornado write their own otherwise.
@@ -260,8 +258,10 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     asyncio.run(run())
 
 
-#: The page connects to its own server only, and runs only its own code.
+#: The page connects to its own server only, and runs only its own code. Browsers ask whether a file has changed, unless
+#: its address states its version.
 HEADERS = {
+    "Cache-Control": "no-cache",
     "Content-Security-Policy": (
         "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -269,39 +269,16 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
 }
-KINDS = {
-    "js": "text/javascript; charset=utf-8",
-    "css": "text/css; charset=utf-8",
-    "svg": "image/svg+xml",
-    "json": "application/json",
-    "html": "text/html; charset=utf-8",
-    "fits": "application/fits",
-}
-_FOLDER = Path(__file__).parent / "assets"
-
-
-@cache
-def packed(content: bytes) -> bytes:
-    """Compress content with gzip."""
-    return gzip.compress(content, 6, mtime=0)
-
-
-@cache
-def asset(name: str) -> bytes | None:
-    """Return an asset of the page; BokehJS comes from its own package."""
-    if name == "bokeh.min.js":
-        return (Path(bokeh.__file__).parent / "server" / "static" / "js" / name).read_bytes()
-    path = _FOLDER / name
-    return path.read_bytes() if path.suffix[1:] in KINDS and path.is_file() else None
+ASSETS = Path(__file__).parent / "assets"
 
 
 @cache
 def front() -> bytes:
     """Return the page."""
     # The digest of all assets, so that browsers do not use old ones.
-    assets = [packed(content) for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
-    digest = hashlib.sha256(b"".join(assets)).hexdigest()[:12]
-    lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
+    assets = [path.read_bytes() for path in sorted(ASSETS.iterdir())]
+    digest = hashlib.sha256(b"".join([f"{VERSION} {bokeh.__version__}".encode(), *assets])).hexdigest()[:12]
+    lookup = TemplateLookup([str(ASSETS)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
         fields=fields, uploads=UPLOADS, examples=EXAMPLES, names=[star.name for star in well_known_stars()],
@@ -363,17 +340,8 @@ def figure(theme: str, name: str, logs: str) -> bytes | None:
     return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
 
 
-class ContentHandler(RequestHandler):
-    """Handler of static content, or without any of requests that are refused."""
-
-    def initialize(self, content: Callable[..., bytes | None] | None = None, status: int = 404, why: str = "") -> None:
-        """Set the function that returns content for the handler and parts of the address, or the refusal."""
-        self._content, self._status, self._why = content, status, why
-
-    def prepare(self) -> None:
-        """Refuse any request if there is no content."""
-        if self._content is None:
-            self.send_error(self._status)
+class PageHandler(RequestHandler):
+    """Base of the page's handlers, with their headers and messages without internal details."""
 
     def set_default_headers(self) -> None:
         """Set the headers of every answer."""
@@ -381,27 +349,48 @@ class ContentHandler(RequestHandler):
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
-    def get(self, *names: str) -> None:
-        """Send content, or status 404 if there is none; a file with its digest in its address never changes.
-
-        Tornado adds a tag of the content, and sends status 304 if the browser has it.
-        """
-        if self._content is None or (content := self._content(self, *names)) is None:
-            raise HTTPError(404)
-        # Addresses end in the kind of content, but for that of the page.
-        self.set_header("Content-Type", KINDS.get(self.request.path.rpartition(".")[2], KINDS["html"]))
-        self.set_header("Vary", "Accept-Encoding")
-        keep = "v" in self.request.arguments and self.request.path != "/"
-        self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
-        if "gzip" in self.request.headers.get("Accept-Encoding", ""):
-            self.set_header("Content-Encoding", "gzip")
-            content = packed(content)
-        self.finish(content)
-
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Send a message without internal details."""
+        """Send the argument `message`, or a usual one."""
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         if status_code == 503:
             self.set_header("Retry-After", "60")
         usual = "There is no such page." if status_code == 404 else f"The page cannot answer this ({status_code})."
-        self.finish(f"{self._why or usual}\n")
+        self.finish(f"{kwargs.get('message', usual)}\n")
+
+
+class AssetHandler(PageHandler, StaticFileHandler):
+    """Handler of the page's files; one with its version in its address never changes."""
+
+
+class FrontHandler(PageHandler):
+    """Handler of the page itself."""
+
+    def get(self) -> None:
+        """Send the page."""
+        self.finish(front())
+
+
+class FigureHandler(PageHandler):
+    """Handler of empty figures."""
+
+    def get(self, theme: str, name: str) -> None:
+        """Send a figure, with the axes of the argument `log` in logarithms."""
+        content = figure(theme, name, "".join(sorted(set(self.get_query_argument("log", ""))))[:2])
+        if content is None:
+            raise HTTPError(404)
+        self.set_header("Content-Type", "application/json")
+        if "v" in self.request.arguments:
+            self.set_header("Cache-Control", f"max-age={StaticFileHandler.CACHE_MAX_AGE}")
+        self.finish(content)
+
+
+class RefusalHandler(PageHandler):
+    """Handler of requests that are refused, by default because there is no such page."""
+
+    def initialize(self, status: int = 404, **reason: str) -> None:
+        """Set the status, and the reason as the argument `message`."""
+        self._refusal = partial(self.send_error, status, **reason)
+
+    def prepare(self) -> None:
+        """Refuse the request."""
+        self._refusal()

@@ -65,11 +65,11 @@ def _changed(study: Study, **sections: dict[str, Any]) -> Study:
 
 @dataclass(frozen=True)
 class Simulation:
-    """Verbs that answer a question of the page, and the studies that they are asked."""
+    """Verbs that answer a question of the page, and the study that they receive."""
 
     #: Verbs that answer it. The page keeps the answer of the first under the question's name, others under their own.
     verbs: tuple[str, ...]
-    study: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
+    study: Callable[[Study], Study] = lambda study: study  # converts the study of the page
 
 
 def _fits(study: Study) -> Study:
@@ -86,30 +86,31 @@ QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
     "completeness": Simulation(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
     "periods": Simulation(("change",), partial(_changed, change={"periods": True})),
 }
-#: What verbs count that use the pool's devices.
+#: Units of the progress of verbs that use the pool's devices.
 DRAWN_UNITS = ("realisations", "steps", "cells")
 
 
 def simulate(
-    name: str, study: Study, pool: Pool, progress: Progress = None, *, given: Mapping[str, Any] | None = None
+    name: str, study: Study, pool: Pool, progress: Progress = None, *, inputs: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the answers to a question by name; its first verb reports its progress and takes the contents of files.
 
-    A detection has that with the other choice of unknowns next to it, which is left out if it is refused.
+    A detection also has the answer with the other choice of unknowns, unless that is refused.
     """
     question = QUESTIONS[name]
-    asked, (main, *more) = question.study(study), question.verbs
-    wanted = [(name, main, asked), *((verb, verb, asked) for verb in more)]
+    study, (main, *more) = question.study(study), question.verbs
+    questions = [(name, main, study), *((verb, verb, study) for verb in more)]
     if name == "detection":
-        wanted.append((OTHER, main, _changed(asked, nuisances={"usual": not asked.nuisances.usual})))
+        questions.append((OTHER, main, _changed(study, nuisances={"usual": not study.nuisances.usual})))
     # Each verb announces its own realisations alone.
-    pool.expect(asked.run.realisations * sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted))
+    n_draws = sum(VERBS[verb].counts == "realisations" for _, verb, _ in questions)
+    pool.expect(study.run.realisations * n_draws)
     answers: dict[str, Any] = {}
-    for called, verb, of in wanted:
+    for key, verb, study in questions:
         try:
-            answers[called] = VERBS[verb].ask(of, pool, progress, **(given or {} if verb == main else {}))
+            answers[key] = VERBS[verb].ask(study, pool, progress, **(inputs or {} if verb == main else {}))
         except InputError:
-            if called != OTHER:
+            if key != OTHER:
                 raise
     return answers
 
@@ -133,7 +134,7 @@ class Tab:
     title: str = ""
     about: str = ""  # what it shows, in a sentence
     pictures: tuple[Chart, ...] = ()
-    simulations: Mapping[str, str] = field(default_factory=dict)  # what can be simulated here, with labels of buttons
+    simulations: Mapping[str, str] = field(default_factory=dict)  # questions that its buttons simulate, with labels
     needs: str = ""  # field without which no simulation of it can start
     answer: str = ""  # name of the simulated answer whose table is below the pictures
     view: int = 0  # number of that table among the answer's `views`
@@ -149,7 +150,7 @@ class Tab:
     #: Its question in words, if it has no chance.
     words: Callable[[FieldValues], str] = lambda q: f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
     #: Reads the file of the field that it `needs` on a thread of its own, and returns arguments of the verb.
-    given: Callable[[FieldValues], dict[str, Any]] = lambda question: {}
+    read_inputs: Callable[[FieldValues], dict[str, Any]] = lambda question: {}
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
     also: tuple[str, ...] = ()
     never: tuple[str, ...] = ()
@@ -177,29 +178,31 @@ class Tab:
     def reads_of(self, *questions: str) -> frozenset[str]:
         """Return the fields on which questions depend, by the keys that the flags of their verbs set."""
         verbs = [VERBS[verb] for question in questions for verb in QUESTIONS[question].verbs]
-        taken = (name for name, one in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in one.keys))
-        return frozenset({*taken, *self.also}).difference(self.never)
+        names = (
+            name for name, field in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in field.keys)
+        )
+        return frozenset({*names, *self.also}).difference(self.never)
 
     def offers(self, name: str, answers: Answers) -> bool:
         """Return whether one of `files` or `documents` can be downloaded: the answer it needs is there and has it."""
         needed = self.documents[name] if name in self.documents else self.files[name]
-        # An answer may lack tables of what was not asked.
-        has = name in self.documents or self.own_table is not None
-        return needed is None or (needed in answers and (has or answers[needed].has_table(name)))
+        # An answer lacks tables that the question does not ask for.
+        always = name in self.documents or self.own_table is not None
+        return needed is None or (needed in answers and (always or answers[needed].has_table(name)))
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
         if self.own_view is None and self.answer not in answers:
             return self.rows_before(closed.question)
-        shown = answers[self.answer].views[self.view] if self.own_view is None else self.own_view(closed, answers)
-        headings, cells = shown.texts(FIXED, empty=False)
+        view = answers[self.answer].views[self.view] if self.own_view is None else self.own_view(closed, answers)
+        headings, cells = view.texts(FIXED, empty=False)
         return [headings, *cells] if headings else []
 
 
 #: Keys that are stated even at their default, so that readers see what was assumed.
 STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
           "run.realisations", "run.seed")  # fmt: skip
-#: Keys without a flag of their own verb that it uses: unknowns are drawn by everything that observes.
+#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
 ALWAYS_USED = ("nuisances.", "observation.temperature_c")
 #: Longest value in a command; a longer one is in the study file.
 MOST_CHARACTERS = 500
@@ -220,15 +223,15 @@ ANYTHING = TypeAdapter(Any)
 
 def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted path and the plain value of each key that has another value in `old`, or is `STATED`."""
-    for key, own_field in type(new).model_fields.items():
-        name, values = f"{path}{key}", (getattr(new, key), getattr(old, key))
+    for key, model_field in type(new).model_fields.items():
+        name, value, old_value = f"{path}{key}", getattr(new, key), getattr(old, key)
         # A new sky replaces all keys of the old one, and so does a section with a flag of its own.
-        whole = name == "sky" or bool(metadata_of(own_field, Flag))
-        if isinstance(values[0], BaseModel) and isinstance(values[1], BaseModel) and not whole:
-            yield from differing(*values, f"{name}.")
-        elif values[0] is not None and (values[0] != values[1] or name in STATED):
+        replaces = name == "sky" or bool(metadata_of(model_field, Flag))
+        if isinstance(value, BaseModel) and isinstance(old_value, BaseModel) and not replaces:
+            yield from differing(value, old_value, f"{name}.")
+        elif value is not None and (value != old_value or name in STATED):
             # As TOML can hold it, without the defaults of records.
-            yield name, ANYTHING.dump_python(values[0], mode="json", exclude_defaults=True, exclude_none=True)
+            yield name, ANYTHING.dump_python(value, mode="json", exclude_defaults=True, exclude_none=True)
 
 
 def as_command(verb: str, study: Study) -> str:
@@ -244,8 +247,8 @@ def as_command(verb: str, study: Study) -> str:
         elif name == "star":
             for star in value:
                 usual = Star(library=star.get("library"))
-                said = {key: given for key, given in star.items() if given != getattr(usual, key)}
-                words += _flag_words("star", {"library": usual.library} | said, question)
+                stated = {key: entry for key, entry in star.items() if entry != getattr(usual, key)}
+                words += _flag_words("star", {"library": usual.library} | stated, question)
         elif name == "sky":
             words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
         else:
@@ -291,7 +294,7 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
 
 def _text(value: str | float) -> str:
     """Return a value as it is typed, with every digit of a number."""
-    return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
+    return value if isinstance(value, str) else str(value).removesuffix(".0")
 
 
 #: Held while matplotlib draws.

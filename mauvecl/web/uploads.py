@@ -52,9 +52,9 @@ def content_folder(folder: Path, content: bytes, files: Callable[[], Mapping[str
 
 #: Largest numbers of files and observations of an archive, and of bytes to which it unpacks.
 MOST_FILES, MOST_BYTES = 40, 64 * 2**20
-#: Bytes of a TOML file of it, and characters of a file's name, at most.
+#: Largest size of a TOML file in an archive, bytes, and largest number of characters of a file's name.
 MOST_TOML_BYTES, MOST_NAME = 2**18, 100
-#: Packings that are read to the stated size and no further; others, such as LZMA, unpack to any size.
+#: Compression types that are read to the stated size and no further; others, such as LZMA, unpack to any size.
 BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
@@ -74,10 +74,11 @@ class Observations:
     def of(cls, name: str, content: bytes) -> Observations:
         """Keep an archive, which must hold one study with observations, and all files that it names."""
         files = unpacked(content)
-        studies = [rows for file, text in files.items() if file.endswith(".toml") and (rows := _observed(file, text))]
+        studies = [rows for file, text in files.items() if file.endswith(".toml") and (rows := _rows_of(file, text))]
         if len(studies) != 1:
-            has = f"but holds {len(studies)}"
-            raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], {has}")
+            raise refusal(
+                f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}"
+            )
         (rows,) = studies
         if len(rows) > MOST_FILES:
             raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
@@ -128,7 +129,7 @@ def unpacked(content: bytes) -> dict[str, bytes]:
     return files
 
 
-def _observed(name: str, content: bytes) -> list[dict[str, Any]]:
+def _rows_of(name: str, content: bytes) -> list[dict[str, Any]]:
     """Return the rows of a file's table of observations; empty if it has none."""
     if len(content) > MOST_TOML_BYTES:
         raise refusal(f"{shortened(name)} must be TOML of at most {MOST_TOML_BYTES // 2**10} KiB")
@@ -136,10 +137,10 @@ def _observed(name: str, content: bytes) -> list[dict[str, Any]]:
     section = study.get("calibrate")
     if not isinstance(section, dict) or "observations" not in section:
         return []
-    others = [*(study.keys() - {"calibrate"}), *(f"calibrate.{key}" for key in section.keys() - {"observations"})]
-    if others:
+    more = [*(study.keys() - {"calibrate"}), *(f"calibrate.{key}" for key in section.keys() - {"observations"})]
+    if more:
         raise refusal(
-            f"{shortened(name)} sets {shortened(min(others))}, but must set calibrate.observations alone; fields set "
+            f"{shortened(name)} sets {shortened(min(more))}, but must set calibrate.observations alone; fields set "
             "the rest"
         )
     rows = section["observations"]
@@ -173,14 +174,14 @@ MOST_PAIRS_BYTES = 2**18
 
 
 def _spectrum(
-    kind: type[Spectrum], reader: Callable[..., Spectrum], called: str, name: str, content: bytes, **options: Any
+    kind: type[Spectrum], reader: Callable[..., Spectrum], label: str, name: str, content: bytes, **options: Any
 ) -> Spectrum:
-    """Read an untrusted spectrum, packed or not, and name it if `called`; its format follows from the content."""
+    """Read an untrusted spectrum, compressed or not, and name it `label`; its format follows from the content."""
     spectrum = read_limited(kind, reader, {"upload": content}, **options)
     if spectrum.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
-    named: Any = {"name": called, "origin": "upload"} if called else {}
-    return replace(spectrum, **named)
+    origin: Any = {"name": label, "origin": "upload"} if label else {}
+    return replace(spectrum, **origin)
 
 
 def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
@@ -188,8 +189,9 @@ def _flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
     flare = _spectrum(ObservedFlare, ObservedFlare.read, "", name, content, **options)
     low, high = flare.measured_nm
     inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
-    own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
-    return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], "uploaded flare", "upload", messages=own)
+    texts = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
+    nm, flux = flare.wavelength_nm[inside], flare.flux_flam[inside]
+    return ReadSpectrum(nm, flux, "uploaded flare", "upload", messages=texts)
 
 
 @dataclass(frozen=True)
@@ -202,8 +204,8 @@ class VisitorFile:
     @classmethod
     def of(cls, name: str, content: bytes) -> VisitorFile:
         """Keep a file."""
-        plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", re.split(r"[/\\]", name)[-1])[-80:].strip(".-")
-        return cls(plain or "file", content)
+        name = re.sub(r"[^A-Za-z0-9_.+-]", "_", re.split(r"[/\\]", name)[-1])[-80:].strip(".-")
+        return cls(name or "file", content)
 
     def written(self, folder: Path) -> str:
         """Write the file below a folder, once, and return its path."""
@@ -266,7 +268,7 @@ UPLOADS: Mapping[str, Upload] = {
 MAPPED = {"time": "Time", "flux": "Flux", "error": "Error", "quality": "Quality", "temperature": "Temperature"}
 #: Units and dates of times, chosen from a menu next to them.
 TIME_UNITS = ("s", "min", "h", "d", "jd", "mjd", "bjd", "btjd", "bkjd")
-#: Assets that visitors may try in place of a file of their own, by field, with what they are.
+#: Example files that visitors may try in place of their own, by field, with descriptions.
 EXAMPLES: Mapping[str, tuple[str, str]] = {
     "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)")
 }
@@ -275,18 +277,18 @@ EXAMPLES: Mapping[str, tuple[str, str]] = {
 def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bits: str | None = None) -> Frames:
     """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits."""
     files = {file.name: file.content}
-    how = None
+    mapping_name = None
     if mapping is not None:
-        how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
-        files[how] = mapping.content
-    return read_limited(Frames, read_frames, files, mapping=how, quality_bits=quality_bits)
+        mapping_name = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
+        files[mapping_name] = mapping.content
+    return read_limited(Frames, read_frames, files, mapping=mapping_name, quality_bits=quality_bits)
 
 
 #: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.
 MOST_RESULTS, MOST_UPLOADS = 256 * 2**20, 256 * 2**20
-#: Objects that are counted of a value; arrays, which take most of the memory, are near its top.
+#: Largest number of objects of a value that are counted; arrays, which take most of the memory, come early.
 MOST_OBJECTS = 20_000
-#: Objects that belong to the program.
+#: Types of objects that belong to the program and not to a value.
 PROGRAM = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
 
 
@@ -296,45 +298,45 @@ class Shelf:
     def __init__(self, most: int) -> None:
         self.most, self.size = most, 0
         # Size and value by visitor, kind and key. The visitor itself, since an id is given again when it has left.
-        self._held: OrderedDict[tuple[object, str, Hashable], tuple[int, Any]] = OrderedDict()
+        self._entries: OrderedDict[tuple[object, str, Hashable], tuple[int, Any]] = OrderedDict()
         self._lock = threading.Lock()
 
     def keep(self, owner: object, kind: str, key: Hashable, value: object, most: int = 1) -> None:
         """Keep a value for its owner, who has at most `most` of its kind."""
-        size, entry = size_of(value), (owner, kind, key)
+        size, path = size_of(value), (owner, kind, key)
         with self._lock:
-            self._remove(entry)
-            self._held[entry] = size, value
+            self._remove(path)
+            self._entries[path] = size, value
             self.size += size
-            for old in self._entries(owner, kind)[:-most]:
+            for old in self._paths(owner, kind)[:-most]:
                 self._remove(old)
-            while self.size > self.most and len(self._held) > 1:
-                self._remove(next(iter(self._held)))
+            while self.size > self.most and len(self._entries) > 1:
+                self._remove(next(iter(self._entries)))
 
     def get(self, owner: object, kind: str, key: Hashable) -> Any:
-        """Return a value, which is used, or None if it is not here any more."""
+        """Return a value, which counts as its use, or None if it was dropped."""
         with self._lock:
-            if (entry := (owner, kind, key)) not in self._held:
+            if (path := (owner, kind, key)) not in self._entries:
                 return None
-            self._held.move_to_end(entry)
-            return self._held[entry][1]
+            self._entries.move_to_end(path)
+            return self._entries[path][1]
 
     def of(self, owner: object, kind: str) -> dict[Any, Any]:
         """Return an owner's values of a kind by key."""
         with self._lock:
-            return {entry[2]: self._held[entry][1] for entry in self._entries(owner, kind)}
+            return {path[2]: self._entries[path][1] for path in self._paths(owner, kind)}
 
-    def drop(self, owner: object, *which: Hashable) -> None:
+    def drop(self, owner: object, *kind_and_key: Hashable) -> None:
         """Drop the values of an owner: all of them, or those of a kind, or of a kind and key."""
         with self._lock:
-            for entry in self._entries(owner, *which):
-                self._remove(entry)
+            for path in self._paths(owner, *kind_and_key):
+                self._remove(path)
 
-    def _entries(self, *which: object) -> list[tuple[object, str, Hashable]]:
-        return [entry for entry in self._held if entry[: len(which)] == which]
+    def _paths(self, *start: object) -> list[tuple[object, str, Hashable]]:
+        return [path for path in self._entries if path[: len(start)] == start]
 
-    def _remove(self, entry: tuple[object, str, Hashable]) -> None:
-        self.size -= self._held.pop(entry, (0, None))[0]
+    def _remove(self, path: tuple[object, str, Hashable]) -> None:
+        self.size -= self._entries.pop(path, (0, None))[0]
 
 
 #: Results and uploads of all visitors.
@@ -342,13 +344,13 @@ RESULTS, UPLOAD_SHELF = Shelf(MOST_RESULTS), Shelf(MOST_UPLOADS)
 
 
 def size_of(value: object) -> int:
-    """Return the approximate size of a value and of what it refers to, bytes."""
-    # The oldest first, so that the top is counted before the details.
-    seen, waiting, size = set[int](), deque[Any]([value]), 0
-    while waiting and len(seen) < MOST_OBJECTS:
+    """Return the approximate size of a value and of the objects to which it refers, bytes."""
+    # Breadth first, so that the top is counted before the details.
+    counted, waiting, size = set[int](), deque[Any]([value]), 0
+    while waiting and len(counted) < MOST_OBJECTS:
         item = waiting.popleft()
-        if id(item) not in seen and not isinstance(item, PROGRAM):
-            seen.add(id(item))
+        if id(item) not in counted and not isinstance(item, PROGRAM):
+            counted.add(id(item))
             size += sys.getsizeof(item, 0)
             waiting += gc.get_referents(item)
             if isinstance(item, np.ndarray):

@@ -93,6 +93,12 @@ def test_amplitudes_like_percentages_have_a_note(tmp_path: Path) -> None:
         assert ("--amplitude 24% is one of 24 %\n" in shown) == noted
 
 
+def test_notes_on_flags_are_shown_if_the_question_is_refused(tmp_path: Path) -> None:
+    done = run("detect", "--star", "G2V", "-m", "-5", "--fap", "1e-6", "-n", "10000", folder=tmp_path, code=2)
+    assert "importance sampling finds them (--tails sampled)." in done.stdout
+    assert "cannot be distinguished" in done.stderr
+
+
 @pytest.mark.parametrize(("magnitude", "seconds"), [(7.4, 50.0), (-0.3, 10.0), (7.4, 1500.0)])
 def test_simulation_equals_the_realisation_of_the_engine(magnitude: float, seconds: float, engine: Engine) -> None:
     """Compare also where frames saturate, and for more frames than are drawn at once."""

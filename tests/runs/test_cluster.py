@@ -165,7 +165,8 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Path) -> None:
     """Check the promised five seconds; workers are not of the group, or what they build is cut off aloud by Ctrl-C."""
-    flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01 --ideal"
+    # A run of more than ten seconds would report its progress.
+    flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01 --ideal --quiet"
     words = ["detect", "--star", "G2V", "--star", "K3V", "-m", "7.4,3.7", *flags.split()]
     command = [*SMALL_SHARDS, *words, "--output", "out"]
     piped: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

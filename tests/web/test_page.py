@@ -400,6 +400,12 @@ def test_visitor_simulates_shares_and_compares(visit: Visit, page: Window) -> No
     page.get_by_role("button", name="Cancel").click()
     page.get_by_text("Cancelled.").wait_for()
     assert "in closed form" in page.shown()
+    # The next question is no run if one that was simulated is refused.
+    runs = page.locator("#history li").count()
+    page.evaluate("page.simulated(); page.enter({magnitude: '99'})")
+    page.get_by_text("No answer.", exact=True).wait_for()
+    page.enter(magnitude="8")
+    assert page.locator("#history li").count() == runs
 
 
 def test_visitor_uploads_spectra(browser: Browser, page: Window) -> None:
@@ -653,6 +659,11 @@ def test_visitor_analyses_an_example_and_own_columns(page: Window) -> None:
     assert page.taken()["columns.toml"] == 'time = "minute"\ntime_unit = "min"\nflux = "rate"\nerror = "sd"\n'
 
 
+#: Whether the card and the tab in front are clear, and have ended to become so.
+CLEAR = """!document.querySelector(":is(#card, [role=tabpanel]:not([hidden])) .dim")
+    && document.getAnimations().length === 0"""
+
+
 @pytest.mark.parametrize("theme", ["light", "dark", "forced"])
 def test_visitor_with_a_screen_reader_or_other_colours_and_sizes(visit: Visit, theme: str) -> None:
     """axe-core finds no violation of any impact on any tab, dialog or error.
@@ -683,7 +694,8 @@ def test_visitor_with_a_screen_reader_or_other_colours_and_sizes(visit: Visit, t
         page.locator(f"#tab-{name}").click()
         page.locator(f"#panel-{name}").wait_for()
         page.settled()
-        page.wait_for_timeout(200)
+        # The pictures of an earlier answer are dim, and become clear slowly.
+        page.until(lambda: page.evaluate(CLEAR))
         # The pointer is on the tab.
         look(name, f"#panel-{name}", f"#tab-{name}")
     look("page")

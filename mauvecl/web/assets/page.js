@@ -33,7 +33,7 @@ class Page {
   constructor() {
     /** @type {Answer | null} */
     this.answer = null
-    this.asking = this.dirty = false
+    this.asking = this.dirty = this.history = false
     // The simulation that answers an example, once its file is read.
     this.tried = ""
     /** Table of the tab in front.
@@ -145,6 +145,8 @@ class Page {
   // The previous answer is invalid until there is one to these fields.
   discardAnswer() {
     this.answer = null
+    // A simulation without an answer is not a run of the next question.
+    this.history = false
     clearTimeout(this.soon)
     clearTimeout(this.later)
     this.card.fade()
