@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 from pydantic import model_serializer
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, OrNone, Range, Unit, as_typed
+from mauvecl.schema.fields import Flag, OptionalNumber, Range, Unit, as_typed
 from mauvecl.schema.section import Section, read_declinations, setting
 
 #: Angle between two directions; None for no limit.
-Separation = Annotated[float | None, Unit("deg"), Range(0, 180), OrNone()]
+Separation = Annotated[float | None, Unit("deg"), Range(0, 180), OptionalNumber()]
 
 
 class Limits(Section):
@@ -20,12 +20,12 @@ class Limits(Section):
     None means no limit; study files say "none".
     """
 
-    earth_limb_deg: Annotated[float | None, Unit("deg"), Range(0, 90), OrNone()] = setting(
+    earth_limb_deg: Annotated[float | None, Unit("deg"), Range(0, 90), OptionalNumber()] = setting(
         25.0, "Smallest angle from the Earth's limb; or none", flag=Flag("--earth-limb", kind=str)
     )
     sun_deg: Separation = setting(46.0, "Smallest angle from the Sun; or none", flag=Flag("--sun", kind=str))
     moon_deg: Separation = setting(25.0, "Smallest angle from the Moon; or none", flag=Flag("--moon", kind=str))
-    declination_deg: Annotated[tuple[float, float] | None, Unit("deg"), OrNone()] = setting(
+    declination_deg: Annotated[tuple[float, float] | None, Unit("deg"), OptionalNumber()] = setting(
         (-46.4, 31.8),
         "Field of regard, low:high; or none",
         flag=Flag("--declination", kind=str, read=read_declinations),
@@ -37,7 +37,7 @@ class Limits(Section):
     eclipse: Literal["any", "only", "never"] = setting(
         "any", "Observing in the Earth's shadow", flag="--eclipse", choices="any, only (in the shadow) or never"
     )
-    proton_flux: Annotated[float | None, Unit("1 / (cm2 s)"), Range(0, open_low=True), OrNone()] = setting(
+    proton_flux: Annotated[float | None, Unit("1 / (cm2 s)"), Range(0, open_low=True), OptionalNumber()] = setting(
         10.0, "Largest flux of protons above 10 MeV; or none", flag=Flag("--protons", kind=str)
     )
     anomaly: Annotated[tuple[tuple[float, float], ...], Unit("deg")] = setting(

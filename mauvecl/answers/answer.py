@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class InCell:
+class StarInCell:
     """Star in a cell of the sweep."""
 
     label: str

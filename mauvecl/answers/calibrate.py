@@ -47,7 +47,7 @@ REJECTED = 0.01
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedValue:
     """A value of the instrument: fitted, or assumed where the observations do not determine it."""
 
     name: str
@@ -157,23 +157,23 @@ class CalibrateAnswer(Answer):
         return [observation for observation in self.observations if observation.star is not None]
 
     @cached_property
-    def values(self) -> list[Fitted]:
+    def values(self) -> list[FittedValue]:
         """Values of the instrument, fitted or assumed."""
         d, t, f, n = self.dark, self.transfer, self.throughput, self.nominal
         level = float(np.mean(d.level_dn_per_s))
         at = float(n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * d.reference_c))
         rows = [
-            Fitted("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s"),
-            Fitted("dark slope", d.slope_per_c, d.slope_error, n.dark_slope_per_c, "1 / deg_C"),
-            Fitted("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN"),
-            Fitted("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron"),
-            Fitted("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN"),
+            FittedValue("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s"),
+            FittedValue("dark slope", d.slope_per_c, d.slope_error, n.dark_slope_per_c, "1 / deg_C"),
+            FittedValue("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN"),
+            FittedValue("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron"),
+            FittedValue("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN"),
         ]
         rows = [replace(row, error=np.nan) if row.name in (*d.assumed, *t.assumed) else row for row in rows]
         names = ("wavelength shift", "wavelength stretch", "line width", "line width, change to the red")
         usual = (0.0, 0.0, n.gaussian_fwhm_nm, 0.0)
         shapes = zip(names, f.shape_nm.tolist(), f.shape_error_nm.tolist(), usual, strict=True)
-        return [*rows, *(Fitted(*shape, "nm") for shape in shapes)]
+        return [*rows, *(FittedValue(*shape, "nm") for shape in shapes)]
 
     @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:

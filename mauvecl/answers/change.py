@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, reported
+from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations import visits
@@ -31,14 +31,14 @@ AMPLITUDES = (0.4, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
-class ChangeRow(InCell):
+class ChangeRow(StarInCell):
     """One change of one star."""
 
     change: visits.Change
     # error, error_known: standard error of one visit, with unknowns marginalised over and with everything known.
     error: float
     error_known: float
-    smallest: visits.Smallest  # in the unit of the change
+    smallest: visits.SmallestChanges  # in the unit of the change
     ideal: float  # smallest difference of one visit if everything but the noise is known
     magnitude: float | None  # of the star
     saturated: tuple[int, int]  # pixels near saturation, and all that the change concerns
@@ -57,7 +57,7 @@ class ChangeRow(InCell):
 
 
 @dataclass(frozen=True, eq=False)
-class IndexRow(InCell):
+class IndexRow(StarInCell):
     """One line index of one star, with its errors in one exposure."""
 
     index: visits.Index
@@ -78,12 +78,12 @@ class IndexRow(InCell):
 
 
 @dataclass(frozen=True, eq=False)
-class PeriodRow(InCell):
+class PeriodRow(StarInCell):
     """Recovered periods of one change of one star."""
 
     change: visits.Change
     error: float
-    recovery: visits.Recovery
+    recovery: visits.PeriodRecovery
 
     def shares(self, end: str) -> NDArray[np.float64]:
         """Return the recovered shares or the ends of their intervals, shape (n_amplitude, n_period)."""
@@ -280,7 +280,7 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
         order, band = study.observation.order, study.change.band
         change = visits.Change.named(name, case.source, quiet, case.instrument, order, file, band)
         error, known_error = (visits.error_of_change(change.counts_dn, quiet, unknowns) for unknowns in (unknown, None))
-        smallest = visits.Smallest(change.size(error * unit.one), change.size(error * unit.scatter))
+        smallest = visits.SmallestChanges(change.size(error * unit.one), change.size(error * unit.scatter))
         ideal = change.size(known_error * unit.one)
         lost, errors = visits.pixels_of(change.counts_dn, quiet), (change.size(error), change.size(known_error))
         rows.append(ChangeRow(case.label, case.at, change, *errors, smallest, ideal, case.star.magnitude, lost))

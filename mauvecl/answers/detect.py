@@ -12,7 +12,7 @@ import numpy as np
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, name_of_instrument, reported, share_column
+from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, name_of_instrument, reported, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap, countable
 from mauvecl.detection.chi2 import Paper
@@ -44,7 +44,7 @@ MOST_ROWS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
-class StarDetection(InCell):
+class StarDetection(StarInCell):
     """A star in a cell of the sweep."""
 
     amplitudes: tuple[float, ...]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, reported, share_column
+from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, first_of, reported, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.stares import Stares
@@ -140,7 +140,7 @@ SEARCH_COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class StarCompleteness(InCell):
+class StarCompleteness(StarInCell):
     """Completeness at one star in one cell of the sweep."""
 
     survey: Survey

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, first_of, share_column
+from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, first_of, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.detection.distributions import Interval, smallest_integer
@@ -371,7 +371,7 @@ class UnknownEffect:
 
 
 @dataclass(frozen=True)
-class Limit(InCell):
+class Limit(StarInCell):
     """Limit of a quantity."""
 
     amplitude: float  # amplitude of the flare; NaN if the amplitude is the limit

@@ -150,7 +150,7 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     x, y = study.map.axes
     total = len(draws) * len(x.points()) * len(y.points())
     report = (lambda done: None) if progress is None else (lambda done: progress(done, total))
-    cells = Cells(x.points(), y.points(), engine or Engine(), report)
+    cells = MapCells(x.points(), y.points(), engine or Engine(), report)
     maps = np.stack([cells.map_of(draw) for draw in draws], axis=1)
     # Means over the draws; NaN if a draw has none.
     values, shares = maps.mean(axis=1), dict[str, dict[str, float]]()
@@ -166,7 +166,7 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
                      shares=shares, inputs=(quiet,), **dict(zip(NUMBERS, values, strict=True)))  # fmt: skip
 
 
-def _messages(case: Case, cells: Cells, values: Float) -> list[str]:
+def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
     """Return messages on the cells of a map, the most important first."""
     study, run, number_of_cells, messages = case.study, case.study.run, len(cells.x) * len(cells.y), list[str]()
     probability, _, _, closed_form, _ = values
@@ -242,7 +242,7 @@ def _shown(value: float | str) -> str:
 
 
 @dataclass(eq=False)
-class Cells:
+class MapCells:
     """Cells of a map, and what their computation finds for messages."""
 
     x: tuple[float | str, ...]

@@ -14,7 +14,7 @@ import scipy
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, InCell, TableOf, reported
+from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, reported
 from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval, clopper_pearson, clopper_pearson_ends
@@ -109,7 +109,7 @@ def _line_flux(light: FlareSpectrum, scale: float, of: str) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class ExpectedMeasurement(InCell):
+class ExpectedMeasurement(StarInCell):
     """Model and flare with true values and expected errors of a fit."""
 
     amplitude: float  # of the study's flare
@@ -327,7 +327,7 @@ class JointFit:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredStare(InCell):
+class MeasuredStare(StarInCell):
     """Flares of a simulated stare, measured in bins of frames with one model, and by a joint fit."""
 
     model: str

@@ -110,7 +110,7 @@ CompletenessOf = Callable[[TargetObservation], Completeness]
 
 
 @dataclass(frozen=True, eq=False)
-class Planned:
+class PlannedTarget:
     """Target of a plan with its expected flares."""
 
     observation: TargetObservation
@@ -382,7 +382,7 @@ class PlanAnswer(Answer):
 
     study: Study
     seen: VisibleAnswer
-    planned: tuple[Planned, ...]
+    planned: tuple[PlannedTarget, ...]
 
     #: One row per target.
     table = TableOf("plan", COLUMNS, "planned", title=lambda answer: answer.heading, about=lambda answer: {
@@ -585,7 +585,7 @@ def plan(
     return PlanAnswer(study, visible, planned)
 
 
-def _planned(visible: VisibleAnswer, completeness: CompletenessOf, target: TargetObservation) -> Planned:
+def _planned(visible: VisibleAnswer, completeness: CompletenessOf, target: TargetObservation) -> PlannedTarget:
     """Return the plan of an observed target."""
     study, k, its = visible.study, target.number, None
     if target.window_s > 0:
@@ -603,4 +603,4 @@ def _planned(visible: VisibleAnswer, completeness: CompletenessOf, target: Targe
         if study.nuisances.usual and its not in (None, NOTHING):
             ideal = recovered_per_day(rates, closed_form(target, ideal=True)) * days
     errors = errors_of_throughput(target, rates)
-    return Planned(target, exposed, observed, its, rates, recovered, best, why, errors, ideal)
+    return PlannedTarget(target, exposed, observed, its, rates, recovered, best, why, errors, ideal)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, reported
+from mauvecl.answers.answer import Answer, StarInCell, TableOf, first_of, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import smallest_integer
 from mauvecl.detection.snr import COLUMNS
@@ -276,7 +276,7 @@ SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
 
 
 @dataclass(frozen=True, eq=False)
-class StarSnr(InCell):
+class StarSnr(StarInCell):
     """A star in a cell of the sweep."""
 
     result: SnrResult

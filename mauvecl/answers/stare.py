@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from mauvecl.answers.answer import Answer, InCell, TableOf, first_of, metadata_of, reported
+from mauvecl.answers.answer import Answer, StarInCell, TableOf, first_of, metadata_of, reported
 from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
@@ -130,7 +130,7 @@ def _table(star: StarStare) -> fits.BinTableHDU:
 
 
 @dataclass(frozen=True, eq=False)
-class StareFlare(InCell):
+class StareFlare(StarInCell):
     """A flare of a stare, with its energies and S/N."""
 
     event: Event
@@ -140,7 +140,7 @@ class StareFlare(InCell):
 
 
 @dataclass(frozen=True, eq=False)
-class FoundFlare(InCell):
+class FoundFlare(StarInCell):
     """A flare that the search of a stare found."""
 
     alarm: Alarm
@@ -150,7 +150,7 @@ class FoundFlare(InCell):
 
 
 @dataclass(frozen=True, eq=False)
-class StarStare(InCell):
+class StarStare(StarInCell):
     """A stare at one star in one cell of the sweep."""
 
     staring: StareExpectation

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Area, Axis, Dots, Line, Mesh, Panel, Picture, Rule, Series, pictures_of
+from mauvecl.charts.chart import Area, Dots, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, pictures_of
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 
@@ -42,8 +42,11 @@ def overview(answer: PlanAnswer) -> Picture:
     logs = np.log10(energies[np.isfinite(energies)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, flare_axis = Axis(limits=(len(planned) - 0.5, -0.5), ticks=names), Axis("flares recovered", True, (0.05, None))
-    energy_axis, above = Axis("bolometric energy (erg)", True, decades), "mean (dot), and 95 % of campaigns"
+    y, flare_axis = (
+        PlotAxis(limits=(len(planned) - 0.5, -0.5), ticks=names),
+        PlotAxis("flares recovered", True, (0.05, None)),
+    )
+    energy_axis, above = PlotAxis("bolometric energy (erg)", True, decades), "mean (dot), and 95 % of campaigns"
     row = [
         Panel(flare_axis, y, _bars(np.maximum(flares, 0.05), "star"), above),
         Panel(energy_axis, y, _bars(energies, "flare"), "recovered in 50 % (dot) to 90 %"),
@@ -76,9 +79,9 @@ def _calendars(answer: VisibleAnswer, hours: Any) -> Picture:
     """Return calendars with days of the month across and months down."""
     months = sorted({day[:7] for day in answer.days})
     across, step = min(len(answer.targets), 2), max(1, len(months) // 14)
-    x = Axis("day of the month (UTC)", ticks=([1, 8, 15, 22, 29],))
+    x = PlotAxis("day of the month (UTC)", ticks=([1, 8, 15, 22, 29],))
     names = np.arange(0, len(months), step), [_month(name) for name in months[::step]]
-    y, panels = Axis(limits=(len(months) - 0.5, -0.5), ticks=names), list[Panel]()
+    y, panels = PlotAxis(limits=(len(months) - 0.5, -0.5), ticks=names), list[Panel]()
     for target, daily_hours, total in zip(answer.targets, hours, answer.visibility.hours, strict=True):
         grid = np.full((len(months), 31), np.nan)
         for day, value in zip(answer.days, daily_hours, strict=True):
@@ -96,7 +99,9 @@ def _rows(answer: VisibleAnswer, hours: Any) -> Picture:
     mesh = Mesh("hours a day", high=None, at=(np.arange(len(answer.days) + 1) - 0.5, np.arange(n + 1) - 0.5, hours))
     step = max(1, n // 60)
     names = np.arange(0, n, step), [target.name for target in answer.targets[::step]]
-    panel = Panel(Axis(ticks=_first_days(answer, MOST_MONTHS)), Axis(limits=(n - 0.5, -0.5), ticks=names), [mesh])
+    panel = Panel(
+        PlotAxis(ticks=_first_days(answer, MOST_MONTHS)), PlotAxis(limits=(n - 0.5, -0.5), ticks=names), [mesh]
+    )
     return Picture([[panel]], (7.4, min(0.16 * n + 1.4, 20.0)))
 
 
@@ -128,7 +133,7 @@ PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 
 
 
 @dataclass(frozen=True)
-class Part:
+class ReportPart:
     """Part of a report, from top to bottom: heading, sentences, a table with a note on it, and a picture."""
 
     heading: str = ""
@@ -145,13 +150,13 @@ class Part:
     new_page: bool = False
 
 
-def pdf_bytes(title: str, parts: Sequence[Part]) -> bytes:
+def pdf_bytes(title: str, parts: Sequence[ReportPart]) -> bytes:
     """Return a report as PDF; without a date, so that equal answers give equal files."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     content, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
     with style(), PdfPages(content, metadata=about) as pages:
-        sheets = Sheets()
+        sheets = TextPages()
         for part in parts:
             sheets.add(part)
         for figure in sheets.pages:
@@ -159,7 +164,7 @@ def pdf_bytes(title: str, parts: Sequence[Part]) -> bytes:
     return content.getvalue()
 
 
-def html_bytes(title: str, parts: Sequence[Part]) -> bytes:
+def html_bytes(title: str, parts: Sequence[ReportPart]) -> bytes:
     """Return a report as a page, with pictures if matplotlib is installed."""
     from mako.template import Template
 
@@ -189,14 +194,14 @@ def html_image(draw: Callable[[Any], Any], text: str) -> str:
     return f"<img alt='{escape(text, quote=True)}' src='data:image/png;base64,{encoded}'>"
 
 
-class Sheets:
+class TextPages:
     """Text that flows over as many pages as it needs."""
 
     def __init__(self) -> None:
         self.pages: list[Any] = []
         self.left_in = 0.0
 
-    def add(self, part: Part) -> None:
+    def add(self, part: ReportPart) -> None:
         """Write a part of a report."""
         from matplotlib.lines import Line2D
 
@@ -252,7 +257,7 @@ class Sheets:
         return top
 
 
-def plan_report(answer: PlanAnswer) -> tuple[str, list[Part]]:
+def plan_report(answer: PlanAnswer) -> tuple[str, list[ReportPart]]:
     """Return title and parts of a plan's report: summary, messages, a part for each target, and all assumptions."""
     height = 0.2 * len(answer.planned) + 1.3
 
@@ -267,20 +272,22 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[Part]]:
     names = [column.name for column in view.columns if column.heading]
     fits, text = height < PAGE[1] - 2 * MARGIN, "flares expected and energies of all targets"
     parts = [
-        Part("Mauve: yields of a campaign", [f"{answer.heading}; mauvecl {VERSION}."], headings, rows, SUMMARY_AT, 2,
-             LEGEND, all_targets, text, height if fits else 0.0),
-        Part(lines=answer.messages),
+        ReportPart(
+            "Mauve: yields of a campaign", [f"{answer.heading}; mauvecl {VERSION}."], headings, rows, SUMMARY_AT, 2,
+            LEGEND, all_targets, text, height if fits else 0.0,
+        ),
+        ReportPart(lines=answer.messages),
     ]  # fmt: skip
     for k, (target, row) in enumerate(zip(answer.planned, rows, strict=True)):
         draw = partial(_panels, answer, k) if target.seen_h > 0 else None
         lines = _target_lines(answer, k, dict(zip(names, row, strict=True)))
-        parts.append(Part(
+        parts.append(ReportPart(
             target.name, (), ("", "", "table: column"), lines, TARGET_AT, picture=draw,
             text=f"hours and energies of {target.name}", height_in=PANELS_IN, new_page=True,
         ))  # fmt: skip
     assumed = answer.assumptions
     note = "Rows of assumptions.ecsv."
-    parts.append(Part("What is assumed", [note], assumed.colnames, list(assumed), ASSUMED_AT, new_page=True))
+    parts.append(ReportPart("What is assumed", [note], assumed.colnames, list(assumed), ASSUMED_AT, new_page=True))
     return f"Mauve: {answer.heading}", parts
 
 
@@ -336,26 +343,26 @@ def _target_lines(answer: PlanAnswer, k: int, cells: Mapping[str, str]) -> list[
 def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
     """Plot the daily hours of a target, its angle from the Sun, and its recovered fraction and rate by energy."""
     target, visible, days = answer.planned[k], answer.seen, np.arange(len(answer.seen.days))
-    x = Axis(limits=(0, max(len(days) - 1, 1)), ticks=_first_days(visible, MOST_MONTHS // 2))
+    x = PlotAxis(limits=(0, max(len(days) - 1, 1)), ticks=_first_days(visible, MOST_MONTHS // 2))
     hours = Area("", COLOURS[3], alpha=1.0, step=True, at=(days, np.zeros(days.size), visible.visibility.by_day(k)))
     away = Line("", "flare", at=(days, visible.elongation_deg(k)))
     rows = [[
-        Panel(x, Axis("hours a day", limits=(0, None)), [hours], "when it is seen"),
-        Panel(x, Axis("angle from the Sun (deg)", limits=(0, 180)), [away]),
+        Panel(x, PlotAxis("hours a day", limits=(0, None)), [hours], "when it is seen"),
+        Panel(x, PlotAxis("angle from the Sun (deg)", limits=(0, 180)), [away]),
     ]]  # fmt: skip
     if target.completeness is not None:
-        row, x = target.by_energy, Axis("bolometric energy (erg)", log=True)
+        row, x = target.by_energy, PlotAxis("bolometric energy (erg)", log=True)
         energy, often = row["energy"], row["rate_above"] * target.hours / 24
         share = Line("", "star", at=(energy, row["recovered"]))
         limits = [Rule("", dash=dash, at=target.energy_at(p)) for p, dash in ((0.5, "--"), (0.9, ":"))]
         shares = (
-            Axis("share recovered", limits=(0, 1.02)),
+            PlotAxis("share recovered", limits=(0, 1.02)),
             [share, *(limit for limit in limits if np.isfinite(limit.at))],
         )
         rows.append([Panel(x, *shares, "flares recovered (E50 dashed, E90 dotted)", _plain_decades)])
         if target.rates is not None:
             rate = Line("", "flare", at=(energy, np.where(often > 0, often, np.nan)))
-            above = Axis(f"flares above this energy in {target.hours:.0f} h", log=True)
+            above = PlotAxis(f"flares above this energy in {target.hours:.0f} h", log=True)
             rows[-1].append(Panel(x, above, [rate], "how often they are", _plain_decades))
     figure = draw_picture(Picture(rows), figure or new_figure((7.4, 5.4), layout="none"))
     figure.subplots_adjust(**PANELS)
@@ -374,14 +381,14 @@ def _plain_decades(axes: Any) -> None:
         )
 
 
-def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[Part]]:
+def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[ReportPart]]:
     """Return title and parts of an analysis's report: messages, tables without empty columns, remarks, and pictures."""
     frames = answer.analysis.frames
     title = f"{frames.name}: {frames.n_frames} frames from {frames.date(float(frames.time_s[0]))[:19]}"
-    parts = [Part(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
-    parts += [Part(view.title, (), *view.texts(empty=False)) for view in answer.all_views]
-    parts.append(Part(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
-    return title, parts + [Part(picture=draw, text=name) for name, draw in pictures_of(answer).items()]
+    parts = [ReportPart(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
+    parts += [ReportPart(view.title, (), *view.texts(empty=False)) for view in answer.all_views]
+    parts.append(ReportPart(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
+    return title, parts + [ReportPart(picture=draw, text=name) for name, draw in pictures_of(answer).items()]
 
 
 def report(answer: Any, form: str) -> bytes:

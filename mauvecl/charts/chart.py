@@ -23,7 +23,7 @@ MOST_TARGETS = 8
 
 
 @dataclass(frozen=True)
-class Axis:
+class PlotAxis:
     """Axis of a chart."""
 
     label: str = ""
@@ -34,7 +34,7 @@ class Axis:
     ticks: tuple[Any, ...] | None = None  # places, and labels if they are no numbers, in files
 
 
-WAVELENGTH = Axis("wavelength (nm)", kind="wavelength")
+WAVELENGTH = PlotAxis("wavelength (nm)", kind="wavelength")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Dots(Series):
 
 
 @dataclass(frozen=True)
-class Own(Series):
+class OwnMarker(Series):
     """Marker of the visitor's question."""
 
     called: str = "your question"
@@ -159,7 +159,7 @@ class Levels(Series):
 
 
 @dataclass(frozen=True)
-class Listed(Series):
+class LegendEntry(Series):
     """Entry of the legend for parts that are not listed themselves."""
 
 
@@ -187,8 +187,8 @@ class Chart:
 
     name: str
     title: str
-    x: Axis
-    y: Axis
+    x: PlotAxis
+    y: PlotAxis
     series: tuple[Series, ...]
     logs: tuple[str, ...] = ()  # axes that the visitor may make logarithmic; in capitals those that are so at first
     shows: Mapping[str, str] = field(default_factory=dict)  # parts that are hidden at first, with what they are called
@@ -232,7 +232,7 @@ class Chart:
                 for k, (name, x, y) in enumerate([*(columns or ()), *[("", [], [])] * MOST_TARGETS][:MOST_TARGETS]):
                     sources[f"{item.key} {k}"] = {"x": x, "y": y}
                     names |= {f"target {k + 1}": name} if name else {}
-            elif not isinstance(item, Listed):
+            elif not isinstance(item, LegendEntry):
                 columns = [[]] * len(item.columns) if columns is None else columns
                 sources[item.key] = dict(zip(item.columns, columns, strict=True))
         return {"text": data.text, "sources": sources, "props": props, "names": names}
@@ -242,8 +242,8 @@ class Chart:
 class Panel:
     """Axes and series with their data, as a part of a file."""
 
-    x: Axis
-    y: Axis
+    x: PlotAxis
+    y: PlotAxis
     series: Sequence[Series]
     title: str = ""
     finish: Callable[[Any], None] | None = None  # changes the axes of matplotlib when all is drawn
@@ -268,7 +268,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Entry:
+class PictureFunction:
     """Function that draws a picture of the objects of a class."""
 
     name: str  # name of the file
@@ -280,7 +280,7 @@ class Entry:
 
 
 #: Entries by class name, since importing the classes would import every answer.
-ENTRIES: defaultdict[str, list[Entry]] = defaultdict(list)
+ENTRIES: defaultdict[str, list[PictureFunction]] = defaultdict(list)
 
 
 def load() -> None:

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.charts import chart
-from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
-from mauvecl.schema.columns import First, note_of, part_note
+from mauvecl.schema.columns import FirstItems, note_of, part_note
 from mauvecl.study.cases import full_label
 from mauvecl.study.questions import QUANTITIES
 
@@ -46,13 +46,13 @@ MARGIN = 0.04
 WIDE = 5.0
 
 
-def _few(answer: DetectAnswer) -> First[Shown]:
+def _few(answer: DetectAnswer) -> FirstItems[Shown]:
     """Limit the number of stars so that each panel stays readable."""
     stars = [
         (star.title, star.detection, [f"flare {100 * amplitude:g} %" for amplitude in star.amplitudes])
         for star in answer.stars
     ]
-    return First(stars, MOST_STARS, "stars")
+    return FirstItems(stars, MOST_STARS, "stars")
 
 
 @picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
@@ -112,7 +112,7 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
     if len(thresholded) == len(cuts) == 1:
         above = f"{title}: threshold {written(float(f'{cuts[0]:.3g}'))}"
     low, high = min(ends + cuts), max(ends + cuts)
-    x, y = Axis(statistic_label(statistic)), Axis("realisations / peak", limits=(0, 1.05))
+    x, y = PlotAxis(statistic_label(statistic)), PlotAxis("realisations / peak", limits=(0, 1.05))
     if linear:
         return Panel(x, y, series, above, finish=partial(_asinh, ends=(low, high)))
     margin = (high / low) ** MARGIN
@@ -152,7 +152,7 @@ def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
         fap, probability, low, high = roc_columns(curve)
         text = f"{title}: area {curve.area.value:.4f}".removeprefix(": ")
         series += [Line(text, colour, at=(fap, probability)), Area("", colour, alpha=0.3, at=(fap, low, high))]
-    x, y = Axis("false-alarm probability per test", log=True), Axis("detection probability", limits=(0, 1.02))
+    x, y = PlotAxis("false-alarm probability per test", log=True), PlotAxis("detection probability", limits=(0, 1.02))
     return Panel(x, y, series)
 
 
@@ -172,11 +172,11 @@ def spectra(stars: Sequence[Shown]) -> Picture:
         spectra = [Line(name, colour, at=(nm, x.signal_dn / x.exposure_s)) for name, x, colour in drawn[::-1]]
         band = Area("1 sigma of a pixel", alpha=0.35, at=(nm, mean - noise, mean + noise))
         series = [*spectra, band, Line("no flare", "text", dash="dashed", at=(nm, mean))]
-        y = Axis("net signal (DN s$^{-1}$ pixel$^{-1}$)")
+        y = PlotAxis("net signal (DN s$^{-1}$ pixel$^{-1}$)")
         above.append(Panel(WAVELENGTH, y, series, f"{title}, {quiet.exposure_s:g} s"))
         risen = [(x.per_element(x.signal_dn - quiet.signal_dn) / sigma, colour) for _, x, colour in drawn[::-1]]
         lines = [Line("", colour, at=(quiet.element_wavelength_nm[complete], rise[complete])) for rise, colour in risen]
-        y = Axis("flare less quiet\n(sigma per 10.5 nm)", log=True)
+        y = PlotAxis("flare less quiet\n(sigma per 10.5 nm)", log=True)
         below.append(Panel(WAVELENGTH, y, [*lines, Rule(along="y", at=1.0)], finish=finish))
     title = "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration"
     size = COLUMN * len(stars), 5.0
@@ -209,7 +209,7 @@ def observation(title: str, table: QTable) -> Picture:
     nm, rows = table["wavelength"].to_value("nm"), list[list[Panel]]()
     for letter, (name, text), colour in zip("abcdefg", COMPONENTS.items(), COLOURS, strict=True):
         line = Line("", colour, width=0.9, at=(nm, table[name].value))
-        rows.append([Panel(WAVELENGTH, Axis("DN"), [line], f"({letter}) {text}")])
+        rows.append([Panel(WAVELENGTH, PlotAxis("DN"), [line], f"({letter}) {text}")])
     title = f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput"
     return Picture(rows, (7.2, 9.5), title, share_x=True)
 
@@ -217,7 +217,7 @@ def observation(title: str, table: QTable) -> Picture:
 @picture_of(
     "SnrAnswer",
     "snr",
-    given=lambda answer: (First([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
+    given=lambda answer: (FirstItems([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
 )
 @picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
 def signal_to_noise(stars: Sequence[tuple[str, SnrResult]]) -> Picture:
@@ -240,7 +240,7 @@ def _snr_panel(title: str, per: str, nm: Any, expected: Any, table: QTable) -> P
         Area("68 % of realisations", "star", alpha=0.45, at=(nm, table["q16"], table["q84"])),
         Line("closed form", "text", width=1.2, at=(nm, expected)),
     ]
-    return Panel(WAVELENGTH, Axis(f"S/N {per}"), series, title)
+    return Panel(WAVELENGTH, PlotAxis(f"S/N {per}"), series, title)
 
 
 @picture_of("UnknownAnswer", "unknowns")
@@ -267,9 +267,9 @@ def unknowns(answer: UnknownAnswer) -> Picture:
             series.append(Line(row["unknown"].replace("+-", "±"), colour, at=(relative, marginal)))
             series.append(Line("", colour, dash="dashed", at=(relative, plain)))
             smallest.append(Dots("", colour, size=12, at=([k], [row["smallest"]])))
-        y = Axis("detection probability", limits=(-0.02, 1.02))
-        above.append(Panel(Axis(QUANTITIES["amplitude"].label, log=True), y, series, star))
-        below.append(Panel(Axis(ticks=((), ())), Axis("smallest flare amplitude", log=True), smallest))
+        y = PlotAxis("detection probability", limits=(-0.02, 1.02))
+        above.append(Panel(PlotAxis(QUANTITIES["amplitude"].label, log=True), y, series, star))
+        below.append(Panel(PlotAxis(ticks=((), ())), PlotAxis("smallest flare amplitude", log=True), smallest))
     title = (
         f"Above: solid marginalised, dashed plain; below: detected with a probability of {answer.study.limit.power:g}, "
         f"marginalised over each unknown; false-alarm probability {fap:g} per test"
@@ -281,17 +281,17 @@ def unknowns(answer: UnknownAnswer) -> Picture:
 MARKS = "osD^vPX"
 
 
-def quantity_axis(study: Study, name: str, **options: Any) -> Axis:
+def quantity_axis(study: Study, name: str, **options: Any) -> PlotAxis:
     """Return the axis of a quantity, with the band of magnitudes if all stars have the same."""
     bands = {star.band for star in study.star}
     band = f" ({bands.pop()})" if name == "magnitude" and len(bands) == 1 else ""
-    return Axis(QUANTITIES[name].label + band, **options)
+    return PlotAxis(QUANTITIES[name].label + band, **options)
 
 
 @picture_of("MapAnswer", "map")
 def detection_map(answer: MapAnswer) -> Picture:
     """Plot the detection probability over two quantities, one panel per statistic."""
-    question, study, places, axes = answer.study.map, answer.study, list[Any](), list[Axis]()
+    question, study, places, axes = answer.study.map, answer.study, list[Any](), list[PlotAxis]()
     for sweep, values in zip(question.axes, (answer.x, answer.y), strict=True):
         named = isinstance(values[0], str)
         places.append(np.arange(len(values)) if named else np.array(values, float))
@@ -338,7 +338,10 @@ def limits(answer: LimitAnswer) -> Picture:
         f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
         f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
     )
-    x, y = quantity_axis(answer.study, of, log=of != "magnitude"), Axis("detection probability", limits=(-0.02, 1.02))
+    x, y = (
+        quantity_axis(answer.study, of, log=of != "magnitude"),
+        PlotAxis("detection probability", limits=(-0.02, 1.02)),
+    )
     return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, below=True)
 
 
@@ -346,7 +349,7 @@ def limits(answer: LimitAnswer) -> Picture:
 MOST_BUDGETS = 12
 #: Noise by origin, as on the page and in files.
 BUDGET = Chart(
-    "budget", "Noise of a pixel by origin", WAVELENGTH, Axis("noise (DN rms per pixel)", log=True),
+    "budget", "Noise of a pixel by origin", WAVELENGTH, PlotAxis("noise (DN rms per pixel)", log=True),
     (
         # A broad pale line below the others does not hide the largest of them.
         Line("all together", "total", "total", width=6, alpha=0.25, tips=("wavelength (nm)", "all together (DN)")),
@@ -378,7 +381,7 @@ def noise_budgets(answer: SnrAnswer) -> Picture:
         # Zodiacal light can be far below everything else.
         axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
 
-    shown = First(observed, MOST_BUDGETS, "observations")
+    shown = FirstItems(observed, MOST_BUDGETS, "observations")
     panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in shown]
     # A column for each cell, unless these are too many.
     across = len(observed) // number_of_cells if number_of_cells <= MAX_COLUMNS and len(shown) == len(observed) else 0
@@ -407,7 +410,7 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
             x, expected, low, high = zip(*points, strict=True)
             lengths = np.maximum(np.subtract(expected, low), 0), np.maximum(np.subtract(high, expected), 0)
             series += [Line(name, colour, at=(x, expected)), Dots("", colour, size=7, at=(x, expected, lengths))]
-        y_axis = Axis("S/N per 10.5 nm element", log=True, limits=(0.1, None))
+        y_axis = PlotAxis("S/N per 10.5 nm element", log=True, limits=(0.1, None))
         x_axis = quantity_axis(answer.study, first, log=first == "exposure")
         row.append(Panel(x_axis, y_axis, series, f"{wavelength:g} nm"))
     title = "S/N in closed form; bars: 95 % of realisations; nominal throughput"
@@ -431,8 +434,8 @@ def gaussian(answer: GaussianAnswer) -> Picture:
             axis.xaxis.set_major_locator(MaxNLocator(3, steps=(1, 2, 5, 10)))
             axis.grid(axis="y", linewidth=0.3)
 
-        y = Axis(limits=(len(rows) - 0.5, -0.5), ticks=(rows, labels))
-        return Panel(Axis(text), y, [series, Rule(dash="-", at=predicted)], finish=finish)
+        y = PlotAxis(limits=(len(rows) - 0.5, -0.5), ticks=(rows, labels))
+        return Panel(PlotAxis(text), y, [series, Rule(dash="-", at=predicted)], finish=finish)
 
     def dots(name: str) -> Dots:
         return Dots("", "star", size=7, at=(np.asarray(cells[name]), rows))
@@ -460,6 +463,6 @@ def exposures(answer: ExposureAnswer) -> Picture:
         series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
     series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))
     per = "10.5 nm element" if first.per == "element" else first.per
-    panel = Panel(Axis("exposure (s)", log=True), Axis(f"S/N per {per}", log=True), series)
+    panel = Panel(PlotAxis("exposure (s)", log=True), PlotAxis(f"S/N per {per}", log=True), series)
     title = f"S/N at {first.wavelength_nm:g} nm against exposure; nominal throughput"
     return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.exposures)), title, below=True)

@@ -13,11 +13,11 @@ from scipy.special import ndtri
 
 from mauvecl.charts import chart
 from mauvecl.charts import matplotlib as figures
-from mauvecl.charts.chart import Area, Axis, Chart, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.chart import Area, Chart, Dots, Levels, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.events import GAP_FRAMES
-from mauvecl.schema.columns import First, part_note
+from mauvecl.schema.columns import FirstItems, part_note
 
 if TYPE_CHECKING:
     from mauvecl.answers.analyse import AnalyseAnswer
@@ -37,12 +37,12 @@ SIZES = {
 MOST_CURVES = 6
 #: Largest number of maps in a picture.
 MOST_MAPS = 6
-HALF_WIDTH = Axis("half-width (s)", log=True)
+HALF_WIDTH = PlotAxis("half-width (s)", log=True)
 
 
 def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, below: bool = False) -> Picture:
     """Return a picture with a panel per star, the first ones if there are many."""
-    stars, study = First(answer.stars, MOST_MAPS, "stars"), answer.study
+    stars, study = FirstItems(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), figures.MAX_COLUMNS)
     rows = figures.in_rows([panel(star) for star in stars], columns)
     title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}; nominal throughput"
@@ -54,11 +54,11 @@ def maps(answer: InjectAnswer) -> Picture:
     """Plot completeness over half-width and size, one panel per star."""
 
     def panel(star: Any) -> Panel:
-        f, size = star.injected, Axis(SIZES[star.size], log=True)
+        f, size = star.injected, PlotAxis(SIZES[star.size], log=True)
         x, y, z = np.array(f.half_widths_s), f.sizes, f.completeness.T
         if x.size < 2:
             # A single half-width defines no cell width.
-            return Panel(Axis("completeness"), size, [Line("", "star", at=(f.completeness[0], y))], star.title)
+            return Panel(PlotAxis("completeness"), size, [Line("", "star", at=(f.completeness[0], y))], star.title)
 
         mesh = Mesh("completeness", at=(_edges(x), _edges(y), z))
         return Panel(HALF_WIDTH, size, [mesh, Levels("found", at=(x, y, z))], star.title)
@@ -80,8 +80,8 @@ def curves(answer: InjectAnswer) -> Picture:
                 Line(name, colour, at=(f.sizes, f.completeness[k])),
             ]
         series.append(Rule("50 % and 90 %", "text", along="y", at=(0.5, 0.9)))
-        y = Axis("completeness", limits=(-0.02, 1.02))
-        return Panel(Axis(SIZES[star.size], log=True), y, series, star.title)
+        y = PlotAxis("completeness", limits=(-0.02, 1.02))
+        return Panel(PlotAxis(SIZES[star.size], log=True), y, series, star.title)
 
     widths = len(answer.stars[0].injected.half_widths_s)
     notes = "shaded: 95 % intervals", part_note(min(MOST_CURVES, widths), widths, "half-widths")
@@ -98,7 +98,7 @@ def energies(answer: InjectAnswer) -> Picture:
             at = _edges(x), _edges(y), np.log10(star.fitted["energy_ratio"].T)
             label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
-        return Panel(HALF_WIDTH, Axis(SIZES[star.size], log=True), meshes, star.title)
+        return Panel(HALF_WIDTH, PlotAxis(SIZES[star.size], log=True), meshes, star.title)
 
     return _stars(answer, panel, "medians; grey: none found")
 
@@ -139,7 +139,7 @@ def light_curves(star: StarStare) -> Picture:
             Dots("simulated frames", "star", size=2, alpha=0.6, at=frames),
             Line("star and flares alone", "text", width=1.1, at=mean),
         ]
-        x, y = Axis(f"time from the start of the stare ({unit})"), Axis("flux / quiescent")
+        x, y = PlotAxis(f"time from the start of the stare ({unit})"), PlotAxis("flux / quiescent")
         # Markers outside the axes that have no place would make matplotlib give up the layout of the figure.
         rows.append([Panel(x, y, series, band, finish if peaks else None)])
     title = f"{star.title}: one simulated stare; nominal throughput"
@@ -206,8 +206,8 @@ def spectra_panel(
             axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=chart.INK[colour], linewidth=3,
                       clip_on=False, solid_capstyle="butt")  # fmt: skip
 
-    x = Axis(f"time from the start of the stare ({unit})", limits=(time[0], time[-1]))
-    panel = Panel(x, Axis("wavelength (nm)", limits=(nm[0], nm[-1])), [mesh], finish=finish)
+    x = PlotAxis(f"time from the start of the stare ({unit})", limits=(time[0], time[-1]))
+    panel = Panel(x, PlotAxis("wavelength (nm)", limits=(nm[0], nm[-1])), [mesh], finish=finish)
     return panel, step * stare.frame_s
 
 
@@ -242,7 +242,7 @@ LONG_GAP = 0.005
 #: Flux in standard deviations above which the light curve has a second panel near the level.
 BRIGHT = 30.0
 LIGHT_CURVE = Chart(
-    "frames", "Light curve", Axis("time from the first frame (min)"), Axis("flux"),
+    "frames", "Light curve", PlotAxis("time from the first frame (min)"), PlotAxis("flux"),
     (
         *(Strips(verdict, colour, f"{verdict} events") for verdict, colour in VERDICTS.items()),
         Area("95 % of the level", "sky", "range", alpha=0.3),
@@ -306,15 +306,17 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     analysis, used = answer.analysis, answer.analysis.level.used
     frames, flux, error = analysis.frames, analysis.flux, analysis.level.error
     unit_s, unit = time_unit(float(np.ptp(frames.time_s)))
-    x = Axis(f"time ({unit}) from {frames.date(float(frames.time_s[0]))[:19]}")
+    x = PlotAxis(f"time ({unit}) from {frames.date(float(frames.time_s[0]))[:19]}")
     label = f"flux ({frames.unit})" if frames.unit else "flux"
     around = float(np.min((flux - error)[used])), float(np.max((flux + error)[used]))
     # Frames that are left out may be far off.
     reach = around[1] - around[0]
     beside = [value for value in flux[~used & np.isfinite(flux)] if around[0] - reach < value < around[1] + reach]
-    shown = [(Axis(label, limits=(min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach)), False)]
+    shown = [
+        (PlotAxis(label, limits=(min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach)), False)
+    ]
     if ((flux - analysis.level.level) / error)[used].max() > BRIGHT:
-        shown.append((Axis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2)), True))
+        shown.append((PlotAxis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2)), True))
     rows = []
     for y, in_noise in shown:
         series = light_curve_series(frames, answer, unit_s, in_noise=in_noise)
@@ -352,7 +354,7 @@ def observed_pixel_noise(answer: AnalyseAnswer) -> Picture:
     for name, chosen, colour in (("measured", ~noise.departs, "star"), ("measured, departs", noise.departs, "flare")):
         if chosen.any():
             series.append(Dots(name, colour, size=4, at=(nm[chosen], (noise.measured / noise.stated)[chosen])))
-    panel = Panel(Axis("wavelength (nm)"), Axis("measured / stated noise"), series)
+    panel = Panel(PlotAxis("wavelength (nm)"), PlotAxis("measured / stated noise"), series)
     return Picture([[panel]], (4.6, 3.5), f"{answer.analysis.frames.name}: noise of quiescent frames", below=True)
 
 
@@ -377,18 +379,18 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
         Dots("", "star", size=size, at=(normal, np.sort(residual))),
     ]
     row = [
-        Panel(Axis(f"time ({unit})"), Axis("residual (standard deviations)"), course),
-        Panel(Axis("lag (frames)"), Axis("autocorrelation"), correlation,
+        Panel(PlotAxis(f"time ({unit})"), PlotAxis("residual (standard deviations)"), course),
+        Panel(PlotAxis("lag (frames)"), PlotAxis("autocorrelation"), correlation,
               finish=lambda axis: axis.xaxis.get_major_locator().set_params(integer=True)),
-        Panel(Axis("normal quantile"), Axis("quantile of the residuals"), quantiles),
+        Panel(PlotAxis("normal quantile"), PlotAxis("quantile of the residuals"), quantiles),
     ]  # fmt: skip
     title = f"{analysis.frames.name}: residuals of the fitted process, {analysis.level.process.name}"
     return Picture([row], (9.6, 2.9), title, ("grey: 95 % of independent, normal noise",), widths=(2, 1, 1))
 
 
 @Chart(
-    "scatter", "Noise of quiescent frames", Axis("frames in a mean", log=True),
-    Axis("scatter (noise of one frame)", log=True),
+    "scatter", "Noise of quiescent frames", PlotAxis("frames in a mean", log=True),
+    PlotAxis("scatter (noise of one frame)", log=True),
     (
         Area("95 % of independent frames", name="range", alpha=0.4),
         Line("independent frames", name="white"),

@@ -160,7 +160,7 @@ def picture_of(kind: str, name: str, **options: Any) -> Callable[[Callable[..., 
 
     def registered(draw: Callable[..., Any]) -> Callable[..., Any]:
         styled = draw if hasattr(draw, "__wrapped__") else styled_picture(draw)
-        chart.ENTRIES[kind].append(chart.Entry(name, styled, **options))
+        chart.ENTRIES[kind].append(chart.PictureFunction(name, styled, **options))
         return styled
 
     return registered

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.charts import chart
-from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Chart, Dots, Line, Panel, Picture, Rule, Series, Strips
+from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of
-from mauvecl.schema.columns import First, with_error
+from mauvecl.schema.columns import FirstItems, with_error
 
 if TYPE_CHECKING:
     from mauvecl.answers.calibrate import CalibrateAnswer
@@ -26,7 +26,7 @@ def source(star: Source) -> Panel:
     """Plot a spectrum in Mauve's wavelength range."""
     inside = (star.wavelength_nm >= RANGE_NM[0]) & (star.wavelength_nm <= RANGE_NM[1])
     flux = Line("", "star", width=1.1, at=(star.wavelength_nm[inside], star.flux_flam[inside]))
-    y = Axis("flux (erg s$^{-1}$ cm$^{-2}$ Å$^{-1}$)")
+    y = PlotAxis("flux (erg s$^{-1}$ cm$^{-2}$ Å$^{-1}$)")
     return Panel(WAVELENGTH, y, [flux], ", ".join([star.name, *star.history]))
 
 
@@ -36,7 +36,7 @@ def expectation(x: Expectation) -> Panel:
     w, mean, noise = (x.table[name].value for name in ("wavelength", "signal", "noise"))
     band = Area("1 sigma of a pixel", alpha=0.35, at=(w, mean - noise, mean + noise))
     line = Line("mean signal", "star", width=1.2, at=(w, mean))
-    return Panel(Axis("wavelength (nm)", limits=(w[0], w[-1])), Axis("DN per pixel"), [band, line],
+    return Panel(PlotAxis("wavelength (nm)", limits=(w[0], w[-1])), PlotAxis("DN per pixel"), [band, line],
                  f"{x.name}, {x.exposure_s:g} s")  # fmt: skip
 
 
@@ -46,7 +46,7 @@ NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the in
 
 
 @Chart(
-    "throughput", "Throughput: fitted and nominal", WAVELENGTH, Axis("electrons per photon (%)"),
+    "throughput", "Throughput: fitted and nominal", WAVELENGTH, PlotAxis("electrons per photon (%)"),
     (
         Area("95 % interval", "star", "band", alpha=0.35),
         Line("fitted", "star", width=2, tips=("nm", "fitted (%)")),
@@ -70,12 +70,12 @@ def fitted_throughput(answer: CalibrateAnswer) -> Picture:
     above = calibrated_throughput.panel(series, f"nominal: {answer.nominal.name}")
     series = {name: (nm, *np.divide(y, 100 * nominal)) for name, (nm, *y) in series.items()}
     ratio = [replace(item, listed=False) for item in calibrated_throughput.panel(series).series]
-    below = Panel(WAVELENGTH, Axis("fitted / nominal"), ratio)
+    below = Panel(WAVELENGTH, PlotAxis("fitted / nominal"), ratio)
     return Picture([[above], [below]], (5.2, 4.6), f"Throughput {answer.source}", share_x=True)
 
 
 @Chart(
-    "residuals", "Observed less fitted spectra", WAVELENGTH, Axis(f"residual of {BIN} pixels (sigma)"),
+    "residuals", "Observed less fitted spectra", WAVELENGTH, PlotAxis(f"residual of {BIN} pixels (sigma)"),
     (
         chart.Targets("residual", tips=("residual (sigma)",)),
         Rule("2 sigma", "threshold", "above", along="y", at=2.0),
@@ -99,15 +99,15 @@ def residuals_of_stars(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
 def calibration_residuals(answer: CalibrateAnswer) -> Picture:
     """Plot the residuals of each star, averaged over some pixels, in their standard deviations."""
     two = Strips(along="y", alpha=0.2, at=([-2], [2]))
-    rows = [[Panel(WAVELENGTH, Axis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
+    rows = [[Panel(WAVELENGTH, PlotAxis("residual (sigma)"), [two, Dots("", "star", at=(nm, row))], name)]
             for name, nm, row in residuals_of_stars.series_of(answer)["residual"]]  # fmt: skip
     title, notes = f"Observed less fitted spectra, means of {BIN} pixels", f"p-value {answer.throughput.p_value:.2g}"
     return Picture(rows, (5.2, 1.0 + 1.1 * len(rows)), title, ("grey: 2 sigma", notes), share_x=True, share_y=True)
 
 
 @Chart(
-    "transfer", "Photon transfer: variance of frames against their mean", Axis("fitted variance (DN²)", log=True),
-    Axis("measured variance (DN²)", log=True),
+    "transfer", "Photon transfer: variance of frames against their mean", PlotAxis("fitted variance (DN²)", log=True),
+    PlotAxis("measured variance (DN²)", log=True),
     (Line("fitted"), Dots("measured", "star", size=6, tips=("fitted", "measured"))),
 ).data("calibrate", NO_OBSERVATIONS)  # fmt: skip
 def variances_of_frames(closed: Any, answer: CalibrateAnswer) -> chart.ChartData:
@@ -130,7 +130,7 @@ def photon_transfer(answer: CalibrateAnswer) -> Picture:
     groups = np.array_split(np.argsort(t.model), GROUPS)
     error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])
     off = Dots("", "star", size=6, at=(model, 100 * (measured / model - 1), 100 * error / model))
-    below = Panel(variances_of_frames.x, Axis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
+    below = Panel(variances_of_frames.x, PlotAxis("difference (%)"), [Rule(along="y", dash="-", at=0), off])
     title = (
         f"Photon transfer: gain {with_error(t.noise.gain, t.gain_error)} DN per electron, read noise "
         f"{with_error(t.read_noise_dn, t.read_noise_error)} DN; dark counts in {t.dark_unit}"
@@ -153,8 +153,8 @@ def dark_current(answer: CalibrateAnswer) -> Picture:
         mean.append(Dots("" if number else "means of frames", "star", at=at))
     mean.append(Line("fitted", "flare", at=(kelvin, d.level_dn_per_s.mean() * d.growth(kelvin))))
     mean.append(Line("nominal", dash="dashed", at=(kelvin, usual)))
-    pixel_panel = Panel(WAVELENGTH, Axis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
-    mean_panel = Panel(Axis("detector temperature (°C)"), Axis("mean dark current (DN/s)"), mean)
+    pixel_panel = Panel(WAVELENGTH, PlotAxis("dark current (DN/s)"), [pixels], f"pixels at {d.reference_c:.1f} °C")
+    mean_panel = Panel(PlotAxis("detector temperature (°C)"), PlotAxis("mean dark current (DN/s)"), mean)
     title = f"Dark current: slope {with_error(d.slope_per_c, d.slope_error)} per °C"
     return Picture([[pixel_panel, mean_panel]], (7.2, 2.9), title)
 
@@ -186,7 +186,7 @@ def shown_name(change: str) -> str:
 @picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
 def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
-    titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
+    titles = FirstItems(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
     (title,), star, row = titles, answer.study.star[0], []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
@@ -196,8 +196,8 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
         if lines:
             # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
             limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
-        y = Axis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
-        row.append(Panel(Axis(f"magnitude ({star.band})"), y, [chart.Targets(at=lines), *rules]))
+        y = PlotAxis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
+        row.append(Panel(PlotAxis(f"magnitude ({star.band})"), y, [chart.Targets(at=lines), *rules]))
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
     title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
     return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
@@ -206,14 +206,14 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
 @picture_of("ChangeAnswer", "periods", when=lambda answer: bool(answer.periods))
 def recovered_periods(answer: ChangeAnswer) -> Picture:
     """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
-    first, row = First(answer.periods, MOST, "changes"), []
+    first, row = FirstItems(answer.periods, MOST, "changes"), []
     for row_of_change in first:
         r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
         shares = 100 * row_of_change.shares("value")
         mesh = chart.Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
         unit = row_of_change.change.unit
-        y = Axis(f"semi-amplitude ({in_figure(unit) if unit else '%'})", log=True)
-        row.append(Panel(Axis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
+        y = PlotAxis(f"semi-amplitude ({in_figure(unit) if unit else '%'})", log=True)
+        row.append(Panel(PlotAxis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
     time = first[0].recovery.time_d
     title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
     return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (first.note,))
@@ -231,8 +231,8 @@ def line_indices(answer: ChangeAnswer) -> Picture:
         line = Line("mean spectrum", "star", at=(nm[near], index_row.flux[near]))
         band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T
         series = [line, Strips("band", "read", at=band), Strips("continuum", alpha=0.2, at=continua)]
-        y = Axis(f"flux ({in_figure('erg / (s cm2 nm)')})")
-        row.append(Panel(Axis("wavelength (nm)"), y, series, index.name))
+        y = PlotAxis(f"flux ({in_figure('erg / (s cm2 nm)')})")
+        row.append(Panel(PlotAxis("wavelength (nm)"), y, series, index.name))
     title = f"{title}: bands and continua of the line indices in the mean spectrum"
     return Picture([row], (1.0 + 2.3 * len(row), 3.1), title, below=True)
 
@@ -254,7 +254,7 @@ def fits(answer: MeasureAnswer) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     from mauvecl.fits.flare_model import usable_variance
 
-    flares, above, below = First(answer.flares, MOST_FLARES, "flares"), list[Panel](), list[Panel]()
+    flares, above, below = FirstItems(answer.flares, MOST_FLARES, "flares"), list[Panel](), list[Panel]()
     for flare in flares:
         quiet, measurement = flare.quiet, flare.found
         mean, unknown = flare.fitted_dn()
@@ -266,20 +266,20 @@ def fits(answer: MeasureAnswer) -> Picture:
         complete = quiet.per_element(used.astype(np.float64)) == pixels
         data, fit, variance = (np.where(complete, values, np.nan) for values in sums)
         nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
-        x = Axis("wavelength (nm)")
+        x = PlotAxis("wavelength (nm)")
         # Elements differ in their number of pixels, means hardly.
         dots = Dots("exposure less star and fitted unknowns", size=4, at=(nm, data / pixels, noise / pixels))
         line = Line(f"fit: {kelvin}", "star", at=(nm, fit / pixels))
-        above.append(Panel(x, Axis("mean of an element (DN per pixel)"), [dots, line], flare.name))
+        above.append(Panel(x, PlotAxis("mean of an element (DN per pixel)"), [dots, line], flare.name))
         residuals = Dots("", "star", size=4, at=(nm, (data - fit) / noise))
-        below.append(Panel(x, Axis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
+        below.append(Panel(x, PlotAxis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
     size = 3.6 * len(flares), 4.6
     return Picture([above, below], size, notes=(flares.note,), share_x=True, heights=(2, 1))
 
 
 def _panel_per_flare(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
     """Return a picture with a panel for each of the first flares."""
-    first = First(flares, MOST_FLARES, "flares")
+    first = FirstItems(flares, MOST_FLARES, "flares")
     row = [panel(flare) for flare in first]
     return Picture([row], (3.4 * len(first), 3.6), notes=(first.note,), below=True)
 
@@ -302,7 +302,7 @@ def contours(answer: MeasureAnswer) -> Picture:
         series.append(Dots("estimate without noise", "flare", marker="+", size=14, at=flare.perfect.estimates[0, :2]))
         if np.isfinite(flare.truth[:2]).all():
             series.append(Dots("simulated flare", "text", marker="x", size=8, at=flare.truth[:2]))
-        return Panel(Axis("flare temperature (K)"), Axis("flare amplitude"), series, flare.name)
+        return Panel(PlotAxis("flare temperature (K)"), PlotAxis("flare amplitude"), series, flare.name)
 
     return _panel_per_flare(_of_single_temperature(answer), panel)
 
@@ -324,8 +324,8 @@ def pulls(answer: MeasureAnswer) -> Picture:
             series.append(Line(flare.found.names[q], colour, step=True, at=((edges[1:] + edges[:-1]) / 2, density)))
         normal = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
         series.append(Line("standard normal", "text", dash="dashed", at=(x, normal)))
-        x_axis = Axis("(estimate \N{MINUS SIGN} truth) / standard error")
-        return Panel(x_axis, Axis("probability density"), series, flare.name)
+        x_axis = PlotAxis("(estimate \N{MINUS SIGN} truth) / standard error")
+        return Panel(x_axis, PlotAxis("probability density"), series, flare.name)
 
     return _panel_per_flare(answer.flares, panel)
 
@@ -342,7 +342,7 @@ def errors(answer: MeasureAnswer) -> Picture:
             for colour, q in zip(COLOURS, range(2), strict=False):
                 relative = [f.errors[q] / f.values[q] for f in ahead]
                 series.append(Line(f"{flare.fitted.names[q]}, {whose}", colour, dash=dash, at=(amplitudes, relative)))
-        x, y = Axis("flare amplitude", log=True), Axis("relative standard error", log=True)
+        x, y = PlotAxis("flare amplitude", log=True), PlotAxis("relative standard error", log=True)
         return Panel(x, y, series, flare.name)
 
     return _panel_per_flare(answer.flares, panel)
@@ -375,8 +375,8 @@ def temperatures(star: MeasuredStare) -> Picture:
         positive = [value for value in (*estimate, *true) if value > 0]
         unit = f" ({in_figure(measurement.units[q])})" if measurement.units[q] else ""
         label = " ".join(name.split(" ")[::-1]) + unit
-        y = Axis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
-        rows.append([Panel(Axis("time from the start of the stare (s)"), y, series)])
+        y = PlotAxis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
+        rows.append([Panel(PlotAxis("time from the start of the stare (s)"), y, series)])
     title = f"{star.title}: one simulated stare; nominal throughput"
     return Picture(rows, (7.2, 6.7), title, below=True, share_x=True)
 
@@ -387,15 +387,17 @@ def joint(star: MeasuredStare, fit: JointFit) -> Picture:
     stare, (event,), (drawn, mean) = star.staring.stare, star.events, (fit.fitted.drawn_dn, fit.fitted.mean_dn)
     since = (stare.middle_s - event.peak_s) / event.half_width_s
     near = (since > -BEFORE) & (since < AFTER)
-    x, time = Axis("time from the start of the stare (s)"), stare.middle_s[near]
+    x, time = PlotAxis("time from the start of the stare (s)"), stare.middle_s[near]
     dots = Dots("frames less star, sky, dark and unknowns", size=4, at=(time, drawn[near]))
     off = Dots("", "star", size=4, at=(time, (drawn - mean)[near]))
     true, fitted = fit.true.kelvin[near], fit.fitted.kelvin[near]
     simulated = Line("simulated flare", "text", dash="dashed", at=(time, true))
-    kelvin = Axis("temperature (K)", limits=(0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max())))
+    kelvin = PlotAxis(
+        "temperature (K)", limits=(0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max()))
+    )
     rows = [
-        [Panel(x, Axis("light (DN per frame)"), [dots, Line("joint fit", "star", at=(time, mean[near]))])],
-        [Panel(x, Axis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],
+        [Panel(x, PlotAxis("light (DN per frame)"), [dots, Line("joint fit", "star", at=(time, mean[near]))])],
+        [Panel(x, PlotAxis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],
         [Panel(x, kelvin, [Line("joint fit", "star", at=(time, fitted)), simulated])],
     ]
     title = f"{star.title}: one simulated stare; nominal throughput"

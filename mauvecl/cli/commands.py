@@ -152,7 +152,7 @@ class Session(flags.Options):
         if lines and not self.as_json:
             show([with_flags(line) for line in lines])
 
-    def leave(self, write: Callable[[], Path]) -> None:
+    def write_file(self, write: Callable[[], Path]) -> None:
         """Write a file; failures are reported at the end, after the answer is printed."""
         try:
             self.files.append(write())
@@ -246,12 +246,14 @@ class Session(flags.Options):
         elif self.pictures and not self.quiet:
             self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
         for name, write in writers.items():
-            self.leave(partial(write, self.folder / name))
+            self.write_file(partial(write, self.folder / name))
         data = answer.study.model_dump(mode="json", exclude_none=True)
         about: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "files": self.files}
         about |= {"seconds": time.perf_counter() - self.started, "messages": [*answer.messages, *answer.remarks]}
         # Only a complete answer replaces another's files.
-        self.leave(lambda: write_record(self.verb, data, answer.inputs, self.folder, whole=not self._lost, **about))
+        self.write_file(
+            lambda: write_record(self.verb, data, answer.inputs, self.folder, whole=not self._lost, **about)
+        )
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 

@@ -310,7 +310,7 @@ def check_last(start: int, realisations: int) -> None:
         raise InputError.of("start", start, f"at most {2**63 - 1 - realisations} for {realisations} realisations")
 
 
-class Countable:
+class ShardedRequest:
     """Base class of requests, which are divided into shards, and pickled without cached results."""
 
     #: Smallest number of realisations of a shard, a power of two.
@@ -345,7 +345,7 @@ class Countable:
 
 @validated
 @dataclass(frozen=True, eq=False)
-class DetectRequest(Countable):
+class DetectRequest(ShardedRequest):
     """Arguments of `Engine.detect`."""
 
     quiet: Expectation
@@ -390,7 +390,7 @@ class DetectRequest(Countable):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class RealiseRequest(Countable):
+class RealiseRequest(ShardedRequest):
     """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
 
     expectation: Expectation

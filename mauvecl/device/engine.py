@@ -211,7 +211,9 @@ class Engine:
             launches.flush_counts(counts)
         return counts
 
-    def count(self, request: requests.Countable, shard: requests.Shard, *, out: NDArray[Any] | None = None) -> Arrays:
+    def count(
+        self, request: requests.ShardedRequest, shard: requests.Shard, *, out: NDArray[Any] | None = None
+    ) -> Arrays:
         """Compute the sums of one shard of a request; raw spectra are ``rows``, filled into `out` if it is given."""
         match request:
             case requests.DetectRequest():

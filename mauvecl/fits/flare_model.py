@@ -60,7 +60,7 @@ BANDS_NM = ((200.0, 320.0), (200.0, 700.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Derived:
+class DerivedQuantity:
     """Quantity that follows from temperature and amplitudes."""
 
     name: str
@@ -105,7 +105,7 @@ class FlareModel:
     hot: Float
     fixed: Float
     linear: tuple[str, ...]
-    derived: tuple[Derived, ...]
+    derived: tuple[DerivedQuantity, ...]
 
     @classmethod
     def of(
@@ -294,7 +294,7 @@ def _light_between(grid: Float, fluxes: Float, low: float, high: float) -> Float
 def _derived(
     kelvin: Float, scale: Float, names: tuple[str, ...], light: list[tuple[str, Float]], exposure_s: float,
     distance_pc: float | None, radius_rsun: float | None,
-) -> Iterator[Derived]:  # fmt: skip
+) -> Iterator[DerivedQuantity]:  # fmt: skip
     """Yield the quantities of a model; `light` holds fluxes per amplitude by range, those of blackbodies first."""
 
     def of_one(column: int, values: Float | float) -> Float:
@@ -303,30 +303,32 @@ def _derived(
         factors[:, column] = values
         return factors
 
-    yield Derived("temperature", "K", "temperature of the flare's blackbody")
-    yield Derived("amplitude", "", "relative rise of the band's photons by the blackbody", of_one(0, 1.0))
+    yield DerivedQuantity("temperature", "K", "temperature of the flare's blackbody")
+    yield DerivedQuantity("amplitude", "", "relative rise of the band's photons by the blackbody", of_one(0, 1.0))
     if "balmer" in names:
         edge = np.array([float(blackbody(np.array([BALMER_EDGE_NM]), float(k))[0]) for k in kelvin])
-        yield Derived("jump", "", "flux just below the Balmer edge over that just above", ratio=1.0 / (scale * edge))
+        yield DerivedQuantity(
+            "jump", "", "flux just below the Balmer edge over that just above", ratio=1.0 / (scale * edge)
+        )
     for column, name in enumerate(names):
         if name.startswith("line "):
             text = f"flux of the line {name[5:]} at the telescope"
-            yield Derived(name, "erg / (cm2 s)", text, of_one(column, 1.0))
+            yield DerivedQuantity(name, "erg / (cm2 s)", text, of_one(column, 1.0))
     fluxes = [(where, np.column_stack([f[:NODES], np.tile(f[NODES:], (NODES, 1))])) for where, f in light]
     for where, flux in fluxes:
-        yield Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", flux)
+        yield DerivedQuantity(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", flux)
     if distance_pc is None:
         return
     far = distance_pc * PARSEC_CM
     area = of_one(0, np.pi * far**2 * scale)
-    yield Derived("area", "cm2", "projected area of the blackbody", area)
+    yield DerivedQuantity("area", "cm2", "projected area of the blackbody", area)
     if radius_rsun is not None:
         share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
-        yield Derived("filling factor", "", "share of the star's disc that the blackbody covers", share)
+        yield DerivedQuantity("filling factor", "", "share of the star's disc that the blackbody covers", share)
     for where, flux in fluxes:
         total = flux * 4 * np.pi * far**2
-        yield Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total)
-        yield Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", total * exposure_s)
+        yield DerivedQuantity(f"luminosity {where}", "erg / s", f"luminosity, {where}", total)
+        yield DerivedQuantity(f"energy {where}", "erg", f"energy within the exposure, {where}", total * exposure_s)
 
 
 #: Shares of a prior in the variance of a ratio at which thresholds are computed, and their largest root.

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import (
     NEAR_SIGMA,
-    Derived,
+    DerivedQuantity,
     FlareModel,
     Ranges,
     ReducedSums,
@@ -545,13 +545,15 @@ class TwoTemperatures:
             # The ratio of the flux at the telescope to that at the surface is proportional to the area.
             return np.asarray(self._bolometric(x)[..., 0] / np.exp(4 * x))
 
-        def with_second(derived: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
+        def with_second(derived: DerivedQuantity, spline: scipy.interpolate.CubicSpline | None) -> DerivedQuantity:
             if derived.factors is None or spline is None:
                 return derived
             return replace(derived, factors=np.insert(derived.factors[:end], 1, spline(log_k)[0], axis=1))
 
-        kelvin = Derived("second temperature", "K", "temperature of the second blackbody", held=float(np.exp(log_k)))
-        share = Derived("second area", "", "area at the second temperature over that at the first",
+        kelvin = DerivedQuantity(
+            "second temperature", "K", "temperature of the second blackbody", held=float(np.exp(log_k))
+        )
+        share = DerivedQuantity("second area", "", "area at the second temperature over that at the first",
                         ratio=area(log_k) / area(single.log_k[:end]), offset=0.0)  # fmt: skip
         return FlareModel(
             single.log_k[:end], single.hot[:end], np.vstack([single.hot_spline(log_k), single.fixed]),

@@ -22,7 +22,7 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Duration
 
 
-class Integrable(ABC):
+class TimeProfile(ABC):
     """Time profile that can be integrated, in units of amplitude and half-width."""
 
     @abstractmethod
@@ -40,7 +40,7 @@ class Integrable(ABC):
 
 
 @validated
-class Shape(Integrable):
+class Shape(TimeProfile):
     """Time profile of a flare."""
 
     #: Name in studies and flags, and publication.
@@ -100,7 +100,7 @@ class Shape(Integrable):
         return np.asarray(integrals * scale / lengths)
 
 
-def sides(shape: Integrable, tau: ArrayLike) -> Float:
+def sides(shape: TimeProfile, tau: ArrayLike) -> Float:
     """Return the integrals up to min(tau, 0) and from max(tau, 0), in half-widths, shape (2, *tau.shape).
 
     `between` subtracts them. Differences of integrals from one end only would cancel on the other side of the peak.
@@ -115,7 +115,7 @@ def between(first: Float, last: Float) -> Float:
     return np.asarray(np.maximum(last[0] - first[0] + (first[1] - last[1]), 0.0))
 
 
-def consecutive_integrals(shape: Integrable, tau: ArrayLike) -> Float:
+def consecutive_integrals(shape: TimeProfile, tau: ArrayLike) -> Float:
     """Return the integrals between consecutive values of tau along the last axis, in half-widths."""
     integrals = sides(shape, tau)
     return between(integrals[..., :-1], integrals[..., 1:])

@@ -19,7 +19,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.requests import Countable
+from mauvecl.detection.requests import ShardedRequest
 from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
 from mauvecl.flares.stare import Stare
 from mauvecl.host.arrays import Arrays, Float
@@ -310,7 +310,7 @@ class Reduction(Protocol):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class StaresRequest(Countable):
+class StaresRequest(ShardedRequest):
     """Request for stares; flares and amplitudes as for `Stares.frames`."""
 
     components: Components
@@ -351,11 +351,11 @@ class StaresRequest(Countable):
     @property
     def reducing(self) -> Reduction:
         """The reduction, or what returns statistics as they are."""
-        return self.reduction or KeepStatistics()
+        return self.reduction or IdentityReduction()
 
 
 @dataclass(frozen=True)
-class KeepStatistics:
+class IdentityReduction:
     """Reduction that returns the statistics, and the draws for flares if there are any, as they are."""
 
     adds: ClassVar[bool] = False

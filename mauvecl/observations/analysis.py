@@ -17,7 +17,7 @@ from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.events import LONG_S, Kind, ObservedEvent, detect_events, measure_events, most_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.level import Likeness, QuiescentLevel, Scatter, binned_scatter, likeness
+from mauvecl.observations.level import NoiseComparison, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import (
@@ -175,7 +175,7 @@ class Analysis:
     scatter: list[Scatter]
     residual: Float  # shape (n_quiet, n_sum); of quiescent frames given those before them, in standard deviations
     quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals
-    likeness: Likeness  # of the residuals and independent noise
+    likeness: NoiseComparison  # of the residuals and independent noise
     spectra: SpectralSeries | None  # if they are searched with weights for flares
     event_spectra: list[EventSpectrum | None]  # of these, those of the events, in their order
     measurements: list[Measurement | str]  # flares fitted to these, or the reasons why none are

@@ -26,7 +26,7 @@ import scipy
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape, consecutive_integrals
+from mauvecl.flares.shapes import SHAPES, Davenport2014, Shape, TimeProfile, consecutive_integrals
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.search.templates import REACH
 
@@ -51,7 +51,7 @@ GENERAL_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
-class Half(Integrable):
+class HalfProfile(TimeProfile):
     """Rise of a flare that ends at the peak, or decay that begins there.
 
     Integrals are those up to a time before the peak and from a time after it, which is all that callers need.
@@ -67,9 +67,9 @@ class Half(Integrable):
         return self.integral(np.asarray(tau)) if self.decays else np.zeros(np.shape(tau))
 
 
-def _exponential(rate: float) -> Half:
+def _exponential(rate: float) -> HalfProfile:
     """Return an exponential decay with a rate per half-width."""
-    return Half(lambda tau: np.asarray(np.exp(-rate * tau) / rate), decays=True)
+    return HalfProfile(lambda tau: np.asarray(np.exp(-rate * tau) / rate), decays=True)
 
 
 def _gaussian(tau: Float, width: float) -> Float:
@@ -79,11 +79,11 @@ def _gaussian(tau: Float, width: float) -> Float:
 
 
 @dataclass(frozen=True)
-class WeightedSum(Integrable):
+class WeightedSum(TimeProfile):
     """Shape of a family: a weighted sum of its parts."""
 
     name: str
-    parts: tuple[tuple[float, Integrable], ...]
+    parts: tuple[tuple[float, TimeProfile], ...]
 
     def before(self, tau: ArrayLike) -> Float:
         return np.asarray(sum(weight * part.before(tau) for weight, part in self.parts))
@@ -97,7 +97,7 @@ class Family:
     """Shapes that are weighted sums of the same parts."""
 
     name: str
-    parts: tuple[Integrable, ...]
+    parts: tuple[TimeProfile, ...]
     weights: Float  # shape (n_shape, n_part)
     log_prior: Float  # shape (n_shape,); logarithm of the prior weight of each shape in the family
     epsilon: tuple[float, ...]  # departures from the shapes that are averaged
@@ -112,8 +112,11 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        rises = [Half(SHAPES["davenport2014"].before), *(Half(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES)]
-        gaussian = Half(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
+        rises = [
+            HalfProfile(SHAPES["davenport2014"].before),
+            *(HalfProfile(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES),
+        ]
+        gaussian = HalfProfile(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
         # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
         low, high = np.log(SLOW_RATES[[0, -1]])
@@ -230,11 +233,11 @@ class Window:
         pairs = zip(unit, self.survey.processes, strict=True)
         return np.asarray(sum(weight**2 * process.at(lags) for weight, process in pairs))
 
-    def model(self, shape: Integrable, peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
+    def model(self, shape: TimeProfile, peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
         """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
         return np.asarray(self.models((shape,), peak_s, half_width_s)[0])
 
-    def models(self, parts: Sequence[Integrable], peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
+    def models(self, parts: Sequence[TimeProfile], peak_s: ArrayLike, half_width_s: ArrayLike) -> Float:
         """Return the mean of several parts of shapes in the bins, in the unit of the values, (n_part, n_shape, n)."""
         times, place = self._times
         peak, width = (np.atleast_1d(values)[:, None] for values in (peak_s, half_width_s))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.process import MAX_TRIED, Binned, Process, Steps, criterion_of_process, fit_process
+from mauvecl.observations.process import MAX_TRIED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
 
@@ -171,7 +171,7 @@ def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
         )
 
 
-class LevelGiven:
+class ConditionalLevel:
     """Means of a process at all times given quiescent values, by one factorisation for all values at these times.
 
     The sum of the `weights` of the values is the inverse of the variance of the constant level.
@@ -206,7 +206,7 @@ def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, s
     It is the scatter of differences between simulated processes and their means given noisy values (Matheron's rule),
     with that of the constant level. `steps` reports each of these.
     """
-    level = LevelGiven(process, time_s, variance, quiet)
+    level = ConditionalLevel(process, time_s, variance, quiet)
     if not process.terms:
         return np.full(time_s.size, (1.0 / float(level.weights.sum())) ** 0.5)
     noise = variance * process.excess**2
@@ -247,7 +247,7 @@ CORRELATED, SIGNIFICANT = 0.12, 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness:
+class NoiseComparison:
     """Comparison of the residuals of the fitted process with independent noise."""
 
     correlations: Float  # shape (n_lag,); at lags of 1, 2 ... frames, of the sum that is most correlated
@@ -264,7 +264,7 @@ class Likeness:
         return bool(self.excess.max() < 1)
 
 
-def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
+def likeness(numbers: NDArray[np.int64], residual: Float) -> NoiseComparison:
     """Return the autocorrelation of residuals, shape (n_frame, n_sum), at lags of the frames' numbers."""
     # Single extreme values would hide correlations, or feign them.
     scaled = np.clip(residual, -4.0, 4.0)
@@ -277,7 +277,9 @@ def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
         if first.size > 10:
             correlations[:, k] = (scaled[first] * scaled[second]).mean(axis=0)
             errors[k] = first.size**-0.5
-    return max((Likeness(row, errors) for row in correlations), key=lambda likeness: float(likeness.excess.max()))
+    return max(
+        (NoiseComparison(row, errors) for row in correlations), key=lambda likeness: float(likeness.excess.max())
+    )
 
 
 @dataclass(frozen=True)
@@ -341,15 +343,15 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
     begun there, and if together they lower the Bayesian information criterion. No frame has a fault.
     """
     constant = np.ones(flux.size)
-    values = flux / Binned(time_s, flux, constant, frame_s).noise
+    values = flux / BinnedLightCurve(time_s, flux, constant, frame_s).noise
     places, sizes = _find_sudden_changes(time_s, values)
     typical = float(np.median(values))
     process: Process | None = None
     if not places.size or not typical > 0:
         return constant
 
-    def binned(light: Float) -> Binned:
-        return Binned.of(time_s[quiet], light[quiet], np.ones(int(quiet.sum())), frame_s, MAX_TRIED)
+    def binned(light: Float) -> BinnedLightCurve:
+        return BinnedLightCurve.of(time_s[quiet], light[quiet], np.ones(int(quiet.sum())), frame_s, MAX_TRIED)
 
     for _ in range(ROUNDS):
         without_steps = values - np.cumsum(np.bincount(places, sizes, values.size))
@@ -414,8 +416,8 @@ def _fit_steps(
     """Return the steps of a light curve by generalised least squares, and their standard errors, (n_step,) each."""
     rows, time = np.flatnonzero(quiet), time_s[quiet]
 
-    def binned(column: Float | Bool) -> Binned:
-        return Binned.of(time, column.astype(np.float64), np.ones(rows.size), frame_s)
+    def binned(column: Float | Bool) -> BinnedLightCurve:
+        return BinnedLightCurve.of(time, column.astype(np.float64), np.ones(rows.size), frame_s)
 
     data = binned(flux[quiet])
     columns = [np.ones(data.values.size), *(binned(rows >= place).values for place in places), data.values]

@@ -33,7 +33,7 @@ from mauvecl.observations.level import (
     relative_level,
     single_frames,
 )
-from mauvecl.observations.process import UNREPORTED, Binned, Process, Steps, criterion_of_process, fit_process
+from mauvecl.observations.process import UNREPORTED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 
@@ -135,7 +135,7 @@ def _shapeless_cost(survey: SeriesSurvey, event: DetectedEvent, light: Sequence[
     costs = []
     for n_flares, flux, extra in added:
         values, variance = survey.sums[rows, 0] - flux[rows, 0], survey.variance[rows] + extra[rows]
-        data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
+        data = BinnedLightCurve(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
         process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
         costs.append(PARAMETERS * n_flares * size + criterion_of_process(process, data, size))
     return min(costs)
@@ -160,10 +160,10 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], chosen: Bool
         if fits and not process.terms:
             # Frames without events in the tail of a flare have more scatter than noise.
             noise = (survey.variance + extra)[chosen]
-            process = fit_process(Binned(start, column, noise, survey.stare.frame_s), process)
+            process = fit_process(BinnedLightCurve(start, column, noise, survey.stare.frame_s), process)
             noise = noise * process.excess**2
         # The excess is in the noise already.
-        data = Binned(start, column, noise, survey.stare.frame_s)
+        data = BinnedLightCurve(start, column, noise, survey.stare.frame_s)
         total += criterion_of_process(replace(process, excess=1.0), data, size)
     return total
 
@@ -207,7 +207,7 @@ def _fit_processes(survey: SeriesSurvey, quiet: Bool, before: SeriesSurvey | Non
     starts = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
     for column, start in zip(columns, starts, strict=False):
         time, values, variance = survey.stare.start_s[quiet], column[quiet], survey.variance[quiet]
-        fits.append(fit_process(Binned.of(time, values, variance, survey.stare.frame_s), start, steps))
+        fits.append(fit_process(BinnedLightCurve.of(time, values, variance, survey.stare.frame_s), start, steps))
     return replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
 
 
@@ -313,7 +313,7 @@ def _find_eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     bright, dim = survey.frames(~guessed), survey.frames(guessed)
     fitted, in_events = fit_quiet_light(bright, guess_flares(bright.stare.numbers, bright.flux))
     # The light in eclipses may have any smooth shape.
-    data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
+    data = BinnedLightCurve(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
     size = float(np.log(guessed.size))
     cost = EPHEMERIS * size + criterion_of_process(fit_process(data), data, size)
     if criterion(fitted, light_of_events(fitted, in_events), in_events) + cost >= usual():
@@ -340,7 +340,7 @@ def guess_eclipses(survey: SeriesSurvey) -> Bool:
 
     time = survey.stare.start_s
     inside = np.zeros(time.size, np.bool_)
-    data = Binned.of(time, survey.flux, survey.variance, survey.stare.frame_s, MOST_BINNED)
+    data = BinnedLightCurve.of(time, survey.flux, survey.variance, survey.stare.frame_s, MOST_BINNED)
     period = max(SHORTEST_PERIOD_S, 2 * data.step_s / ECLIPSES[0])
     grids = []
     while period < data.span_s / 3:

@@ -299,7 +299,7 @@ def level_fit(covariance: Covariance, values: Float) -> tuple[float, float, Floa
 
 
 @dataclass(frozen=True, eq=False)
-class Binned:
+class BinnedLightCurve:
     """Light curve to which the parameters of a process are fitted."""
 
     time_s: Float
@@ -326,7 +326,9 @@ class Binned:
         return float(np.log(max(self.noise / float(np.sqrt(np.median(self.variance))), 1e-6)))
 
     @classmethod
-    def of(cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED) -> Binned:
+    def of(
+        cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED
+    ) -> BinnedLightCurve:
         """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
         factor = -(-time_s.size // largest)
         if factor == 1:
@@ -342,13 +344,13 @@ class Binned:
         return cls(total(time_s) / count, total(values) / count, total(variance) / count**2, factor * step_s)
 
 
-def criterion_of_process(process: Process, data: Binned, size: float) -> float:
+def criterion_of_process(process: Process, data: BinnedLightCurve, size: float) -> float:
     """Return the Bayesian information criterion of a process, of which a parameter costs `size`."""
     covariance = process.covariance(data.time_s, data.variance * process.excess**2)
     return process.n_parameters * size - 2 * level_fit(covariance, data.values)[1]
 
 
-def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREPORTED) -> Process:
+def fit_process(data: BinnedLightCurve, start: Process | None = None, steps: Steps = UNREPORTED) -> Process:
     """Fit a process to a light curve without flares; the terms of `start`, of nearly the same data, are kept.
 
     `steps` reports each combination of terms.
@@ -376,12 +378,12 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps = UNREP
     return replace(best, bic=tuple((name, bic - value) for name, bic in tried.items()))
 
 
-def _sharpen(data: Binned, process: Process) -> tuple[Process, float] | None:
+def _sharpen(data: BinnedLightCurve, process: Process) -> tuple[Process, float] | None:
     """Return a process whose last term, rotation, has more harmonics, and its BIC; None if they do not fit better."""
     size, period, quality, *_ = process.terms[-1].parameters
     sharp = ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
     terms, log_excess = (*process.terms[:-1], sharp), float(np.log(process.excess))
-    coarse = Binned.of(data.time_s, data.values, data.variance, data.step_s, MAX_TRIED)
+    coarse = BinnedLightCurve.of(data.time_s, data.values, data.variance, data.step_s, MAX_TRIED)
     fitted, bic = _fit_terms(coarse, terms, log_excess)
     if coarse.step_s != data.step_s:
         if bic + STRONG >= _fit_terms(coarse, process.terms, log_excess)[1]:
@@ -390,7 +392,7 @@ def _sharpen(data: Binned, process: Process) -> tuple[Process, float] | None:
     return fitted, bic + STRONG
 
 
-def _starting_terms(data: Binned, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
+def _starting_terms(data: BinnedLightCurve, best: Process) -> Iterator[tuple[ProcessTerm, ...]]:
     """Yield starting points of a further term, or of rotation with a slower change of the light."""
     covariance = best.covariance(data.time_s, data.variance * best.excess**2)
     spread = max(float(np.std(data.values - level_fit(covariance, data.values)[0])), data.noise)
@@ -419,7 +421,7 @@ def _rotation(size: float, period: float) -> ProcessTerm:
     return ProcessTerm("rotation", tuple(np.log([size, period, 10.0, 1.0, 0.3]).tolist()))
 
 
-def _find_period(data: Binned, values: Float, share: float) -> float | None:
+def _find_period(data: BinnedLightCurve, values: Float, share: float) -> float | None:
     """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
 
     The values may be residuals of the data; `share` is the longest period over the length of the data.
@@ -442,7 +444,7 @@ def _find_period(data: Binned, values: Float, share: float) -> float | None:
     return float(1.0 / frequency[best]) if chance < PERIODIC else None
 
 
-def _fit_terms(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
+def _fit_terms(data: BinnedLightCurve, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
     """Return the process of some terms that fits best, and its BIC."""
     expected = data.log_excess
     start = np.array([log_excess, *(value for term in terms for value in term.parameters)])

@@ -26,7 +26,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.host.arrays import Bool, Float, array_cache, map_in_threads
-from mauvecl.observations.level import LevelGiven
+from mauvecl.observations.level import ConditionalLevel
 from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search.search import largest_values
@@ -354,7 +354,7 @@ class SeriesSurvey:
     def levels(self, quiet: Bool) -> Float:
         """Return the mean of the process of each sum given quiescent frames, shape (n_frame, n_sum)."""
         return np.column_stack([
-            LevelGiven(process, self.stare.start_s, self.variance, quiet).of(column)
+            ConditionalLevel(process, self.stare.start_s, self.variance, quiet).of(column)
             for process, column in zip(self.processes, self.sums.T, strict=True)
         ])  # fmt: skip
 
@@ -371,7 +371,7 @@ class SeriesSurvey:
         """
         if quiet.sum() < MIN_BASELINE:
             return np.full(quiet.size, self.level / self.scale)
-        return LevelGiven(self.flux_process, self.stare.start_s, self.variance, quiet).of(self.flux)
+        return ConditionalLevel(self.flux_process, self.stare.start_s, self.variance, quiet).of(self.flux)
 
     def inverted(self) -> SeriesSurvey:
         """Return the survey upside down: losses of light become flares."""

@@ -43,7 +43,7 @@ IN_TAIL = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Recovery:
+class PeriodRecovery:
     """Share of sinusoids whose period is recovered."""
 
     time_d: Float  # shape (n_visit,)
@@ -78,7 +78,7 @@ def recover_periods(
     seed: Seed = DEFAULT_SEED,
     shortest_d: Annotated[Positive | None, Unit("d")] = None,
     longest_d: Annotated[Positive | None, Unit("d")] = None,
-) -> Recovery:
+) -> PeriodRecovery:
     """Simulate how often the period of a sinusoid is found in visits with normal errors of one.
 
     A period is recovered if the highest peak exceeds the threshold and lies within half of the frequency resolution,
@@ -127,7 +127,7 @@ def recover_periods(
                 recoveries += power > threshold and abs(at - 1 / period) < 0.5 / base
             row.append(clopper_pearson(recoveries, trials))
         recovered.append(row)
-    return Recovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
+    return PeriodRecovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
 
 
 def _frequencies(base: float, low: float, high: float) -> Float:
@@ -148,7 +148,7 @@ LEAST_LIGHT = 1e-3
 
 
 @dataclass(frozen=True)
-class Smallest:
+class SmallestChanges:
     """Smallest detectable changes, in the unit of the error of a visit."""
 
     one: float  # difference of one visit from all others
@@ -158,7 +158,7 @@ class Smallest:
 @validated
 def smallest_change(
     error: Positive, visits: Annotated[int, Range(2)], fap: Probability, power: Probability
-) -> Smallest:
+) -> SmallestChanges:
     """Compute the smallest detectable changes among visits with equal errors.
 
     Parameters
@@ -180,11 +180,11 @@ def smallest_change(
     dof = visits - 1
     cut = float(scipy.stats.chi2.isf(fap, dof))
     if power <= fap:
-        return Smallest(0.0, 0.0)
+        return SmallestChanges(0.0, 0.0)
     # Non-centrality with which the test exceeds its threshold with this probability.
     centre = scipy.special.chndtrinc(cut, dof, 1.0 - power)
     ratio = cut / float(scipy.stats.chi2.isf(power, dof))
-    return Smallest(float(error * np.sqrt(centre * visits / dof)), float(error * np.sqrt(ratio - 1.0)))
+    return SmallestChanges(float(error * np.sqrt(centre * visits / dof)), float(error * np.sqrt(ratio - 1.0)))
 
 
 def pixels_of(counts_dn: Float, quiet: Expectation) -> tuple[int, int]:

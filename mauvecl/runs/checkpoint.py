@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from mauvecl.detection.requests import Countable, Shard
+from mauvecl.detection.requests import Shard, ShardedRequest
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import Arrays
 from mauvecl.host.tables.files import UNFINISHED, read_bytes, write_whole
@@ -79,7 +79,7 @@ SHARD_WORK = 2**34
 MAX_SHARDS = 2**13
 
 
-def shards(request: Countable) -> list[Shard]:
+def shards(request: ShardedRequest) -> list[Shard]:
     """Divide a request into shards at multiples of a power of two, independently of the workers."""
     count = max(SHARD_WORK // request.work, request.realisations // MAX_SHARDS, request.least)
     size = 1 << (count.bit_length() - 1)
@@ -92,7 +92,7 @@ def shards(request: Countable) -> list[Shard]:
 class Task:
     """A shard to count."""
 
-    request: Countable
+    request: ShardedRequest
     key: str  # fingerprint of the request
     shard: Shard
     tick: Callable[[int], None] = lambda done: None  # called with the number of counted realisations, if possible

@@ -17,7 +17,7 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.detection.requests import Countable, Shard
+from mauvecl.detection.requests import Shard, ShardedRequest
 from mauvecl.device.build import DeviceRecord
 from mauvecl.device.drivers import THREADS, DeviceError
 from mauvecl.host import VERSION
@@ -306,7 +306,7 @@ def dask_setup(worker: Any) -> None:
 
 _one_at_a_time = threading.Lock()
 #: Requests by their bytes; each keeps what it has computed for earlier shards.
-_request: Callable[[bytes], Countable] = lru_cache(maxsize=4)(pickle.loads)
+_request: Callable[[bytes], ShardedRequest] = lru_cache(maxsize=4)(pickle.loads)
 
 
 @cache

@@ -234,7 +234,7 @@ def with_error(value: float, error: float) -> str:
 T = TypeVar("T")
 
 
-class First(list[T]):
+class FirstItems(list[T]):
     """The first items of a list, with a `note` such as "6 of 9 stars shown" if it has more."""
 
     def __init__(self, items: Collection[T], most: int, name: str) -> None:
@@ -249,7 +249,7 @@ def part_note(shown: int, total: int, name: str) -> str:
 
 def note_of(items: Iterable[object]) -> str:
     """Return the note of items that are a part of a list, or nothing."""
-    return items.note if isinstance(items, First) else ""
+    return items.note if isinstance(items, FirstItems) else ""
 
 
 class Drawable:

@@ -239,7 +239,7 @@ def says_none(value: Any) -> bool:
     return isinstance(value, str) and value.strip().lower() == "none"
 
 
-class OrNone:
+class OptionalNumber:
     """Number that may be None, for which study files and flags write ``none``."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:

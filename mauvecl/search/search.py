@@ -430,14 +430,14 @@ class Survey:
 
     def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
         """Return the request for the largest values of stares without a flare."""
-        method, largest = method_for(self.components, self.stare, processes), Largest(self.bank, self.frames)
+        method, largest = method_for(self.components, self.stare, processes), LargestValues(self.bank, self.frames)
         return StaresRequest(
             self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Largest:
+class LargestValues:
     """Reduction of simulated stares to their largest values."""
 
     adds: ClassVar[bool] = False

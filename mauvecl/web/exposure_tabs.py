@@ -11,7 +11,20 @@ from mauvecl.answers.closed_forms import Cost, spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
 from mauvecl.answers.signal import simulate
-from mauvecl.charts.chart import WAVELENGTH, Area, Axis, Bars, Chart, ChartData, Custom, Dots, Line, Listed, Own, Rule
+from mauvecl.charts.chart import (
+    WAVELENGTH,
+    Area,
+    Bars,
+    Chart,
+    ChartData,
+    Custom,
+    Dots,
+    LegendEntry,
+    Line,
+    OwnMarker,
+    PlotAxis,
+    Rule,
+)
 from mauvecl.charts.detection import BUDGET, budget_series, roc_columns
 from mauvecl.detection.requests import statistic_label
 from mauvecl.noise.unknowns import NUISANCES
@@ -57,7 +70,7 @@ NOISE = Tab(
 
 
 @Chart(
-    "snr", "Signal to noise without a flare", WAVELENGTH, Axis("S/N"),
+    "snr", "Signal to noise without a flare", WAVELENGTH, PlotAxis("S/N"),
     (
         Area("95 % of realisations, per element", name="spread", alpha=0.4),
         SATURATED,
@@ -99,7 +112,7 @@ SIGNAL = Tab(
 
 
 @Chart(
-    "recorded", "One exposure, less bias and dark", WAVELENGTH, Axis("DN in the exposure"),
+    "recorded", "One exposure, less bias and dark", WAVELENGTH, PlotAxis("DN in the exposure"),
     (
         Area("95 % of draws with the flare", "flare", "spread"),
         SATURATED,
@@ -141,7 +154,7 @@ def recorded(closed: ClosedForms, answers: Answers) -> ChartData:
 
 
 @Chart(
-    "telescope", "Spectrum at the telescope", WAVELENGTH, Axis("flux (erg / s / cm² / Å)"),
+    "telescope", "Spectrum at the telescope", WAVELENGTH, PlotAxis("flux (erg / s / cm² / Å)"),
     (
         Line("star with flare", "flare", "flare", tips=("with flare",)),
         Line("star", "star", tips=("wavelength (nm)", "star")),
@@ -174,7 +187,7 @@ SPECTRUM = Tab(
 
 
 @Chart(
-    "excess", "Flare minus quiet, in sigma of the noise", WAVELENGTH, Axis("sigma of the noise"),
+    "excess", "Flare minus quiet, in sigma of the noise", WAVELENGTH, PlotAxis("sigma of the noise"),
     (
         Area("95 % of the noise", name="noise", alpha=0.16),
         SATURATED,
@@ -217,12 +230,12 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
 
 
 @Chart(
-    "distributions", "The statistic without and with the flare", Axis("statistic"),
-    Axis("density, each peak = 1", limits=(0, 1.06), log_limits=(1e-4, 1.5)),
+    "distributions", "The statistic without and with the flare", PlotAxis("statistic"),
+    PlotAxis("density, each peak = 1", limits=(0, 1.06), log_limits=(1e-4, 1.5)),
     (
         Bars("simulated", "star", "null bars", listed=False),
         Bars("simulated", "flare", "flare bars", listed=False),
-        Listed("simulated", form="bars", show="if any"),
+        LegendEntry("simulated", form="bars", show="if any"),
         Area("no flare", "star", "null area", alpha=0.18, listed=False),
         Line("no flare", "star", "null", width=2, tips=("statistic", "density")),
         Area("flare", "flare", "flare area", alpha=0.18, listed=False),
@@ -260,12 +273,13 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
 
 
 @Chart(
-    "roc", "Receiver operating characteristic", Axis("false-alarm probability per test", log=True, limits=(1e-6, 1)),
-    Axis("detection probability", limits=(-0.02, 1.03)),
+    "roc", "Receiver operating characteristic",
+    PlotAxis("false-alarm probability per test", log=True, limits=(1e-6, 1)),
+    PlotAxis("detection probability", limits=(-0.02, 1.03)),
     (
         Area("simulated, 95 %", name="simulated", alpha=0.4),
         Line("closed form", "flare", width=2, tips=("false-alarm probability", "detection probability")),
-        Own(),
+        OwnMarker(),
     ),
     sets="fap=x", pins="closed form",
 ).data()  # fmt: skip
@@ -329,8 +343,8 @@ def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
 
 
 @Chart(
-    "cost", "What each unknown costs: the flare's S/N by the matched statistic", Axis("S/N of the flare"),
-    Axis(kind="names"), (Custom("bars", columns=("name", "plain", "marginal", "known"), draw=_bars),),
+    "cost", "What each unknown costs: the flare's S/N by the matched statistic", PlotAxis("S/N of the flare"),
+    PlotAxis(kind="names"), (Custom("bars", columns=("name", "plain", "marginal", "known"), draw=_bars),),
 ).data()  # fmt: skip
 def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the matched S/N with each unknown, plain and marginalised."""

@@ -10,12 +10,25 @@ from bokeh import models
 from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.plotting import figure
 
-from mauvecl.charts.chart import INK, Area, Bars, Contours, Custom, Dots, Line, Listed, Own, Rule, Strips, Targets
+from mauvecl.charts.chart import (
+    INK,
+    Area,
+    Bars,
+    Contours,
+    Custom,
+    Dots,
+    LegendEntry,
+    Line,
+    OwnMarker,
+    Rule,
+    Strips,
+    Targets,
+)
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars.flare import EmissionLine
 
 if TYPE_CHECKING:
-    from mauvecl.charts.chart import Axis, Chart, Series
+    from mauvecl.charts.chart import Chart, PlotAxis, Series
 
 #: Wavelengths that are shown, nm.
 SHOWN_NM = (195.0, 705.0)
@@ -63,10 +76,10 @@ class Canvas:
                     tips=(), listed=False)
             for k, (colour, dash) in enumerate(PINS[theme]) for item in chart.series if item.key == chart.pins
         ]  # fmt: skip
-        for series in sorted((*chart.series, *pins), key=lambda item: isinstance(item, Own)):
+        for series in sorted((*chart.series, *pins), key=lambda item: isinstance(item, OwnMarker)):
             self._add(series)
 
-    def _frame(self, x: Axis, y: Axis) -> Any:
+    def _frame(self, x: PlotAxis, y: PlotAxis) -> Any:
         """Return a figure with axes only."""
         ranges = {f"{name}_range": bounds for name, axis in (("x", x), ("y", y)) if (bounds := self._range(name, axis))}
         plot = figure(
@@ -104,7 +117,7 @@ class Canvas:
         plot.x_range.name, plot.y_range.name = "wavelength" if x.kind == "wavelength" else "x range", "y range"
         return plot
 
-    def _range(self, name: str, axis: Axis) -> Any:
+    def _range(self, name: str, axis: PlotAxis) -> Any:
         """Return the range of an axis, or None for Bokeh's own."""
         if axis.kind == "wavelength":
             # All figures with wavelengths share one range.
@@ -134,7 +147,7 @@ class Canvas:
             dimension: Literal["height", "width"] = "height" if series.along == "x" else "width"
             style: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
             self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **style))
-        if isinstance(series, Rule | Listed):
+        if isinstance(series, Rule | LegendEntry):
             self._list(series)
             return
         if isinstance(series, Targets):
@@ -173,7 +186,7 @@ class Canvas:
                 return plot.vstrip(*columns, line_color=None, **fill, **hatch)
             case Bars():
                 return plot.quad("left", "right", "top", 1e-9 if "y" in self.logs else 0, line_color=None, **fill)
-            case Own():
+            case OwnMarker():
                 return plot.scatter(*columns, source=source, size=13, marker="circle", fill_color=colour,
                                     line_color=self.ink["ground"], line_width=2)  # fmt: skip
             case Dots():

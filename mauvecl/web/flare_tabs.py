@@ -14,7 +14,19 @@ from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from mauvecl.answers.measure import COLUMNS, expected_measurements, models_of
-from mauvecl.charts.chart import Area, Axis, Chart, ChartData, Contours, Custom, Dots, Line, Listed, Own, Rule
+from mauvecl.charts.chart import (
+    Area,
+    Chart,
+    ChartData,
+    Contours,
+    Custom,
+    Dots,
+    LegendEntry,
+    Line,
+    OwnMarker,
+    PlotAxis,
+    Rule,
+)
 from mauvecl.charts.spectra import FACTORS, RISES
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.host.arrays import Float
@@ -109,13 +121,13 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
 
 
 @Chart(
-    "limit", "How faint a star: this flare is detected", Axis("magnitude", limits=MAGNITUDES),
-    Axis("detection probability", limits=(-0.03, 1.05)),
+    "limit", "How faint a star: this flare is detected", PlotAxis("magnitude", limits=MAGNITUDES),
+    PlotAxis("detection probability", limits=(-0.03, 1.05)),
     (
         Line("closed form", "flare", width=2, tips=("magnitude", "detected")),
         Rule("wanted: 90 %", "threshold", "power", along="y"),
         Dots("simulated", size=8),
-        Own(),
+        OwnMarker(),
     ),
     sets="magnitude=x", pins="closed form", alike=("band",),
 ).data()  # fmt: skip
@@ -179,17 +191,17 @@ def _draw_labels(canvas: Canvas, source: ColumnDataSource) -> None:
 
 
 @Chart(
-    "map", "How faint a star, how small a flare", Axis("magnitude", limits=MAGNITUDES),
-    Axis("flare amplitude", limits=tuple(np.log10(PERCENTS))),
+    "map", "How faint a star, how small a flare", PlotAxis("magnitude", limits=MAGNITUDES),
+    PlotAxis("flare amplitude", limits=tuple(np.log10(PERCENTS))),
     (
         Custom("map", columns=("image", "percent", "x", "y", "dw", "dh"), draw=_draw_map),
         Contours("contours", "#ffffff", width=1.2, listed=False),
         Contours("half", "#ffffff", width=2.2, listed=False),
         Custom("simulated", columns=("x", "y", "p"), draw=_draw_cells),
         Custom("labels", columns=("x", "y", "text"), draw=_draw_labels),
-        Listed("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
-        Listed("simulated", "#8a8678", show="if any", form="dot", name="entry"),
-        Own(),
+        LegendEntry("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
+        LegendEntry("simulated", "#8a8678", show="if any", form="dot", name="entry"),
+        OwnMarker(),
     ),
     sets="magnitude=x,amplitude_percent=10^y", pins="half", alike=("band",),
 ).data()  # fmt: skip
@@ -276,15 +288,15 @@ def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
 
 
 @Chart(
-    "errors", "Error of the temperature for smaller and larger flares", Axis("flare amplitude (%)", log=True),
-    Axis("error of the temperature (%)", log=True, limits=(0.1, 1000)),
+    "errors", "Error of the temperature for smaller and larger flares", PlotAxis("flare amplitude (%)", log=True),
+    PlotAxis("error of the temperature (%)", log=True, limits=(0.1, 1000)),
     (
         # Errors with other unknowns may be the same: dashes show the curve below.
         *(
             Line(label, colour, name, width=2, dash="dashed" * (name == "free"), tips=("amplitude (%)", f"{label} (%)"))
             for label, name, colour in zip(ASSUMED, NAMES, ("flare", "star", "sky"), strict=True)
         ),
-        Own(),
+        OwnMarker(),
     ),
     sets="amplitude_percent=x", pins="known",
 ).data()  # fmt: skip
@@ -306,13 +318,13 @@ def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
 
 
 @Chart(
-    "region", "Temperature and amplitude: 95 % confidence region", Axis("temperature (K)"),
-    Axis("amplitude of the blackbody (%)"),
+    "region", "Temperature and amplitude: 95 % confidence region", PlotAxis("temperature (K)"),
+    PlotAxis("amplitude of the blackbody (%)"),
     (
         Area("dark and star free", "sky", "free", alpha=0.3),
         Area("everything known", "flare", "known", alpha=0.5),
         Dots("simulated fits", name="fits", size=3),
-        Own("the flare"),
+        OwnMarker("the flare"),
     ),
     logs=("x",),
 ).data()  # fmt: skip
@@ -358,8 +370,8 @@ def _ellipse(best: Float, ahead: Forecast) -> tuple[Float, Float, Float]:
 
 
 @Chart(
-    "course", "Temperature of the flare along a stare", Axis("time from the start of the stare (s)"),
-    Axis("temperature (K)", log=True),
+    "course", "Temperature of the flare along a stare", PlotAxis("time from the start of the stare (s)"),
+    PlotAxis("temperature (K)", log=True),
     (
         Area("bins of frames: 95 % interval", "star", "bins", alpha=0.3),
         Dots("bins of frames", "star", "estimates"),
@@ -430,8 +442,8 @@ LENGTHS = ("shortest", "middle", "longest")
 
 @Chart(
     "shares", "Share of flares that a search of a stare finds",
-    Axis("peak amplitude of the flare (%)", log=True, limits=(0.01, 100)),
-    Axis("share of flares found", limits=(-0.03, 1.05)),
+    PlotAxis("peak amplitude of the flare (%)", log=True, limits=(0.01, 100)),
+    PlotAxis("share of flares found", limits=(-0.03, 1.05)),
     (
         *(
             series

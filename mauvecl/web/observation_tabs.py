@@ -11,7 +11,7 @@ from bokeh.palettes import interp_palette
 
 from mauvecl.answers.plan import COLUMNS
 from mauvecl.charts import chart, light_curves, spectra
-from mauvecl.charts.chart import Axis, Chart, ChartData, Custom, Own, Targets
+from mauvecl.charts.chart import Chart, ChartData, Custom, OwnMarker, PlotAxis, Targets
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
@@ -66,12 +66,12 @@ def _image(canvas: Canvas, source: ColumnDataSource) -> None:
 
 
 @Chart(
-    "dynamic", "Dynamic spectrum", Axis("time from the first frame (min)"), Axis("wavelength (nm)"),
+    "dynamic", "Dynamic spectrum", PlotAxis("time from the first frame (min)"), PlotAxis("wavelength (nm)"),
     (
         Custom("dynamic", columns=("image", "x", "y", "dw", "dh"), draw=_image),
         chart.Contours("events", "star", "marks", show="if any", width=5),
-        chart.Listed("brighter than the median", RED, form="bar"),
-        chart.Listed("fainter", BLUE, form="bar"),
+        chart.LegendEntry("brighter than the median", RED, form="bar"),
+        chart.LegendEntry("fainter", BLUE, form="bar"),
     ),
 ).data()  # fmt: skip
 def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
@@ -180,8 +180,11 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
         lines = spectra.along_magnitude(answer, units)
         return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(finite), finite)})
 
-    axis, lines = Axis(f"smallest change ({label})", log=True), (Targets(name, tips=(label,)), Own("this star"))
-    changes = Chart(name, title, Axis("magnitude"), axis, lines, sets="magnitude=x")
+    axis, lines = (
+        PlotAxis(f"smallest change ({label})", log=True),
+        (Targets(name, tips=(label,)), OwnMarker("this star")),
+    )
+    changes = Chart(name, title, PlotAxis("magnitude"), axis, lines, sets="magnitude=x")
     return changes.data("change", "Change computes which differences between visits are detected.")(along)
 
 
@@ -213,8 +216,8 @@ def _cells(canvas: Canvas, source: ColumnDataSource) -> None:
 
 
 @Chart(
-    "periods", "Share of periods that visits recover", Axis("period (d)", log=True),
-    Axis("semi-amplitude (errors of a visit)", log=True),
+    "periods", "Share of periods that visits recover", PlotAxis("period (d)", log=True),
+    PlotAxis("semi-amplitude (errors of a visit)", log=True),
     (Custom("cells", columns=("left", "right", "bottom", "top", "period", "amplitude", "share"), draw=_cells),),
 ).data("periods", "For each period and amplitude, how often it is found in visits that the orbit allows.")  # fmt: skip
 def recovered_periods(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
@@ -254,7 +257,7 @@ PERIODS = Tab(
 )
 
 
-#: Limits of the energy axes, erg, the same for all questions; columns of `Planned.by_energy` in the pictures.
+#: Limits of the energy axes, erg, the same for all questions; columns of `PlannedTarget.by_energy` in the pictures.
 ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 
 
@@ -274,11 +277,11 @@ def _columns(answer: PlanAnswer) -> list[tuple[str, Any, Any, Any]]:
     return columns
 
 
-ENERGY = Axis("bolometric energy of the flare (erg)", log=True, limits=ENERGIES)
+ENERGY = PlotAxis("bolometric energy of the flare (erg)", log=True, limits=ENERGIES)
 
 
 @Chart(
-    "recovered", "Share of flares that the search recovers", ENERGY, Axis("share recovered", limits=(-0.03, 1.05)),
+    "recovered", "Share of flares that the search recovers", ENERGY, PlotAxis("share recovered", limits=(-0.03, 1.05)),
     (Targets("recovered", tips=("share recovered",)),),
 ).data("plan", "The share of flares that are found on each target, against their energy.")  # fmt: skip
 def recovered(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
@@ -294,7 +297,7 @@ def recovered(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
 
 @Chart(
     "expected", "Recovered flares above an energy, in the whole campaign", ENERGY,
-    Axis("flares", log=True, limits=(1e-3, 1e4)), (Targets("found", tips=("recovered flares",)),),
+    PlotAxis("flares", log=True, limits=(1e-3, 1e4)), (Targets("found", tips=("recovered flares",)),),
 ).data("plan", "The number of flares expected to be found on each target.")  # fmt: skip
 def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
     """Return the numbers of recovered flares above an energy."""
@@ -333,8 +336,8 @@ PLAN = Tab(
 
 
 @Chart(
-    "hours", "Hours in which targets are seen, day by day", Axis(kind="dates"),
-    Axis("hours in the day", limits=(-0.5, 24.5)), (Targets("hours", tips=("hours",)),),
+    "hours", "Hours in which targets are seen, day by day", PlotAxis(kind="dates"),
+    PlotAxis("hours in the day", limits=(-0.5, 24.5)), (Targets("hours", tips=("hours",)),),
 ).data("visible", "For each target, how many hours of each day it is seen.")  # fmt: skip
 def hours(closed: ClosedForms, answer: VisibleAnswer) -> ChartData:
     """Return the daily hours of visibility."""
