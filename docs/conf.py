@@ -16,7 +16,7 @@ from typer.main import get_command
 from mauvecl.cli.app import app
 from mauvecl.host import VERSION
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, found
+from mauvecl.schema.fields import Flag, Help, Range, Unit, as_typed, first, metadata_of
 from mauvecl.schema.section import fields_of, model_in
 from mauvecl.study.study import Study
 
@@ -97,7 +97,7 @@ def reference_of(section: type[BaseModel]) -> Iterator[dict[str, str]]:
             + (f", {help.more}" if help.more else ""),
             "accepted": accepted_words(field.annotation, unit, reach),
             "default": help.default or ("required" if value is PydanticUndefined else default_text(value)),
-            "flags": ", ".join(name for flag in found(field, Flag) for name in flag.names),
+            "flags": ", ".join(name for flag in metadata_of(field, Flag) for name in flag.names),
         }
 
 

@@ -132,7 +132,7 @@ def test_level_norms_and_covariances_are_those_of_the_matrices(term: processes.P
     inverse = np.linalg.inv(between[np.ix_(quiet, quiet)] + np.diag(noise[quiet]))
     mean = inverse.sum(axis=0) @ values[quiet] / inverse.sum()
     expected = mean + between[:, quiet] @ inverse @ (values[quiet] - mean)
-    found = levels.LevelGiven(model, time, variance, quiet).of(values)
+    found = levels.ConditionalLevel(model, time, variance, quiet).of(values)
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     weights = np.where(np.arange(time.size) % 90 < 20, rng.random(time.size), 0.0)
     np.testing.assert_allclose(model.times(time, weights), between @ weights, rtol=1e-9)
