@@ -118,7 +118,7 @@ def tolerances(question: str, column: str) -> tuple[float, float]:
     return next(row[2:] for row in TOLERANCES if question.startswith(row[0]) and re.search(row[1], column))
 
 
-@pytest.mark.parametrize("name", long_but(QUESTIONS, "exposure", "limit-of-amplitude", "map", "visible"))
+@pytest.mark.parametrize("name", long_but(QUESTIONS, "detect", "exposure", "limit-of-amplitude", "map", "visible"))
 def test_tables_of_default_questions_are_unchanged(name: str, tmp_path: Path) -> None:
     found = answer(name, tmp_path)
     expected = sorted((GOLDEN / name).glob("*.ecsv"))

@@ -23,8 +23,6 @@ LARGEST_SINE = 1.0 - 1e-9
 NEWTON_STEPS, LONGEST, CONVERGED, RIDGE = 40, 1.5, 1e-3, 1e-10
 #: Factor on the lengths of all steps after one that turns back.
 SHORTER = 0.5
-#: Share of the rise of chi-squared that the end of a closed interval reaches.
-NEARLY = 0.9
 
 
 def least_squares(
@@ -59,13 +57,13 @@ def least_squares(
 def interval_end(
     linearised: Linearised, quantity: Callable[[Float], tuple[float, Float]], theta: Float,
     limits: tuple[Float, Float], chi2: float, rise: float, free: NDArray[np.intp] | None = None,
-) -> tuple[float, bool]:  # fmt: skip
+) -> tuple[float, float]:  # fmt: skip
     """Return the end of a quantity's interval on one side, where the smallest chi-squared has risen by `rise`.
 
-    The end is the lower one if `rise` is negative. The second value is False if chi-squared does not rise that far
-    within the limits of the parameters; the end is then where the search for it stops. Each step goes to where the
-    quantity is extreme on the surface of equal chi-squared, of linearised residuals. A parameter that reaches a limit
-    stays there.
+    The end is the lower one if `rise` is negative. The second value is 1, or the share of the rise (below 1) that
+    chi-squared has reached where the search stops without an end within the limits of the parameters. Each step goes
+    to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals. A parameter that
+    reaches a limit stays there.
 
     Parameters
     ----------
@@ -105,5 +103,6 @@ def interval_end(
         if outside[free].any():
             there, free = np.clip(there, low, high), free[~outside[free]]
         elif share * length < CONVERGED:
-            return quantity(there)[0], True
-    return quantity(there)[0], float(residuals @ residuals) >= chi2 + NEARLY * abs(rise)
+            return quantity(there)[0], 1.0
+    share = (float(residuals @ residuals) - chi2) / abs(rise)
+    return quantity(there)[0], min(share, np.nextafter(1.0, 0.0))

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
 from mauvecl.fits.flare_model import EVERY, Ranges, ReducedSums
-from mauvecl.fits.least_squares import interval_end, least_squares
+from mauvecl.fits.least_squares import interval_end
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
 from mauvecl.flares.settings import Cooling
@@ -257,8 +257,6 @@ Whiten = Callable[[Float], Float]
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
 #: Number of fits after the first, each with the covariances of the previous fit.
 REFITS = 3
-#: Relative change of chi-squared at which a fit has converged.
-TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -609,19 +607,25 @@ class _BestFit:
         whiten = data.whitening(None)
         theta = np.clip(_start(data, whiten, peak_s, half_width_s, cooling), *limits)
 
-        def linearised(values: Float) -> tuple[Float, Float]:
-            residuals, jacobian = data.linearised(np.concatenate([values, theta[free.size :]]), whiten)
-            return residuals, jacobian[:, free]
+        def with_free(values: Float) -> Float:
+            return np.concatenate([values, theta[free.size :]])
+
+        def residuals(values: Float) -> Float:
+            return data.linearised(with_free(values), whiten)[0]
+
+        def jacobian(values: Float) -> Float:
+            return data.linearised(with_free(values), whiten)[1][:, free]
 
         low, high = (end[free] for end in limits)
         for refits in range(REFITS + 1):
             whiten = data.whitening(theta) if refits else whiten
-            best, chi2, _ = least_squares(linearised, theta[free], (low, high), TOLERANCE)
-            theta = np.concatenate([best, theta[free.size :]])
-        return cls(data, whiten, theta, free, limits, chi2)
+            start, scale = np.clip(theta[free], low + 1e-9, high - 1e-9), np.where(free == 0, np.exp(theta[1]), 1.0)
+            solution = scipy.optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=scale)
+            theta = with_free(solution.x)
+        return cls(data, whiten, theta, free, limits, 2 * float(solution.cost))
 
     def end(self, rise: float, quantity: _Quantity) -> float:
         """Return the end of an interval at a rise of chi-squared, as `interval_end` does; infinite if it is open."""
         linearised, value = partial(self.data.linearised, whiten=self.whiten), partial(quantity.at, data=self.data)
-        end, closed = interval_end(linearised, value, self.theta, self.limits, self.chi2, rise, self.free)
-        return end if closed else float(np.copysign(np.inf, rise))
+        end, share = interval_end(linearised, value, self.theta, self.limits, self.chi2, rise, self.free)
+        return end if share >= 1.0 else float(np.copysign(np.inf, rise))

@@ -10,7 +10,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from itertools import islice
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -159,19 +159,28 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
     Columns that a table lacks are masked, or NaN if they have a unit.
     """
     import numpy as np
-    from astropy.table import QTable, hstack, vstack
 
-    rows, tables = zip(*parts, strict=True)
-    stack = vstack([QTable(table, copy=False) for table in tables], metadata_conflicts="silent")
-    for name, column in [*stack.columns.items()]:
-        if hasattr(column, "filled") and column.unit is not None:
-            stack[name] = column.filled(np.nan)
-    if first:
-        row_numbers = np.repeat(np.arange(len(rows)), list(map(len, tables)))
-        stack = hstack([table_of(first, rows)[row_numbers], stack])
+    pairs = list(parts)
+    tables = [table for _, table in pairs]
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-    stack.meta = shared | meta
-    return stack
+
+    def values(pair: tuple[object, Table], name: str) -> Any:
+        if name not in pair[1].colnames:
+            return None
+        cells = getattr(pair[1][name], "value", pair[1][name])
+        return np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
+
+    def column_of(name: str) -> Column:
+        columns = [table[name] for table in tables if name in table.colnames]
+        (unit,) = {str(column.unit or "") for column in columns}
+        kind = np.result_type(*(column.dtype for column in columns)).type
+        text = columns[0].info.description or ""
+        return Column(name, lambda pair: values(pair, name), unit, text, kind=kind)
+
+    # A first column may have one value for each row of its table, with which it is broadcast.
+    names = dict.fromkeys(name for table in tables for name in table.colnames)
+    columns = [*(column.of(itemgetter(0)) for column in first), *map(column_of, names)]
+    return table_of(columns, pairs, **shared | meta)
 
 
 def records(table: Table) -> list[dict[str, Any]]:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from mauvecl.search.search import Survey
 
 
+#: Share of the rise of chi-squared that the ends of a closed interval reach.
+NEARLY = 0.9
 #: Columns of a flare's parameters: log amplitude, peak time in s, log half-width in s, log temperature in K.
 AMPLITUDE, PEAK, WIDTH, KELVIN = range(4)
 #: Factor by which fitted half-widths may exceed the range of the bank.
@@ -265,11 +267,11 @@ class Block:
             return value, gradient.ravel()
 
         limits = self._limits(len(best.theta))
-        (low, low_closed), (high, high_closed) = (
+        (low, low_share), (high, high_share) = (
             interval_end(self.residuals, value_and_slope, best.theta.ravel(), limits, best.chi2, sign * rise)
             for sign in (-1.0, 1.0)
         )
-        return low, high, not (low_closed and high_closed)
+        return low, high, min(low_share, high_share) < NEARLY
 
     def without(self, blended: BlendFit, j: int) -> BlendFit:
         """Fit all flares except flare `j`."""

@@ -290,9 +290,13 @@ class CriticalAmplitudes:
 
     @cached_property
     def surveys(self) -> tuple[Survey, ...]:
-        """Surveys of the frames of each site."""
-        stares = [select_frames(self.survey.stare, site.frames) for site in self.sites]
-        return tuple(replace(self.survey, stare=stare) for stare in stares)
+        """Surveys of the frames of each site; that of all frames where no template detects the flare."""
+        return tuple(
+            replace(self.survey, stare=select_frames(self.survey.stare, site.frames))
+            if len(site.filters)
+            else self.survey
+            for site in self.sites
+        )
 
     def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
         """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and the fits of some stares.
