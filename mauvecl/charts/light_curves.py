@@ -16,7 +16,6 @@ from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Chart, Dots, Levels, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, picture_of
 from mauvecl.host.arrays import Bool, Float
-from mauvecl.observations.events import GAP_FRAMES
 from mauvecl.schema.columns import FirstItems, part_note
 
 if TYPE_CHECKING:
@@ -275,6 +274,9 @@ def light_curve_series(
     time, series = (frames.time_s - frames.time_s[0]) / unit_s, dict[str, Any]()
     flux, used = frames.white_light[0], frames.faults == 0
     if answer is not None:
+        # Only an answer that has loaded it already needs this module.
+        from mauvecl.observations.events import GAP_FRAMES
+
         level, half_s = answer.analysis.level, frames.cadence_s / 2
         flux, used, middle, off = answer.analysis.flux, level.used, level.level, 2 * level.level_error
         if in_noise:

@@ -306,6 +306,8 @@ LIGHT: dict[str, set[str]] = {
          "mauvecl.host.tables.opening"},
     "from mauvecl.cli.app import app; sys.argv[1:] = ['--help']; app(standalone_mode=False)":
         {"pyopencl", "synphot", "astropy", "scipy", "pydantic", "mauvecl.study"},
+    "import mauvecl; mauvecl.detect(star='G2V', magnitude=7, amplitude=1, realisations=2000, fap=0.05).pictures":
+        {"matplotlib", "astropy.coordinates", "mauvecl.observations", "mauvecl.search", "mauvecl.fits"},
     "from mauvecl.schema.section import read_ranges; read_ranges(['5:6'], '--gap', expected='', unit='s')": {"astropy"},
 }  # fmt: skip
 
