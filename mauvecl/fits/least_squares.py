@@ -20,7 +20,7 @@ MAX_EVALUATIONS = 200
 LARGEST_SINE = 1.0 - 1e-9
 #: Number of steps to the end of an interval; largest length of a step and of the last, relative to the root of the rise
 #: of chi-squared; relative regularisation of degenerate parameters.
-NEWTON_STEPS, LONGEST, CONVERGED, RIDGE = 40, 1.5, 1e-3, 1e-10
+NEWTON_STEPS, LONGEST, CONVERGED, RIDGE = 200, 1.5, 1e-3, 1e-10
 #: Factor on the lengths of all steps after one that turns back.
 SHORTER = 0.5
 

@@ -144,6 +144,21 @@ def test_joint_fit_recovers_shape_and_cooling_without_noise() -> None:
     assert whole == pytest.approx(fluence * 4 * np.pi * (5.0 * 3.0856775814913674e18) ** 2, rel=1e-9)
 
 
+def test_intervals_of_a_bright_flare_of_another_shape_follow_its_standard_errors() -> None:
+    """Fit light that is constant for four frames: chi-squared has a kink where the peak would change frames.
+
+    All quantities but those of the cooling, which is not determined, are nearly normal.
+    """
+    bright = mauvecl.expect(star().flaring(2.0, 9800.0), MAUVE, exposure=5.0)
+    frames = np.array([x.recorded_dn for x in (quiet(), bright, quiet()) for _ in range(4)])
+    found = fit_cooling(frames, quiet(), model(), levels=(0.3, 0.68, 0.95), peak_s=25.0, half_width_s=10.0)
+    deviates = scipy.stats.norm.ppf(0.5 + np.array([[0.3], [0.68], [0.95]]) / 2)
+    ratios = (found.high - found.low)[:, 0] / (2 * deviates * found.errors[0])
+    determined = [name for name in found.names if "cooling" not in name and "end" not in name]
+    for name in determined:
+        assert np.abs(np.log(ratios[:, found.column(name)])).max() < 0.25, (name, ratios[:, found.column(name)])
+
+
 @pytest.mark.long
 def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
     found = fit_cooling(recorded(STEADY, Stare.of(150.0)), quiet(), model(), levels=(0.95,), **START)
