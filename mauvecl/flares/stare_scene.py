@@ -26,7 +26,7 @@ from mauvecl.host.arrays import Arrays, Float
 from mauvecl.noise import layout
 from mauvecl.noise.disturbances import ADDITIVE
 from mauvecl.noise.drawing import Cumulants, joint_is_exact, truncation_distance
-from mauvecl.noise.scene import Scene, padded, prepare
+from mauvecl.noise.scene import REACH_DN, Scene, padded, prepare
 from mauvecl.noise.unknowns import CHANGING, NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -40,8 +40,6 @@ REACH_SIGMA = 7.0
 MOST_UNKNOWNS, MOST_SCENARIOS = 32, 16
 #: Largest amplitude of a flare.
 LARGEST = 1e12
-#: Distance of a count from its base up to which the device rounds to whole DN.
-REACH_DN = 2.0**22
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,7 +201,7 @@ def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors:
         out[f"dark_{name}"] = dark * c.dark_cumulant(order)
 
 
-#: The device does not round counts correctly beyond this distance from their base.
+#: Distance of a count from its base up to which the device rounds to whole DN.
 REACH_DN = 2.0**22
 
 
