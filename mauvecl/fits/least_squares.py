@@ -104,5 +104,5 @@ def interval_end(
             there, free = np.clip(there, low, high), free[~outside[free]]
         elif share * length < CONVERGED:
             return quantity(there)[0], 1.0
-    share = (float(residuals @ residuals) - chi2) / abs(rise)
-    return quantity(there)[0], min(share, np.nextafter(1.0, 0.0))
+    reached = (float(residuals @ residuals) - chi2) / abs(rise)
+    return quantity(there)[0], min(reached, float(np.nextafter(1.0, 0.0)))
