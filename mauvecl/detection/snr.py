@@ -189,7 +189,7 @@ class SnrResult(Drawable, ContentEquality):
         """Structures of `observers`."""
         return observers(self.expectation, self.scene)
 
-    @property
+    @cached_property
     def pixel(self) -> QTable:
         """S/N per pixel: wavelength, closed form, simulated mean, standard deviation, quantiles, clipped frames.
 
@@ -208,7 +208,7 @@ class SnrResult(Drawable, ContentEquality):
         low, high = self.counts.clipped.T / (self.counts.n * x.n_frames)
         return self._table("pixel", x.wavelength_nm, x.snr(), snr, clipped_low=low, clipped_high=high)
 
-    @property
+    @cached_property
     def element(self) -> QTable:
         """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
         x, table = self.expectation, elements(self.expectation)
