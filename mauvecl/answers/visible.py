@@ -168,7 +168,7 @@ class VisibleAnswer(Answer):
         """UTC days of the time grid, such as "2027-01-31"."""
         first = np.datetime64(self.times.iso(0.0)[:10], "D")
         count = int(np.floor(self.times.julian[1][-1])) + 1
-        return [str(first + n) for n in range(count)]
+        return np.arange(first, first + np.timedelta64(count, "D")).astype(str).tolist()
 
     @cached_property
     def noons(self) -> Bodies:

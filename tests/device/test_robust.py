@@ -242,6 +242,7 @@ def test_requirements_name_wheels_only_for_supported_platforms() -> None:
 
 
 def test_windows_error_names_alternative() -> None:
-    code = "import sys; sys.platform = 'win32'; import mauvecl"
+    # Python 3.13's shutil is that of the platform.
+    code = "import shutil, sys; sys.platform = 'win32'; import mauvecl"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (found.returncode, "wsl --install" in found.stderr.splitlines()[-1]) == (1, True)
