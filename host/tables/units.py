@@ -258,7 +258,7 @@ def time_unit(text: str) -> TimeSystem | None:
         name = match["name"]
         is_mission = name in ("btjd", "tbjd", "bkjd", "kbjd")
         scale = match["scale"] or match["end"] or ("tdb" if is_mission else "")
-        place = "BARYCENTER" if "b" in name else "HELIOCENTER" if name.startswith("h") else ""
+        place = "BARYCENTER" if "b" in name else "HELIOCENTER" if "h" in name else ""
         return TimeSystem("d", _DAYS[name] + float(match["less"] or match["plus"] or 0.0), scale, place)
     if (match := _SINCE.fullmatch(word)) and match["unit"] in _TIME_WORDS:
         scale = match["scale"] or "utc"

@@ -256,7 +256,7 @@ def _with_row_per_frame(quantities: Quantities, label: str) -> Quantities:
             if (rows != rows[:, :1]).any():
                 raise InputError(f"{label}: {values.name!r} must not change within a frame", key=values.name)
             rows = rows[:, 0]
-        by_frame[key] = Values.of(values.name, rows, values.unit, label)
+        by_frame[key] = replace(Values.of(values.name, rows, values.unit, label), keywords=values.keywords)
     return by_frame
 
 

@@ -188,7 +188,10 @@ def times_of(
     """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
     import astropy.units as u
 
-    label, header = file.label, units.TimeSystem.of(file.header, file.label)
+    label = file.label
+    if any(values.keywords != time[0].keywords for values in time):
+        raise InputError(f"{label}: {' and '.join(v.name for v in time)} must be in one time system", key="time")
+    header = units.TimeSystem.of(file.header | {**time[0].keywords}, label)
     scale = units.scale_of(mapping.scale) or header.scale
     position = units.position_of(mapping.position) or header.position
     epoch, remarks = mapping.epoch_mjd, []
