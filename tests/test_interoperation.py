@@ -58,6 +58,8 @@ def test_specutils_spectrum_round_trips() -> None:
     np.testing.assert_array_equal(back.wavelength_nm, source.wavelength_nm)
     other = specutils.Spectrum(spectral_axis=source.wavelength_nm * u.nm, flux=out.flux.to(u.W / u.m**2 / u.um))
     np.testing.assert_allclose(Source.from_specutils(other).flux_flam, source.flux_flam)
+    other.mask = source.wavelength_nm < 150.0
+    assert Source.from_specutils(other).wavelength_nm[0] >= 150.0
 
 
 def test_expectation_converts_to_a_specutils_spectrum() -> None:
