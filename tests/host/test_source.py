@@ -86,6 +86,11 @@ def test_replacing_flare_hides_photosphere() -> None:
     f = 0.1 / (10 ** (0.4 * difference) - 1)
     flare = star.flaring(0.1, 10_000, geometry="replaces", photosphere_temperature=5000)
     np.testing.assert_allclose(flare.flux_flam, (1 - f) * cool + f * hot, rtol=1e-9)
+    # Two halves of a flare hide as much as one of both.
+    halves = TwoBlackbodies(10_000.0, 10_000.0, 1.0)
+    for light in (halves, FlareWithLines(halves)):
+        parts = star.flaring(0.1, spectrum=light, geometry="replaces", photosphere_temperature=5000)
+        np.testing.assert_allclose(parts.flux_flam, flare.flux_flam, rtol=1e-9)
 
 
 def test_short_spectra_are_used_where_they_suffice() -> None:
