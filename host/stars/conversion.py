@@ -290,13 +290,14 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
             raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
         # A row without wavelength or flux is not a point.
         nm, unmarked = np.delete(nm, bad), np.delete(unmarked, bad)
+        # Fluxes per frequency or photon refer to wavelengths in vacuum.
+        nm, added = vacuum_wavelengths(nm, table.axis.name, table.remarks, medium or in_unit, table.headers)
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
         flam = np.asarray(light(unmarked).to_value(FLUX_UNIT, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
         segments.append((nm[order], flam[order]))
     nm, flam = _joined(segments, messages)
     if is_assumed_flux:
         _check_assumed_flux(flam, f"{table.remarks}\n{table.origin}")
-    nm, added = vacuum_wavelengths(nm, table.axis.name, table.remarks, medium or in_unit, table.headers)
     messages += added
     nm, flam = _merged(nm, flam, messages)
     unscaled, notes = table.unscaled, table.notes
