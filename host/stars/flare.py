@@ -366,7 +366,8 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         measured = float(nm[0]), float(nm[-1])
         gaps = [f"{nm[i]:.1f}-{nm[i + 1]:.1f}" for i in np.flatnonzero(np.diff(nm) > GAP_NM)]
         if gaps:
-            messages += (f"The flare spectrum {name} is interpolated in its gaps at {', '.join(gaps)} nm",)
+            noun = "gap" if len(gaps) == 1 else "gaps"
+            messages += (f"The flare spectrum {name} is interpolated in its {noun} at {', '.join(gaps)} nm",)
         if continue_at_k is not None:
             nm, flux = _continued(name, nm, flux, continue_at_k)
             covered = f"The flare spectrum {name} covers {measured[0]:g}-{measured[1]:g} nm"

@@ -61,8 +61,8 @@ def without_indefinite(values: Float) -> Float:
     return np.where(bad, np.nan, values) if bad.any() else values
 
 
-def marks_in(values: Float, noun: str) -> tuple[list[float], list[str]]:
-    """Return values that mark missing ones, such as -99 and 9999, and remarks on them.
+def marks_in(values: Float, one: str, several: str) -> tuple[list[float], list[str]]:
+    """Return values that mark missing ones, such as -99 and 9999, and remarks on `one` or `several` of them.
 
     A mark consists of nines. Either it occurs once and is a thousand times larger than all other values, or it occurs
     more often and is three times larger, or three times as far below zero.
@@ -78,7 +78,8 @@ def marks_in(values: Float, noun: str) -> tuple[list[float], list[str]]:
         beyond = np.max(-unmarked if mark < 0 and n > 1 else np.abs(unmarked), initial=0.0)
         if unmarked.size and abs(mark) > (3 if n > 1 else 1000) * beyond:
             marks += [mark, -mark]
-            remarks.append(f"{n} {noun} of {mark:.7g} mark missing values and are left undefined")
+            words = "marks a missing value and is" if n == 1 else "mark missing values and are"
+            remarks.append(f"{n} {one if n == 1 else several} of {mark:.7g} {words} left undefined")
     return marks, remarks
 
 

@@ -252,7 +252,8 @@ def time_unit(text: str) -> TimeSystem | None:
     word = re.sub(r"[−–]", "-", text.strip().strip("\"'")).lower()
     # BJD - 2,457,000
     word = re.sub(r"(?<=\d),(?=\d{3}(?:\D|$))", "", word)
-    if word in _TIME_WORDS:
+    # Ms are megaseconds.
+    if word in _TIME_WORDS and text.strip() != "Ms":
         return TimeSystem(_TIME_WORDS[word])
     if match := _JULIAN.fullmatch(word):
         name = match["name"]

@@ -427,7 +427,7 @@ def _read_light(
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     light, sd = without_indefinite(light), None if sd is None else without_indefinite(sd)
-    marks, notes = marks_in(light, "values")
+    marks, notes = marks_in(light, "value", "values")
     light = np.where(np.isin(light, marks), np.nan, light) if marks else light
     unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
     if "quality" not in quantities and unused:
