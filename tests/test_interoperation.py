@@ -35,8 +35,10 @@ def test_reddening_has_the_total_extinction_of_its_law() -> None:
     """The laws of dust_extinction are those relative to A(V), which is A at 550 nm."""
     pytest.importorskip("dust_extinction")
     star = Source.from_library("G2V")
-    bare, dimmed = (np.interp(550.0, one.wavelength_nm, one.flux_flam) for one in (star, star.reddened(0.3)))
-    assert 2.5 * np.log10(bare / dimmed) == pytest.approx(3.1 * 0.3, rel=2e-3)
+    for rv in (3.1, 5.0):
+        pair = (star, star.reddened(0.3, rv=rv))
+        bare, dimmed = (np.interp(550.0, one.wavelength_nm, one.flux_flam) for one in pair)
+        assert 2.5 * np.log10(bare / dimmed) == pytest.approx(rv * 0.3, rel=2e-3)
 
 
 def test_stsynphot_spectrum_is_read(recwarn: pytest.WarningsRecorder) -> None:

@@ -238,6 +238,11 @@ def test_coarse_spectrum_is_continued_from_its_last_point_if_asked() -> None:
     assert "8000 K continues it" in flare.messages[-1]
     far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
     assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
+    # A finer one is continued from the mean of its last 20 nm.
+    nm = np.arange(200.0, 801.0)
+    flare, last = ObservedFlare.from_arrays(nm, nm**4, continue_at_k=8000.0), nm >= 780.0
+    level = np.trapezoid(nm[last] ** 4) / np.trapezoid(blackbody(nm[last], 8000.0))
+    assert flare.flux_flam[-1] == pytest.approx(level * blackbody(flare.wavelength_nm[-1:], 8000.0)[0])
 
 
 def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
@@ -248,7 +253,7 @@ def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
     assert flare.measured_nm == (190.0, 800.0)
     inside = nm[nm >= 190.0]
     np.testing.assert_allclose(flare.flux(inside), 2e-14 * inside, rtol=1e-9)
-    assert not any("gaps" in text for text in flare.messages)
+    assert not any("gap" in text for text in flare.messages)
     # What is left of equal spectra may be their rounding.
     for factor in (1.0, 1.0 - 1e-14, 1.01):
         np.savetxt(tmp_path / "same.txt", np.column_stack([nm, factor * 3e-14 * nm]), fmt="%.17e")
@@ -256,4 +261,4 @@ def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
             ObservedFlare.read(tmp_path / "both.txt", tmp_path / "same.txt", continue_at_k=9000.0)
     kept = (nm < 330.0) | (nm > 356.0)
     gap = ObservedFlare.from_arrays(nm[kept], 1e-14 * nm[kept])
-    assert any("gaps at 329.5-356.5 nm" in text for text in gap.messages)
+    assert any("its gap at 329.5-356.5 nm" in text for text in gap.messages)
