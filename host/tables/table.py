@@ -196,7 +196,7 @@ def dates_in(scale: str) -> dict[str, Any]:
 def stacked(cells: Any) -> Any:
     """Return arrays of variable length as one array if all have the same length; other cells are unchanged."""
     is_even = getattr(cells, "dtype", np.dtype(float)).kind == "O" and len({np.shape(cell) for cell in cells}) == 1
-    return np.ma.stack(list(cells)) if is_even and np.ndim(cells[0]) else cells  # type: ignore[no-untyped-call]
+    return np.ma.stack(list(cells)) if is_even and np.ndim(cells[0]) else cells
 
 
 def _plain(text: Any) -> str:
