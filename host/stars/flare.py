@@ -92,7 +92,7 @@ class FlareSpectrum:
     """Spectrum of a flare, up to a factor."""
 
     temperature_k: float | None = None  # temperature of the (first) blackbody; None for an observed flare
-    area: float = 1.0  # area of the flare in units of that whose surface has `flux`
+    _area: float = 1.0  # area of the flare in units of that whose surface has `flux`
     # Shape (n,); wavelengths that a grid must contain so that linear interpolation conserves the flux.
     nodes_nm: Float = np.empty(0)
     surface: ClassVar[bool] = True  # whether `flux` is that of the flare's surface, from which an area follows
@@ -148,7 +148,7 @@ class TwoBlackbodies(FlareSpectrum):
     second_area: fields.AreaRatio = 0.05
 
     @property
-    def area(self) -> float:  # type: ignore[override]
+    def _area(self) -> float:  # type: ignore[override]
         """Area of both blackbodies over that of the first."""
         return 1.0 + self.second_area
 
@@ -267,9 +267,9 @@ class FlareWithLines(FlareSpectrum):
         return self.continuum.temperature_k
 
     @property
-    def area(self) -> float:  # type: ignore[override]
+    def _area(self) -> float:  # type: ignore[override]
         """Area of the continuum."""
-        return self.continuum.area
+        return self.continuum._area
 
     @property
     def surface(self) -> bool:  # type: ignore[override]
@@ -534,7 +534,7 @@ def added_light(
         fault = f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown"
         raise InputError(fault, key="flare_geometry")
     checked(fields.Temperature, "photosphere temperature", photosphere_k)
-    ratio = hot / (spectrum.area * photons(nm, blackbody(nm, photosphere_k), band))
+    ratio = hot / (spectrum._area * photons(nm, blackbody(nm, photosphere_k), band))
     if ratio <= 1.0:
         photosphere = f"the {photosphere_k:g} K of the photosphere that it replaces"
         fault = f"flare temperature must be above {photosphere}, not {spectrum.describe()}"

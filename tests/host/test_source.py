@@ -111,6 +111,8 @@ def test_short_spectra_are_used_where_they_suffice() -> None:
     assert cut.measured_nm == (195.0, 1099.0)
     with refused("band", "195-1099", "99%", "GALEX"):
         cut.magnitude("GALEX NUV")
+    # Noise below zero is not continued.
+    assert Source.from_arrays(NM[15:], np.where(NM < 200, -1e-17, GOOD)[15:]).flux_flam[0] == 0.0
 
 
 def test_extension_by_another_star() -> None:
