@@ -23,12 +23,17 @@ def test_synphot_spectrum_round_trips() -> None:
 
 def test_synphot_blackbody_is_read() -> None:
     from synphot import SourceSpectrum
-    from synphot.models import BlackBodyNorm1D
+    from synphot.models import BlackBodyNorm1D, Empirical1D
 
     body = Source.from_synphot(SourceSpectrum(BlackBodyNorm1D, temperature=6000))
     inside = (body.wavelength_nm > 200) & (body.wavelength_nm < 700)
     shape = body.flux_flam[inside] / Blackbody(6000.0).flux(body.wavelength_nm[inside])
     np.testing.assert_allclose(shape, shape[0], rtol=1e-3)
+    # As many photons at all wavelengths are no straight line between two points.
+    flat = Source.from_synphot(SourceSpectrum(Empirical1D, points=[1600, 11_000], lookup_table=[1.0, 1.0]))
+    nm = np.arange(200.0, 700.0, 7.3)
+    light = nm * np.interp(nm, flat.wavelength_nm, flat.flux_flam)
+    np.testing.assert_allclose(light, light[0], rtol=1e-5)
 
 
 def test_reddening_has_the_total_extinction_of_its_law() -> None:

@@ -141,6 +141,8 @@ def test_measured_noise_is_kept_and_reported_once() -> None:
     # Magnitudes take the noise as it is, above and below zero.
     assert star.magnitude("GALEX NUV") != Source.from_arrays(nm, np.maximum(flux, 0), name="x").magnitude("GALEX NUV")
     assert star.binned(5.0).wavelength_nm.size < 200
+    # The last bin is at least half as wide as the others.
+    assert all(np.diff(SUN.binned(width).wavelength_nm[1:-1]).min() > 0.7 * width for width in (5.0, 9.0, 11.0))
     assert star.binned(5.0).magnitude("V") == pytest.approx(star.magnitude("V"), abs=2e-3)
 
 

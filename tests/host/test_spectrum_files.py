@@ -260,6 +260,8 @@ def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
         with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0
+    # The Sun is as bright as its file states.
+    assert not Source.read(HERE / "sun_reference_stis_002.fits").unscaled
 
 
 def test_calspec_files_that_start_within_the_line_function_are_continued() -> None:
