@@ -23,20 +23,27 @@ def test_synphot_spectrum_round_trips() -> None:
 
 def test_synphot_blackbody_is_read() -> None:
     from synphot import SourceSpectrum
-    from synphot.models import BlackBodyNorm1D
+    from synphot.models import BlackBodyNorm1D, Empirical1D
 
     body = Source.from_synphot(SourceSpectrum(BlackBodyNorm1D, temperature=6000))
     inside = (body.wavelength_nm > 200) & (body.wavelength_nm < 700)
     shape = body.flux_flam[inside] / Blackbody(6000.0).flux(body.wavelength_nm[inside])
     np.testing.assert_allclose(shape, shape[0], rtol=1e-3)
+    # As many photons at all wavelengths are no straight line between two points.
+    flat = Source.from_synphot(SourceSpectrum(Empirical1D, points=[1600, 11_000], lookup_table=[1.0, 1.0]))
+    nm = np.arange(200.0, 700.0, 7.3)
+    light = nm * np.interp(nm, flat.wavelength_nm, flat.flux_flam)
+    np.testing.assert_allclose(light, light[0], rtol=1e-5)
 
 
 def test_reddening_has_the_total_extinction_of_its_law() -> None:
     """The laws of dust_extinction are those relative to A(V), which is A at 550 nm."""
     pytest.importorskip("dust_extinction")
     star = Source.from_library("G2V")
-    bare, dimmed = (np.interp(550.0, one.wavelength_nm, one.flux_flam) for one in (star, star.reddened(0.3)))
-    assert 2.5 * np.log10(bare / dimmed) == pytest.approx(3.1 * 0.3, rel=2e-3)
+    for rv in (3.1, 5.0):
+        pair = (star, star.reddened(0.3, rv=rv))
+        bare, dimmed = (np.interp(550.0, one.wavelength_nm, one.flux_flam) for one in pair)
+        assert 2.5 * np.log10(bare / dimmed) == pytest.approx(rv * 0.3, rel=2e-3)
 
 
 def test_stsynphot_spectrum_is_read(recwarn: pytest.WarningsRecorder) -> None:
@@ -58,6 +65,8 @@ def test_specutils_spectrum_round_trips() -> None:
     np.testing.assert_array_equal(back.wavelength_nm, source.wavelength_nm)
     other = specutils.Spectrum(spectral_axis=source.wavelength_nm * u.nm, flux=out.flux.to(u.W / u.m**2 / u.um))
     np.testing.assert_allclose(Source.from_specutils(other).flux_flam, source.flux_flam)
+    other.mask = source.wavelength_nm < 150.0
+    assert Source.from_specutils(other).wavelength_nm[0] >= 150.0
 
 
 def test_expectation_converts_to_a_specutils_spectrum() -> None:

@@ -279,7 +279,7 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
     wavelengths = axis(waves)
     if is_assumed:
         check_assumed_unit(wavelengths.value, str(wavelengths.unit))
-    marks, remarks = marks_in(fluxes, "fluxes")
+    marks, remarks = marks_in(fluxes, "flux", "fluxes")
     messages += remarks
     segments = []
     for values, flux in table.segments:
@@ -290,13 +290,14 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
             raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
         # A row without wavelength or flux is not a point.
         nm, unmarked = np.delete(nm, bad), np.delete(unmarked, bad)
+        # Fluxes per frequency or photon refer to wavelengths in vacuum.
+        nm, added = vacuum_wavelengths(nm, table.axis.name, table.remarks, medium or in_unit, table.headers)
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
         flam = np.asarray(light(unmarked).to_value(FLUX_UNIT, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
         segments.append((nm[order], flam[order]))
     nm, flam = _joined(segments, messages)
     if is_assumed_flux:
         _check_assumed_flux(flam, f"{table.remarks}\n{table.origin}")
-    nm, added = vacuum_wavelengths(nm, table.axis.name, table.remarks, medium or in_unit, table.headers)
     messages += added
     nm, flam = _merged(nm, flam, messages)
     unscaled, notes = table.unscaled, table.notes
@@ -432,6 +433,9 @@ def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:
     total = np.add.reduceat(flux, first)
     least, most = np.minimum.reduceat(flux, first), np.maximum.reduceat(flux, first)
     unequal = int(np.count_nonzero(most - least > 1e-9 * np.abs(most)))
-    difference = f"; {unequal} of them differ in flux and are averaged" if unequal else ", equal in flux"
-    messages.append(f"{int((count > 1).sum())} wavelengths that occur more than once are merged{difference}")
+    differ = "differs in flux and is" if unequal == 1 else "differ in flux and are"
+    difference = f"; {unequal} of them {differ} averaged" if unequal else ", equal in flux"
+    n = int((count > 1).sum())
+    words = "1 wavelength that occurs" if n == 1 else f"{n} wavelengths that occur"
+    messages.append(f"{words} more than once {'is' if n == 1 else 'are'} merged{difference}")
     return distinct, np.where(count > 1, total / count, flux[first])

@@ -91,7 +91,8 @@ def blackbody(wavelength_nm: Float, temperature_k: float) -> Float:
 class FlareSpectrum:
     """Spectrum of a flare, up to a factor."""
 
-    temperature_k: float | None = None  # temperature of the hottest blackbody of the flare; None for an observed flare
+    temperature_k: float | None = None  # temperature of the (first) blackbody; None for an observed flare
+    _area: float = 1.0  # area of the flare in units of that whose surface has `flux`
     # Shape (n,); wavelengths that a grid must contain so that linear interpolation conserves the flux.
     nodes_nm: Float = np.empty(0)
     surface: ClassVar[bool] = True  # whether `flux` is that of the flare's surface, from which an area follows
@@ -145,6 +146,11 @@ class TwoBlackbodies(FlareSpectrum):
     temperature_k: fields.Temperature = 10_000.0
     second_temperature_k: fields.Temperature = 30_000.0
     second_area: fields.AreaRatio = 0.05
+
+    @property
+    def _area(self) -> float:  # type: ignore[override]
+        """Area of both blackbodies over that of the first."""
+        return 1.0 + self.second_area
 
     def flux(self, wavelength_nm: Wavelengths) -> Float:
         second = blackbody(wavelength_nm, self.second_temperature_k)
@@ -261,6 +267,11 @@ class FlareWithLines(FlareSpectrum):
         return self.continuum.temperature_k
 
     @property
+    def _area(self) -> float:  # type: ignore[override]
+        """Area of the continuum."""
+        return self.continuum._area
+
+    @property
     def surface(self) -> bool:  # type: ignore[override]
         """True if `flux` is that of the flare's surface."""
         return self.continuum.surface
@@ -355,7 +366,8 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         measured = float(nm[0]), float(nm[-1])
         gaps = [f"{nm[i]:.1f}-{nm[i + 1]:.1f}" for i in np.flatnonzero(np.diff(nm) > GAP_NM)]
         if gaps:
-            messages += (f"The flare spectrum {name} is interpolated in its gaps at {', '.join(gaps)} nm",)
+            noun = "gap" if len(gaps) == 1 else "gaps"
+            messages += (f"The flare spectrum {name} is interpolated in its {noun} at {', '.join(gaps)} nm",)
         if continue_at_k is not None:
             nm, flux = _continued(name, nm, flux, continue_at_k)
             covered = f"The flare spectrum {name} covers {measured[0]:g}-{measured[1]:g} nm"
@@ -522,7 +534,7 @@ def added_light(
         fault = f"flare geometry must be 'added' with {spectrum.describe()}, since its surface flux is unknown"
         raise InputError(fault, key="flare_geometry")
     checked(fields.Temperature, "photosphere temperature", photosphere_k)
-    ratio = hot / photons(nm, blackbody(nm, photosphere_k), band)
+    ratio = hot / (spectrum._area * photons(nm, blackbody(nm, photosphere_k), band))
     if ratio <= 1.0:
         photosphere = f"the {photosphere_k:g} K of the photosphere that it replaces"
         fault = f"flare temperature must be above {photosphere}, not {spectrum.describe()}"

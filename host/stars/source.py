@@ -208,7 +208,7 @@ class Source(Drawable, ContentEquality):
 
         try:
             nm, values = (
-                array if isinstance(array, u.Quantity) else np.asarray(array) * unit
+                array if isinstance(array, u.Quantity) else np.asarray(array) * (getattr(array, "unit", None) or unit)
                 for array, unit in ((wavelength, u.nm), (flux, FLUX_UNIT))
             )
             nm = nm.to(u.nm, u.spectral())
@@ -241,9 +241,11 @@ class Source(Drawable, ContentEquality):
         """Convert a one-dimensional specutils Spectrum with units."""
         if not (hasattr(spectrum, "spectral_axis") and hasattr(spectrum, "flux")):
             raise InputError.of("spectrum", spectrum, "a Spectrum of specutils")
-        axis, flux = spectrum.spectral_axis, spectrum.flux
+        axis, flux = spectrum.spectral_axis, u.Quantity(spectrum.flux, dtype=float)
         if flux.ndim != 1:
             raise InputError(f"{name} must be one spectrum, but has the shape {flux.shape}", key="spectrum")
+        if spectrum.mask is not None:
+            flux[spectrum.mask] = np.nan
         order = np.argsort(axis.to_value(u.nm, u.spectral()))
         return cls.from_arrays(u.Quantity(axis)[order], u.Quantity(flux)[order], name=name, origin="specutils Spectrum")
 

@@ -284,8 +284,9 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
     if negative:
         i = int(np.argmin(values))
         messages.append(
-            f"{negative} of its {nm.size} points in {SPAN_NM[0]:g}-{SPAN_NM[1]:g} nm have a negative flux, the lowest "
-            f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; `bin_nm` bins it"
+            f"{negative} of its {nm.size} points in {SPAN_NM[0]:g}-{SPAN_NM[1]:g} nm "
+            f"{'has' if negative == 1 else 'have'} a negative flux, the lowest {values[i]:.3g} at {nm[i]:.1f} nm: "
+            "measured noise, kept; `bin_nm` bins it"
         )
     # Runs of at least three zeros are not measurements.
     first, stop = true_runs(values == 0.0).T

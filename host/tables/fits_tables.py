@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mauvecl.host.tables import table
 from mauvecl.host.tables.files import check_content, limit_bytes, reading
 from mauvecl.host.tables.names import match_name, text_at
-from mauvecl.host.tables.table import TableFile, Values, number_in
+from mauvecl.host.tables.table import TableFile, Values, dates_in, number_in, stacked
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
 
@@ -200,8 +200,8 @@ def column_values(data: Any, column: Any) -> Any:
     stored: NDArray[Any] = np.asarray(data.view(np.ndarray)[column.name])
     kind, null = stored.dtype.kind, "" if column.null is None else str(column.null).strip()
     scale, zero = float(column.bscale or 1.0), float(column.bzero or 0.0)
-    if (scale, zero) != (1.0, 0.0) and kind in "iuf":
-        # astropy cannot scale integers of 64 bits by fractions.
+    # Unsigned integers keep all digits; others of 64 bits cannot be scaled by astropy.
+    if (scale, zero) not in ((1.0, 0.0), (1.0, 2.0 ** (8 * stored.dtype.itemsize - 1))) and kind in "iuf":
         values: Any = stored * scale + zero
     else:
         values = data.field(column.name)
@@ -222,9 +222,9 @@ _AXIS_NAMES = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}
 
 
 def _number_at(headers: Sequence[Any], *keys: str) -> float | None:
-    """Return the first number that headers have under one of some keys."""
-    for key in keys:
-        for header in headers:
+    """Return the number that the first of some headers with one of some keys has under the first of these."""
+    for header in headers:
+        for key in keys:
             value = header.get(key)
             if isinstance(value, int | float) and not isinstance(value, bool):
                 return float(value)
@@ -238,6 +238,8 @@ AXIS_BEGINNINGS = ("WAVELEN", "LAM", "ANGSTROM", "ALOG")
 
 def axis_of(header: Any, primary: Any) -> tuple[Any, str | None, str, tuple[str, ...]]:
     """Return the values of an image's first axis, their unit, their kind (WAVE, AWAV, ...) and notes."""
+    # The axis of the primary's own image is not that of an extension.
+    primary = header if "CRVAL1" in header and "CRVAL1" in primary else primary
     number, n = partial(_number_at, (header, primary)), int(header["NAXIS1"])
     first, slope = number("COEFF0"), number("COEFF1")
     if first is not None and slope is not None and 1.0 < first < 6.0:
@@ -264,7 +266,7 @@ def axis_of(header: Any, primary: Any) -> tuple[Any, str | None, str, tuple[str,
             fault = f"its axis from {start:g} in steps of {step:g} has no unit or type; give CTYPE1 and CUNIT1"
             raise InputError(fault, key="CUNIT1")
         return value, unit, name, ()
-    if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and start > 20.0:
+    if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and not 1.0 < start <= 20.0:
         # Greisen et al. 2006 (A&A 446, 747), equation 5: the value at the reference pixel times an exponential.
         with np.errstate(over="ignore"):
             return start * np.exp(step * pixel / start), unit, name, (f"logarithmic axis {kind}",)
@@ -309,10 +311,17 @@ def _iraf_unit(header: Any) -> str:
     return "" if match is None else match[1] or match[2]
 
 
-def _time_scale(header: Any, number: int) -> str:
-    """Return the scale of a column in which astropy writes times as two parts of a Julian date (TCTYPn), or nothing."""
-    scale = str(header.get(f"TCTYP{number}", ""))
-    return scale.upper() if scale.lower() in SCALES.values() else ""
+def _times(header: Any, number: int) -> tuple[bool, dict[str, Any]]:
+    """Return whether a column has times as astropy writes them, two parts of a Julian date, and its keywords of times.
+
+    TCTYPn is the scale and TRPOSn the place of a column (standard 4.0, section 9.2).
+    """
+    scale, place = (text_at(header, f"{key}{number}") for key in ("TCTYP", "TRPOS"))
+    if scale.lower() not in SCALES.values():
+        return False, {}
+    is_pair = text_at(header, f"TFORM{number}") == "2D"
+    keywords = dates_in(scale) if is_pair else {"TIMESYS": scale.upper()}
+    return is_pair, keywords | ({"TREFPOS": place} if place else {})
 
 
 class FitsTables(TableFile):
@@ -340,10 +349,6 @@ class FitsTables(TableFile):
         for number in (0, at, self.chosen):
             header |= {} if number is None else dict(hdus[number].header)
         columns = [] if self.chosen is None else titles[self.chosen]
-        for k in range(1, 1 + len(columns)):
-            if (scale := _time_scale(header, k)) and str(header.get(f"TFORM{k}", "")) == "2D":
-                header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale,
-                           "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
         elsewhere = [f"{self._label(k)}/{title}" for k in self.tables if k != self.chosen for title in titles[k]]
         super().__init__(label, header, [*columns, *map(self._label, self.images), *elsewhere], columns=columns)
 
@@ -436,20 +441,34 @@ class FitsTables(TableFile):
             fault = f"{self.label}: the table {self._label(number)} has text or columns of variable length"
             raise InputError(f"{fault} and {size >> 20} MiB; use columns of fixed length", key="hdu")
         place = hdu.columns.names.index(column.name) + 1
-        pair = _time_scale(self.header, place)
+        is_pair, keywords = _times(hdu.header, place)
 
         def read(piece: slice) -> Any:
             with reading(self.label, WHOLE):
                 values = column_values(hdu.data[piece] if small else _rows(hdu, piece), column)
-            if pair and values.ndim == 2 and number == self.chosen:
-                return (values[:, 0] - 2_400_000.5) + values[:, 1]
-            return values
+            return (values[:, 0] - 2_400_000.5) + values[:, 1] if is_pair else values
 
+        ucd, unit = text_at(hdu.header, f"TUCD{place}"), str(column.unit or "").strip()
+        if column.format.format in ("P", "Q"):
+            with reading(self.label, WHOLE):
+                return Values.of(column.name, stacked(_arrays(hdu, place)), unit, self.label, ucd)
         row_shape = np.shape(read(slice(0, min(1, n_rows))))
         width = 0 if small else 2 * int(hdu.header["NAXIS1"])
-        ucd = text_at(hdu.header, f"TUCD{place}")
-        unit = str(column.unit or "").strip()
-        return Values(column.name, (n_rows, *row_shape[1:]), read, unit, self.label, width, ucd)
+        return Values(column.name, (n_rows, *row_shape[1:]), read, unit, self.label, width, ucd, keywords=keywords)
+
+
+def _arrays(hdu: Any, number: int) -> Any:
+    """Return the arrays of variable length of a column; astropy keeps scaled integers as integers and ignores TNULL."""
+    from astropy.io import fits
+
+    header, place = hdu.header.copy(), hdu.fileinfo()
+    scale, zero, null = (header.pop(f"{key}{number}", None) for key in ("TSCAL", "TZERO", "TNULL"))
+    if scale is zero is null is None:
+        return hdu.data.field(number - 1)
+    place["file"].seek(place["datLoc"])
+    raw = fits.BinTableHDU.fromstring(header.tostring().encode() + place["file"].read(place["datSpan"])).data
+    marked = (row if null is None else np.ma.masked_equal(row, null) for row in raw.field(number - 1))
+    return np.fromiter((row * float(scale or 1) + float(zero or 0) for row in marked), object)
 
 
 def _rows(hdu: Any, piece: slice) -> Any:

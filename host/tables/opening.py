@@ -73,9 +73,10 @@ class LargeTable(TableFile):
         title = match_name(name, self.names, self.label)
         if title is None:
             return None
+        first = self.table.find(name)
         # A copy, since a view of a column would keep all columns of the piece in memory.
         return Values(name, (self.n_rows,), lambda piece: self._rows(piece)[title].copy(),
-                      self.table.find(name).unit, self.label, self.row.itemsize)  # fmt: skip
+                      first.unit, self.label, self.row.itemsize, keywords=first.keywords)  # fmt: skip
 
 
 def _numbers(values: Values) -> bool:
@@ -250,19 +251,25 @@ def votables(content: bytes, label: str) -> Iterator[MemoryTable]:
         fault = f"{label} is the answer to a query that failed: {reason}"
         raise InputError(f"{fault}; give that of one that succeeds", key="file")
     shared = _parameters(parameter for resource in file.resources for parameter in resource.params)
+    systems: dict[str, dict[str, Any]] = {}
     for resource in file.resources:
         for system in resource.time_systems:
             # A number of days, or the words JD-origin and MJD-origin.
             origin = {"JD-origin": 0.0, "MJD-origin": 2_400_000.5}.get(str(system.timeorigin), system.timeorigin)
-            shared |= {} if origin is None else {"JDREF": float(origin)}
-            shared |= {"TIMESYS": str(system.timescale or ""), "TREFPOS": str(system.refposition or "")}
-        for system in resource.coordinate_systems:
-            shared["COOSYS"] = str(system.system or "")
+            systems[system.ID] = {} if origin is None else {"JDREF": float(origin)}
+            systems[system.ID] |= {"TIMESYS": str(system.timescale or ""), "TREFPOS": str(system.refposition or "")}
+        systems |= {system.ID: {"COOSYS": str(system.system or "")} for system in resource.coordinate_systems}
+    # A system applies to the fields that refer to it; the only one of its kind to all.
+    for key in ("COOSYS", "TIMESYS"):
+        alike = [system for system in systems.values() if key in system]
+        shared |= alike[0] if alike and all(system == alike[0] for system in alike) else {}
     for table in file.iter_tables():
         with files.parsing(label, "give a whole VOTable"):
             for field in table.fields:
                 field.name = field.name or field.ID
             read = table.to_table(use_names_over_ids=True)
+            for field, column in zip(table.fields, read.itercols(), strict=True):
+                column.meta |= systems.get(field.ref, {})
             if "OVERFLOW" in status:
                 read.meta[REMARKS] = ("the query had more rows than the archive returns: the table is incomplete",)
             memory_table = MemoryTable(read, label)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import fnmatch
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -61,8 +61,8 @@ def without_indefinite(values: Float) -> Float:
     return np.where(bad, np.nan, values) if bad.any() else values
 
 
-def marks_in(values: Float, noun: str) -> tuple[list[float], list[str]]:
-    """Return values that mark missing ones, such as -99 and 9999, and remarks on them.
+def marks_in(values: Float, one: str, several: str) -> tuple[list[float], list[str]]:
+    """Return values that mark missing ones, such as -99 and 9999, and remarks on `one` or `several` of them.
 
     A mark consists of nines. Either it occurs once and is a thousand times larger than all other values, or it occurs
     more often and is three times larger, or three times as far below zero.
@@ -78,7 +78,8 @@ def marks_in(values: Float, noun: str) -> tuple[list[float], list[str]]:
         beyond = np.max(-unmarked if mark < 0 and n > 1 else np.abs(unmarked), initial=0.0)
         if unmarked.size and abs(mark) > (3 if n > 1 else 1000) * beyond:
             marks += [mark, -mark]
-            remarks.append(f"{n} {noun} of {mark:.7g} mark missing values and are left undefined")
+            words = "marks a missing value and is" if n == 1 else "mark missing values and are"
+            remarks.append(f"{n} {one if n == 1 else several} of {mark:.7g} {words} left undefined")
     return marks, remarks
 
 
@@ -94,6 +95,7 @@ class Values:
     row_bytes: int = 0  # bytes that are read for a row, if more than those of its values
     ucd: str = ""  # unified content descriptor of the IVOA
     description: str = ""
+    keywords: Mapping[str, Any] = field(default_factory=dict)  # on its times, which override those of the header
 
     @classmethod
     def of(
@@ -129,7 +131,7 @@ class Values:
         """Return rows as numbers; NaN where they are missing. `expected` says what a cell may be, for messages."""
         values: Any = np.ma.asarray(self.read(piece))
         if values.dtype.kind == "O":
-            # Arrays of variable length.
+            # Arrays of variable length, or texts.
             try:
                 values = np.ma.asarray(np.stack([np.asarray(row) for row in values]))
             except ValueError as error:
@@ -180,6 +182,21 @@ class Values:
             fault = f"{self.label}: {self.name!r} in row {row} must be {expected}, not {shortened(text, 40)}"
             raise InputError(fault, key=self.name) from error
         return np.array(parsed, float).reshape(values.shape)
+
+
+#: Keywords of the times of a column.
+TIMES = ("JDREF", "TIMESYS", "TREFPOS")
+
+
+def dates_in(scale: str) -> dict[str, Any]:
+    """Return the keywords of modified Julian dates in a scale."""
+    return {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale.upper()}
+
+
+def stacked(cells: Any) -> Any:
+    """Return arrays of variable length as one array if all have the same length; other cells are unchanged."""
+    is_even = getattr(cells, "dtype", np.dtype(float)).kind == "O" and len({np.shape(cell) for cell in cells}) == 1
+    return np.ma.stack(list(cells)) if is_even and np.ndim(cells[0]) else cells
 
 
 def _plain(text: Any) -> str:
@@ -289,15 +306,10 @@ class MemoryTable(TableFile):
     """A table in memory: CSV, ECSV, VOTable, text."""
 
     def __init__(self, table: Any, label: str) -> None:
-        from astropy.time import Time
-
         meta = table.meta if isinstance(table.meta, dict) else {}
         header = {str(key): value for key, value in meta.items() if key != REMARKS}
         super().__init__(label, header, list(map(str, table.colnames)), meta.get(REMARKS, ()))
         self.table = table
-        # Columns of dates have a scale.
-        for dates in (table[name] for name in table.colnames if isinstance(table[name], Time)):
-            self.header |= {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": dates.scale.upper()}
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
@@ -309,10 +321,12 @@ class MemoryTable(TableFile):
         column = self.table[title]
         if isinstance(column, Time | TimeDelta):
             days = column.mjd if isinstance(column, Time) else column.to_value("d")
-            return Values.of(name, np.asarray(np.ma.filled(days, np.nan)), "d", self.label)
-        ucd, description = str((column.info.meta or {}).get("ucd", "")), column.info.description or ""
-        unit = getattr(column, "unit", None)
-        return Values.of(name, getattr(column, "value", column), unit, self.label, ucd, description)
+            values = Values.of(name, np.asarray(np.ma.filled(days, np.nan)), "d", self.label)
+            return values if isinstance(column, TimeDelta) else replace(values, keywords=dates_in(column.scale))
+        meta, cells = column.info.meta or {}, stacked(getattr(column, "value", column))
+        values = Values.of(name, cells, getattr(column, "unit", None), self.label, str(meta.get("ucd", "")),
+                           column.info.description or "")  # fmt: skip
+        return replace(values, keywords={key: meta[key] for key in TIMES if key in meta})
 
 
 class Rows:
@@ -386,6 +400,7 @@ class Rows:
         # Keywords, columns, comments or the name state the system.
         systems = [str(value) for key, value in meta.items() if key_of(str(key)) in SYSTEMS]
         systems += [text for column in self.names if key_of(column) in SYSTEMS for text in {*self.texts(column)}]
+        systems.append(str((self.table[name].info.meta or {}).get("COOSYS", "")))
         comments = f"{meta.get('comments', '')} {meta.get('COMMENT', '')}"
         if not re.search(r"J2000|ICRS|FK5", f"{name} {comments}", re.IGNORECASE):
             systems += re.findall(r"FK4|B1950", comments, re.IGNORECASE)

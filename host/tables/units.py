@@ -252,13 +252,14 @@ def time_unit(text: str) -> TimeSystem | None:
     word = re.sub(r"[−–]", "-", text.strip().strip("\"'")).lower()
     # BJD - 2,457,000
     word = re.sub(r"(?<=\d),(?=\d{3}(?:\D|$))", "", word)
-    if word in _TIME_WORDS:
+    # Ms are megaseconds.
+    if word in _TIME_WORDS and text.strip() != "Ms":
         return TimeSystem(_TIME_WORDS[word])
     if match := _JULIAN.fullmatch(word):
         name = match["name"]
         is_mission = name in ("btjd", "tbjd", "bkjd", "kbjd")
         scale = match["scale"] or match["end"] or ("tdb" if is_mission else "")
-        place = "BARYCENTER" if "b" in name else "HELIOCENTER" if name.startswith("h") else ""
+        place = "BARYCENTER" if "b" in name else "HELIOCENTER" if "h" in name else ""
         return TimeSystem("d", _DAYS[name] + float(match["less"] or match["plus"] or 0.0), scale, place)
     if (match := _SINCE.fullmatch(word)) and match["unit"] in _TIME_WORDS:
         scale = match["scale"] or "utc"

@@ -256,7 +256,7 @@ def _with_row_per_frame(quantities: Quantities, label: str) -> Quantities:
             if (rows != rows[:, :1]).any():
                 raise InputError(f"{label}: {values.name!r} must not change within a frame", key=values.name)
             rows = rows[:, 0]
-        by_frame[key] = Values.of(values.name, rows, values.unit, label)
+        by_frame[key] = replace(Values.of(values.name, rows, values.unit, label), keywords=values.keywords)
     return by_frame
 
 
@@ -427,7 +427,7 @@ def _read_light(
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     light, sd = without_indefinite(light), None if sd is None else without_indefinite(sd)
-    marks, notes = marks_in(light, "values")
+    marks, notes = marks_in(light, "value", "values")
     light = np.where(np.isin(light, marks), np.nan, light) if marks else light
     unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
     if "quality" not in quantities and unused:

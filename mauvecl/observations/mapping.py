@@ -188,7 +188,7 @@ def times_of(
     """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
     import astropy.units as u
 
-    label, header = file.label, units.TimeSystem.of(file.header, file.label)
+    label, header = file.label, _stated_system(time, file)
     scale = units.scale_of(mapping.scale) or header.scale
     position = units.position_of(mapping.position) or header.position
     epoch, remarks = mapping.epoch_mjd, []
@@ -224,6 +224,14 @@ def times_of(
     seconds, epoch = (seconds + first_d * DAY_S, None) if epoch is None else (seconds, epoch + first_d)
     system = replace(header, epoch_mjd=epoch, scale=scale, position=position, at=at)
     return seconds, exposure, system, tuple(remarks)
+
+
+def _stated_system(time: tuple[Values, ...], file: TableFile) -> units.TimeSystem:
+    """Return the time system that a header and the columns of times state; raise InputError if these differ."""
+    if any(values.keywords != time[0].keywords for values in time):
+        names = " and ".join(values.name for values in time)
+        raise InputError(f"{file.label}: {names} must be in one time system", key="time")
+    return units.TimeSystem.of(file.header | {**time[0].keywords}, file.label)
 
 
 def _time_unit(

@@ -80,7 +80,7 @@ class FolderFile(TableFile):
 
         # A column of every file, with one row per file.
         return Values(name, (len(self.paths), n), lambda piece: np.stack([*map(row, self.paths[piece])]), column.unit,
-                      self.label)  # fmt: skip
+                      self.label, keywords=column.keywords)  # fmt: skip
 
     def axis(self, name: str, dimension: int) -> Values:
         """Return the wavelengths of the first file's image; raise InputError if another file has others."""

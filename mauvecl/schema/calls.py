@@ -94,7 +94,8 @@ def _array(value: Any) -> Any:
     if is_quantity(value):
         return without_unit(value, "")
     _require(_kind(value) in tuple("iufb"))
-    return value
+    # Masked values are undefined; NumPy would take what lies below the mask.
+    return value.astype(float).filled(float("nan")) if getattr(value, "mask", None) is not None else value
 
 
 def _real_array(value: Any) -> Any:

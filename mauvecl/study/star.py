@@ -50,6 +50,14 @@ def unit_of_file(of: Literal["wavelength", "flux"], prefix: str, whose: str, lab
     )
 
 
+def _listed(name: str, band: Any, system: Any) -> dict[str, float]:
+    """Return the distance of a listed star, and its V if magnitudes are those of catalogues in V."""
+    listed = listed_values(name)
+    if band not in ("V", *ALIASES["V"]) or system != "catalogue":
+        listed.pop("magnitude", None)
+    return listed
+
+
 class Star(Section):
     """Spectrum, extinction and magnitude of a star; distance or radius for flare energies."""
 
@@ -172,9 +180,7 @@ class Star(Section):
         """Add the V magnitude and the distance of a star of the embedded list, unless others are given."""
         if not isinstance(data, dict) or not isinstance(data.get("library"), str):
             return data
-        listed = listed_values(data["library"])
-        if data.get("band", "V") != "V" or data.get("magnitude_system", "catalogue") != "catalogue":
-            listed.pop("magnitude", None)
+        listed = _listed(data["library"], data.get("band", "V"), data.get("magnitude_system", "catalogue"))
         return data | {key: value for key, value in listed.items() if data.get(key) is None}
 
     def _check_values(self) -> None:
@@ -187,8 +193,8 @@ class Star(Section):
         changed = super().with_value(path, value)
         if path[0] != "library":
             return changed
-        listed = listed_values(str(value))
-        if self.magnitude not in (None, listed_values(self.library or "").get("magnitude")):
+        here, listed = (_listed(name, self.band, self.magnitude_system) for name in (self.library or "", str(value)))
+        if self.magnitude not in (None, here.get("magnitude")):
             # A magnitude that is not from the list was set by the user, for every star.
             listed.pop("magnitude", None)
         return changed.model_copy(update=dict.fromkeys(STAR_KEYS) | listed)

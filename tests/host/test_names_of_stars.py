@@ -162,6 +162,7 @@ def test_messages_on_neighbours(tmp_path: Path) -> None:
     for row, said in (
         (FAR, "none within 47.46 arcsec; 1 star beyond does not enter"),
         ("c,1,9,M2V", "of type M2V: M1V, the nearest type"),
+        ("c,1,9,K", "of type K: K5V"),
         ("A,0.3,7.2,G2V", "neighbours_of"),
     ):
         assert said in " ".join(seen(tmp_path, row).messages)

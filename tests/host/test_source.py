@@ -86,6 +86,11 @@ def test_replacing_flare_hides_photosphere() -> None:
     f = 0.1 / (10 ** (0.4 * difference) - 1)
     flare = star.flaring(0.1, 10_000, geometry="replaces", photosphere_temperature=5000)
     np.testing.assert_allclose(flare.flux_flam, (1 - f) * cool + f * hot, rtol=1e-9)
+    # Two halves of a flare hide as much as one of both.
+    halves = TwoBlackbodies(10_000.0, 10_000.0, 1.0)
+    for light in (halves, FlareWithLines(halves)):
+        parts = star.flaring(0.1, spectrum=light, geometry="replaces", photosphere_temperature=5000)
+        np.testing.assert_allclose(parts.flux_flam, flare.flux_flam, rtol=1e-9)
 
 
 def test_short_spectra_are_used_where_they_suffice() -> None:
@@ -106,6 +111,8 @@ def test_short_spectra_are_used_where_they_suffice() -> None:
     assert cut.measured_nm == (195.0, 1099.0)
     with refused("band", "195-1099", "99%", "GALEX"):
         cut.magnitude("GALEX NUV")
+    # Noise below zero is not continued.
+    assert Source.from_arrays(NM[15:], np.where(NM < 200, -1e-17, GOOD)[15:]).flux_flam[0] == 0.0
 
 
 def test_extension_by_another_star() -> None:
@@ -134,6 +141,8 @@ def test_measured_noise_is_kept_and_reported_once() -> None:
     # Magnitudes take the noise as it is, above and below zero.
     assert star.magnitude("GALEX NUV") != Source.from_arrays(nm, np.maximum(flux, 0), name="x").magnitude("GALEX NUV")
     assert star.binned(5.0).wavelength_nm.size < 200
+    # The last bin is at least half as wide as the others.
+    assert all(np.diff(SUN.binned(width).wavelength_nm[1:-1]).min() > 0.7 * width for width in (5.0, 9.0, 11.0))
     assert star.binned(5.0).magnitude("V") == pytest.approx(star.magnitude("V"), abs=2e-3)
 
 
@@ -233,6 +242,11 @@ def test_coarse_spectrum_is_continued_from_its_last_point_if_asked() -> None:
     assert "8000 K continues it" in flare.messages[-1]
     far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
     assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
+    # A finer one is continued from the mean of its last 20 nm.
+    nm = np.arange(200.0, 801.0)
+    flare, last = ObservedFlare.from_arrays(nm, nm**4, continue_at_k=8000.0), nm >= 780.0
+    level = np.trapezoid(nm[last] ** 4) / np.trapezoid(blackbody(nm[last], 8000.0))
+    assert flare.flux_flam[-1] == pytest.approx(level * blackbody(flare.wavelength_nm[-1:], 8000.0)[0])
 
 
 def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
@@ -243,7 +257,7 @@ def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
     assert flare.measured_nm == (190.0, 800.0)
     inside = nm[nm >= 190.0]
     np.testing.assert_allclose(flare.flux(inside), 2e-14 * inside, rtol=1e-9)
-    assert not any("gaps" in text for text in flare.messages)
+    assert not any("gap" in text for text in flare.messages)
     # What is left of equal spectra may be their rounding.
     for factor in (1.0, 1.0 - 1e-14, 1.01):
         np.savetxt(tmp_path / "same.txt", np.column_stack([nm, factor * 3e-14 * nm]), fmt="%.17e")
@@ -251,4 +265,4 @@ def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
             ObservedFlare.read(tmp_path / "both.txt", tmp_path / "same.txt", continue_at_k=9000.0)
     kept = (nm < 330.0) | (nm > 356.0)
     gap = ObservedFlare.from_arrays(nm[kept], 1e-14 * nm[kept])
-    assert any("gaps at 329.5-356.5 nm" in text for text in gap.messages)
+    assert any("its gap at 329.5-356.5 nm" in text for text in gap.messages)

@@ -16,6 +16,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Column, MaskedColumn
 from corpus import CORPUS, FLUX, NM, cases, value, written
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -49,6 +50,10 @@ def test_units_may_be_those_of_astropy_and_frequencies_may_rise_or_fall(tmp_path
     frequency, flux = (NM * u.nm).to(u.Hz, u.spectral()), value('per("Jy")') * u.Jy
     for order in (slice(None), slice(None, None, -1)):
         assert is_right(Source.from_arrays(frequency[order], flux[order]))
+    # Columns of a plain table have units but are no Quantities, and values below a mask are none.
+    spoilt = MaskedColumn(np.where(NM < 175.0, 1.0, FLUX / 100), unit=u.W / u.m**2 / u.nm, mask=NM < 175.0)
+    star = Source.from_arrays(Column(10 * NM, unit=u.AA), spoilt)
+    np.testing.assert_allclose((star.wavelength_nm, star.flux_flam), (NM[NM > 175.0], FLUX[NM > 175.0]), rtol=1e-6)
 
 
 RANDOM = tomllib.loads((CORPUS / "spectrum_files.toml").read_text(encoding="utf-8"))["random"]
@@ -255,6 +260,8 @@ def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
         with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0
+    # The Sun is as bright as its file states.
+    assert not Source.read(HERE / "sun_reference_stis_002.fits").unscaled
 
 
 def test_calspec_files_that_start_within_the_line_function_are_continued() -> None:

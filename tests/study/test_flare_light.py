@@ -49,6 +49,8 @@ def test_spectrum_of_a_study_round_trips_through_toml(name: str, tmp_path: Path)
     (tmp_path / "study.toml").write_text(study.toml())
     assert Study.read(tmp_path / "study.toml") == study
     assert ("spectrum" in study.toml()) == (name != "blackbody")
+    fixed = study.flare.spectrum.model_copy(update={"line_fluxes": {"280": 2e-13}, "line_scale": 3.0})
+    assert fixed.at_temperature(9000.0).fluxes_cgs == {"280": 3.0 * 2e-13}
 
 
 @TOGETHER

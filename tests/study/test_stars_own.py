@@ -36,6 +36,10 @@ def test_each_star_has_its_own_photosphere() -> None:
     assert Study.build(own.model_dump(), "again") == own
     # Another star has its own temperature.
     assert own.at("star", "M3V").star[0].effective_temperature_k is None
+    # Its V in the list is no magnitude in another band.
+    bands = {"Kepler": None, "V": 8.81, "Johnson V": 8.81}
+    vega = {band: study({"library": "Vega", "magnitude": None, "band": band}) for band in bands}
+    assert {band: one.at("star", "AU Mic").star[0].magnitude for band, one in vega.items()} == bands
 
 
 def test_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
