@@ -522,8 +522,9 @@ def entirely_saturated(x: Expectation, key: str) -> InputError:
 
 
 def _safe_frame_s(x: Expectation) -> float:
-    """Return the longest frame without a saturated pixel, rounded down so that it is safe."""
-    return float(np.floor(x.longest_safe_frame_s * 1000) / 1000)
+    """Return the longest frame without a saturated pixel, rounded down to milliseconds or three digits."""
+    per_s = max(1000.0, 10.0 ** (2 - np.floor(np.log10(x.longest_safe_frame_s))))
+    return float(np.floor(x.longest_safe_frame_s * per_s) / per_s)
 
 
 def _saturation(x: Expectation) -> list[str]:

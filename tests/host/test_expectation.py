@@ -81,6 +81,9 @@ def test_saturation_is_the_first_message() -> None:
     assert safe == pytest.approx(x.longest_safe_frame_s, abs=1e-3)
     assert not expect(star, MAUVE.with_(frame_s=safe), exposure=1).saturated.any()
     assert expect(star, MAUVE.with_(frame_s=safe + 0.002), exposure=1).saturated.any()
+    bright = expect(source("B2IV", -9.0), MAUVE, exposure=1)
+    safe = float(bright.messages[0].split("longest safe frame is ")[1].split(" s")[0])
+    assert safe == pytest.approx(bright.longest_safe_frame_s, rel=0.01)
     assert (QUIET.saturated.any(), "saturated" in kinds(QUIET), QUIET.longest_safe_frame_s > 60) == (False, False, True)
 
 
