@@ -167,7 +167,8 @@ def test_conditions_equal_those_of_stares_along_the_orbit() -> None:
     assert seen["temperature"].value == pytest.approx(frames.temperature_c.mean(), abs=0.2)
     still = plan(study.with_settings(["plan.along_orbit=false", "observation.temperature_c=21"]))
     assert still.stars["temperature"][0].value == 21.0
-    assert still.stars["hits"][0].value == 0.0 < seen["hits"].value
+    # The limit of protons leaves little more than the cosmic rays.
+    assert still.stars["hits"][0].value == 0.0 < 1.0 < seen["hits"].value < 1.1
     hot = study.with_settings(["observation.temperature_c=21"])
     rays = hot.with_settings(["processes.cosmic_rays.electrons=[5000, 10000]"])
     planned = [plan(one) for one in (rays, hot)]

@@ -11,6 +11,7 @@ import pytest
 from astropy.table import QTable
 from scenes import instrument, quiescent, source
 from scipy.special import erf
+from scipy.stats import norm
 
 from mauvecl import Expectation, Instrument, PixelMap, Sky, Source, expect
 
@@ -34,6 +35,7 @@ def test_rates_equal_the_published_ones() -> None:
 
 @pytest.mark.parametrize("signal", ["net", "paper"])
 def test_closed_form_signal_to_noise(signal: Any) -> None:
+    """Compare one pixel, and warn of frames that fall below zero, which closed forms neglect."""
     # One pixel by hand: 10 frames, noise added in quadrature; the paper counts the zodiacal light as signal.
     p, x = 900, expect(SUN, MAUVE, exposure=50, sky=22.1, signal=signal)
     assert ("paper signal" in kinds(x)) == (signal == "paper")
@@ -47,6 +49,11 @@ def test_closed_form_signal_to_noise(signal: Any) -> None:
     assert x.snr()[p] == pytest.approx(counted / noise, rel=1e-6)
     assert x.variance_dn2[p] == pytest.approx(noise**2 + 10 / 12, rel=1e-6)
     assert x.mean_raw_dn[p] == pytest.approx(light / 10 + 445.5337 * 5 + 600, rel=1e-6)
+    low = expect(SUN, MAUVE.with_(bias_dn=20, dark_scale_dn_per_s=0, read_noise_dn=12), exposure=50, signal=signal)
+    sd = np.sqrt(low.variance_dn2 / 10)
+    near = norm.sf((low.mean_raw_dn + 0.5) / sd) > 1e-4
+    assert f"frames of {near.sum()} of 1643 pixels fall below 0 DN" in " ".join(low.messages)
+    assert (near.any(), near.all(), "below 0 DN" in " ".join(x.messages)) == (True, False, False)
 
 
 @pytest.mark.parametrize(("exposure", "frame_s", "frames", "rounded"), [
