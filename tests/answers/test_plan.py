@@ -53,6 +53,8 @@ def test_plan_numbers_are_consistent_and_missing_ones_are_told(answer: Any) -> N
         assert np.interp(np.log10(table["E50"][k].value), np.log10(energy), share) == pytest.approx(0.5, abs=1e-6)
         assert np.interp(np.log10(table["E90"][k].value), np.log10(energy), share) == pytest.approx(0.9, abs=1e-6)
         assert table["low"][k] < table["expected"][k] < table["high"][k]
+        days = answer.days[(answer.days["target"] == name) & (answer.days["hours"].value > 0)]
+        assert stars["sky"][k].value == pytest.approx(np.nanmedian(days["zodiacal_light"].value), abs=1e-9)
     assert table["false_alarms"].tolist() == pytest.approx((table["hours"].value / 24 / (365.25 / 12)).tolist())
     assert (table["hours"] <= table["seen"]).all()
     assert answer.seen.table["hours"].value == pytest.approx(table["seen"].value)

@@ -49,6 +49,7 @@ def test_closed_form_signal_to_noise(signal: Any) -> None:
     assert x.snr()[p] == pytest.approx(counted / noise, rel=1e-6)
     assert x.variance_dn2[p] == pytest.approx(noise**2 + 10 / 12, rel=1e-6)
     assert x.mean_raw_dn[p] == pytest.approx(light / 10 + 445.5337 * 5 + 600, rel=1e-6)
+    assert x.element_wavelength_nm[[0, -1]] == pytest.approx([205.25, 698.75])
     low = expect(SUN, MAUVE.with_(bias_dn=20, dark_scale_dn_per_s=0, read_noise_dn=12), exposure=50, signal=signal)
     sd = np.sqrt(low.variance_dn2 / 10)
     near = norm.sf((low.mean_raw_dn + 0.5) / sd) > 1e-4
