@@ -388,11 +388,12 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     bands, kind, file, temperature, colour = map(
         table.first, (names.BANDS, TYPES, SPECTRUM_FILES, TEMPERATURES, COLOURS)
     )
-    # Gmag is Gaia's in VizieR, gmag that of other surveys.
+    # Gmag is Gaia's in VizieR, gmag that of other surveys; a table may have both.
+    gaia = next((name for name in table.names if names.divided_unit(name)[0] == "Gmag"), None)
     magnitudes = {
         column: band
         for name, band in MAGNITUDES.items()
-        if (column := table.first((name,))) and (name != "gmag" or column == "Gmag")
+        if (column := gaia if name == "gmag" else table.first((name,)))
     }
     stars = []
     for k, title in enumerate(titles):

@@ -486,6 +486,12 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
         frames = f"{x.n_frames} frame{'s' if x.n_frames > 1 else ''} of {x.frame_s:g} s"
         text = f"The exposure of {exposure:g} s is rounded up to {x.exposure_s:g} s, {frames}."
         yield Message(text, "rounded up")
+    below = special.ndtr(-(x.mean_raw_dn + 0.5) / np.sqrt(x.unsaturated_variance_dn2 / x.n_frames)) > REPORTED_CLIPPING
+    if below.any():
+        yield (
+            f"{source.name}: frames of {int(below.sum())} of {below.size} pixels fall below 0 DN by noise and are "
+            "recorded as 0, which means, noise and S/N leave out: the bias of the instrument is too small."
+        )
     if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
         yield (
             f"{source.name} was dereddened by its archive: it is brighter in the ultraviolet than as observed, unless "
@@ -506,7 +512,7 @@ def continued_to_reach(source: Source, instrument: Instrument) -> Source:
     return replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
 
 
-#: Fraction of exposures with a clipped frame from which a message reports it.
+#: Fraction of exposures with a saturated frame, and of frames below zero, from which a message reports it.
 REPORTED_CLIPPING = 1e-4
 #: Largest number of runs of saturated pixels that a message names one by one.
 MOST_RUNS = 3
@@ -522,8 +528,9 @@ def entirely_saturated(x: Expectation, key: str) -> InputError:
 
 
 def _safe_frame_s(x: Expectation) -> float:
-    """Return the longest frame without a saturated pixel, rounded down so that it is safe."""
-    return float(np.floor(x.longest_safe_frame_s * 1000) / 1000)
+    """Return the longest frame without a saturated pixel, rounded down to milliseconds or three digits."""
+    per_s = max(1000.0, 10.0 ** (2 - np.floor(np.log10(x.longest_safe_frame_s))))
+    return float(np.floor(x.longest_safe_frame_s * per_s) / per_s)
 
 
 def _saturation(x: Expectation) -> list[str]:

@@ -64,8 +64,15 @@ class Limits(Section):
     @property
     def assumptions(self) -> list[tuple[str, str, str]]:
         """Name, value and source of each limit in force."""
-        limits = [(name, value) for name, value in self if value not in (None, ())]
-        return [(name, as_typed(value).replace(",", " "), SOURCES[name]) for name, value in limits]
+        rows, usual = [], type(self)()
+        for name, value in self:
+            if value in (None, ()) or (name == "proton_flux" and self.anomaly):
+                continue
+            default, source = getattr(usual, name), SOURCES[name]
+            if default not in (None, (), value):
+                source = f"set by the user; default {as_typed(default).replace(',', ' ')}: {source}"
+            rows.append((name, as_typed(value).replace(",", " "), source))
+        return rows
 
 
 _UVEX = "assumption, borrowed from UVEX (m4opt's definition of that mission); Mauve's own is not public"

@@ -85,6 +85,11 @@ class TimeGrid:
         midnight = float(np.floor(time.jd - 0.5)) + 0.5
         return midnight, float((time.jd1 - midnight) + time.jd2)
 
+    @property
+    def first_day(self) -> np.datetime64:
+        """UTC day of the start."""
+        return np.datetime64(utc_text(self.first[0])[:10], "D")
+
     @cached_property
     def seconds(self) -> Float:
         """Middles of the steps, s since the start, shape (n,)."""

@@ -203,19 +203,10 @@ class Visibility:
     def by_month(self) -> tuple[list[str], Float]:
         """Return the calendar months (UTC), such as "2027-01", and the hours of exposure, shape (n_month, k)."""
         times = self.track.times
-        day = np.datetime64(times.iso(0.0)[:10], "D") + np.floor(times.julian[1]).astype(int)
+        day = times.first_day + np.floor(times.julian[1]).astype(int)
         months, starts = np.unique(day.astype("datetime64[M]"), return_index=True)
         hours = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
         return [str(month) for month in months], hours
-
-    def by_orbit(self, k: int) -> Float:
-        """Return the minutes of exposure between ascending nodes, shape (n_orbit,).
-
-        The first and last orbit may be incomplete.
-        """
-        z = self.track.of_date_km[:, 2]
-        number = np.concatenate([[0], np.cumsum((z[:-1] < 0) & (z[1:] >= 0))])
-        return np.asarray(np.bincount(number, self.seen[:, k]) * self._step_h * 60)
 
     @property
     def _step_h(self) -> float:

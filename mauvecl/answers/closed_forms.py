@@ -250,7 +250,9 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     x, y = draws.values[finite], outcome[finite]
     if len(y) <= x.shape[1] + 1 or y.std() == 0.0:
         return dict.fromkeys((*names, REST), float("nan"))
-    scaled = (x - x.mean(axis=0)) / x.std(axis=0)
+    # A prior of zero width explains nothing.
+    varied = np.ptp(x, axis=0) > 0
+    scaled = np.where(varied, x - x.mean(axis=0), 0.0) / np.where(varied, x.std(axis=0), 1.0)
 
     def explained_by(some: tuple[int, ...]) -> float:
         straight = np.column_stack([scaled[:, some], np.ones(len(y))])
@@ -266,7 +268,7 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
             # Fraction of orders in which exactly these precede unknown k.
             weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
             share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
-    return {names[k]: float(share[k]) for k in np.argsort(-share)} | {REST: 1.0 - explained[tuple(indices)]}
+    return {names[k]: max(float(share[k]), 0.0) for k in np.argsort(-share)} | {REST: 1.0 - explained[tuple(indices)]}
 
 
 #: Unknowns whose shares of a scatter are named, at most.

@@ -114,7 +114,7 @@ class PlannedTarget:
     """Target of a plan with its expected flares."""
 
     observation: TargetObservation
-    seen_h: float  # visible time
+    seen_h: float  # visible time, times the duty cycle
     hours: float  # observed time
     completeness: Completeness | None  # None if the target is never visible
     rates: Rates | None  # of bolometric energies; None if unknown
@@ -174,8 +174,10 @@ def errors_of_throughput(observation: TargetObservation, rates: Rates | None) ->
         return None
     forms = [closed_form(replace(observation, case=case)) for case in (observation.case, *calibrated)]
     values = [(form.energy_at(0.5), np.nan if rates is None else recovered_per_day(rates, form)) for form in forms]
-    nominal, *moved = np.log(values)
-    energy, number = np.sqrt(((np.array(moved) - nominal) ** 2).sum(axis=0))
+    # Errors of an infinite E50 and of a yield of zero are NaN.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        nominal, *moved = np.log(values)
+        energy, number = np.sqrt(((np.array(moved) - nominal) ** 2).sum(axis=0))
     return float(energy), float(number)
 
 
@@ -245,7 +247,8 @@ def observe(
         typical = int(np.argmin(np.abs(windows.length_s - window_s)))
         first = round(float(windows.start_s[typical]) / step_s)
         orbit_c = temperature_c[first : first + int(np.ceil(study.orbit.orbit().elements.period_s / step_s))] - mean_c
-        swing = tuple((float((n + 0.5) * step_s), float(value)) for n, value in enumerate(orbit_c))
+        # Temperatures are those at the ends of steps.
+        swing = tuple((float(n * step_s), float(value)) for n, value in enumerate(orbit_c, 1))
         changes["processes"] = study.processes.with_particles(float(hits[when].mean()))
         if study.observation.temperature_c is None:
             changes["observation"] = study.observation.model_copy(update={"temperature_c": mean_c})
@@ -268,8 +271,8 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
     gap = max(orbit_s - observation.window_s, 0.0)
     changes: dict[str, Any] = {"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (),
                                "along_orbit": False}  # fmt: skip
-    if observation.swing and study.stare.thermal is None:
-        swing = [(t, value) for t, value in observation.swing if t < orbit_s]
+    swing = [(t, value) for t, value in observation.swing if t < orbit_s]
+    if swing and study.stare.thermal is None:
         changes["thermal"] = Curve(points=tuple((n * orbit_s + t, value) for n in range(ORBITS) for t, value in swing))
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
@@ -311,7 +314,8 @@ def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
 #: Columns of the table of targets.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
-    Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f", detail=True),
+    Column("seen", "seen_h", "h", "time in which the target is seen, times the duty cycle", "seen (h)", ".0f",
+           detail=True),
     Column("hours", "", "h", "part of it that is observed", "observed (h)", ".0f"),
     Column("E50", lambda row: row.energy_at(0.5), "erg",
            "bolometric energy from which on half of the flares are recovered", "E50 (erg)", energy),
@@ -406,7 +410,8 @@ class PlanAnswer(Answer):
         best = max(with_rates, key=lambda target: target.recovered.expected if target.recovered else 0.0)
         assert best.recovered is not None
         ideal = "" if np.isnan(best.ideal) else f"; {two_digits(best.ideal)} {IF_KNOWN}"
-        most = f", the most of {len(self.planned)} targets" if len(self.planned) > 1 else ""
+        known = "targets" if len(with_rates) == len(self.planned) else "targets with known flare rates"
+        most = f", the most of {len(with_rates)} {known}" if len(with_rates) > 1 else ""
         return (
             f"{self.instrument_name} would recover {two_digits(best.recovered.expected)} flares of "
             f"{best.name} in {best.hours:.0f} h (95 % of campaigns: {best.recovered.low} to {best.recovered.high}"
@@ -427,6 +432,7 @@ class PlanAnswer(Answer):
         elements = f"{e.source}, epoch {e.epoch}; mean is a Sun-synchronous orbit through them"
         scale = f"{law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}"
         half_width = f"t_1/2 = {scale}, {law.scatter_dex:g} dex"
+        maehara = "; exponent of Maehara et al. 2015" if law.exponent == type(law)().exponent else ""
         light = ("blackbody of " if study.flare.is_blackbody else "") + study.flare.light().describe()
         alarms = f"{study.search.false_alarms:g} per {study.search.per} of exposure"
         return [
@@ -435,7 +441,7 @@ class PlanAnswer(Answer):
             ("orbit", orbit.resolved(self.seen.times), elements),
             ("throughput", study.observation.instrument, study.observation.load_instrument().notice),
             ("sky", "zodiacal light", "median over the days on which a target is seen; table of the MauveSim paper"),
-            ("duration of flares", half_width, "assumption; exponent of Maehara et al. 2015"),
+            ("duration of flares", half_width, f"assumption{maehara}"),
             ("shape of flares", study.search.shape, "every flare alike, no bursts"),
             ("light of flares", light,
              "assumption; energies are those of all its light, emitted equally in all directions"),
@@ -463,9 +469,10 @@ class PlanAnswer(Answer):
     def _along_orbit(self) -> list[tuple[str, str, str]]:
         if not self.study.plan.along_orbit:
             return [("temperature and particles", "the study's", "the same for all targets")]
-        hits = self.study.processes.with_particles(0.0).particle_processes
+        hits, mean_c = self.study.processes.with_particles(0.0).particle_processes, self.study.observation.temperature_c
+        about = "" if mean_c is None else f", about the study's mean of {mean_c:g} deg C"
         return [
-            ("temperature", "along the orbit", THERMAL_SOURCE),
+            ("temperature", f"along the orbit{about}", THERMAL_SOURCE),
             ("hits by particles", "along the orbit", PARTICLES_SOURCE),
             *(process.assumption for process in hits),
         ]
@@ -493,6 +500,10 @@ class PlanAnswer(Answer):
         for case in self.observed:
             if case.neighbours is not None:
                 lines += case.neighbours.messages(case.label, case.instrument)
+        if no_sky := [target.name for target in self.planned if target.observation.sky is None and target.seen_h]:
+            lines.append(
+                f"The zodiacal light behind {', '.join(no_sky)} is unknown so near the Sun: the study's sky is used."
+            )
         lines += self._messages_on_rates
         slow = any(getattr(study.stare, name) for name in (*COURSES, "pointing"))
         if study.plan.completeness == "closed form" and (slow or study.nuisances.usual):

@@ -149,13 +149,14 @@ class VisibleAnswer(Answer):
     @property
     def headline(self) -> str:
         """The hours in which the first target is seen."""
-        row = self._row(0)
+        row, duty_cycle = self._row(0), self.visibility.limits.duty_cycle
         least = first_of(len(self.targets), "targets")
         if not row["hours"]:
             return f"{row['target']} is not seen in {self.times.days:g} days from {self.times.iso(0.0)[:10]}{least}."
+        exposed = "" if duty_cycle == 1 else f" and exposed for {row['hours']:.0f} h"
         return (
-            f"{row['target']} is seen for {row['hours']:.0f} h ({100 * row['share']:.1f} % of {self.times.days:g} days "
-            f"from {self.times.iso(0.0)[:10]}), most in {row['best_month']}{least}."
+            f"{row['target']} is seen for {row['hours'] / duty_cycle:.0f} h ({100 * row['share']:.1f} % of "
+            f"{self.times.days:g} days from {self.times.iso(0.0)[:10]}){exposed}, most in {row['best_month']}{least}."
         )
 
     @property
@@ -166,8 +167,7 @@ class VisibleAnswer(Answer):
     @cached_property
     def days(self) -> list[str]:
         """UTC days of the time grid, such as "2027-01-31"."""
-        first = np.datetime64(self.times.iso(0.0)[:10], "D")
-        count = int(np.floor(self.times.julian[1][-1])) + 1
+        first, count = self.times.first_day, int(self.times.julian[1][-1]) + 1
         return np.arange(first, first + np.timedelta64(count, "D")).astype(str).tolist()
 
     @cached_property
@@ -201,13 +201,14 @@ class VisibleAnswer(Answer):
         # The least and the largest value of no values is none.
         sky = sky[np.isfinite(sky)] if np.isfinite(sky).any() else sky[:1]
         length, end_s = windows.length_s, self.times.n * self.times.step_s
+        exposed, orbit_min = visibility.share[k] * visibility.limits.duty_cycle, visibility.orbit.elements.period_s / 60
         gaps_s = np.append(windows.start_s, end_s) - np.append(0.0, windows.stop_s)
         return {
             "target": target.name, "ra": target.ra_deg, "dec": target.dec_deg, "hours": visibility.hours[k],
             "share": visibility.share[k],
             **{f"leaves_{name}": shares[k] for name, shares in visibility.kept_by.items()},
             "windows": length.size, "median_window": float(np.median(length / 60)) if length.size else 0.0,
-            "longest_gap": float(np.max(gaps_s)) / DAY_S, "per_orbit": float(np.mean(visibility.by_orbit(k))),
+            "longest_gap": float(np.max(gaps_s)) / DAY_S, "per_orbit": float(exposed * orbit_min),
             "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
             "best_month": self.by_month[0][int(np.argmax(hours))] if hours.any() else "",
             "least_elongation": float(away.min()), "most_elongation": float(away.max()),
@@ -253,7 +254,7 @@ class VisibleAnswer(Answer):
         for k, target in enumerate(self.targets):
             windows, hours = self.windows[k], self.visibility.by_day(k)
             for a, b in zip(windows.start_s, windows.stop_s, strict=True) if single else ():
-                length = f"{(b - a) / 60:.0f} min of exposure"
+                length = f"{(b - a) / 60 * self.visibility.limits.duty_cycle:.0f} min of exposure"
                 entries.append((times.iso(float(a)), times.iso(float(b)), target.name, length))
             for first, last in true_runs(hours >= SEEN_H) if not single else ():
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"

@@ -70,6 +70,10 @@ class OrbitQuestion(Section):
                 parse_time(text, "start")
         return text
 
+    def _check_values(self) -> None:
+        if self.step_s > self.days * fields.DAY_S:
+            raise InputError.of("step_s", self.step_s, f"at most the {self.days:g} days that are looked at", unit="s")
+
     def orbit(self) -> Orbit:
         """Load the orbit."""
         from mauvecl.host.orbit.orbit import Orbit

@@ -53,6 +53,8 @@ def test_plan_numbers_are_consistent_and_missing_ones_are_told(answer: Any) -> N
         assert np.interp(np.log10(table["E50"][k].value), np.log10(energy), share) == pytest.approx(0.5, abs=1e-6)
         assert np.interp(np.log10(table["E90"][k].value), np.log10(energy), share) == pytest.approx(0.9, abs=1e-6)
         assert table["low"][k] < table["expected"][k] < table["high"][k]
+        days = answer.days[(answer.days["target"] == name) & (answer.days["hours"].value > 0)]
+        assert stars["sky"][k].value == pytest.approx(np.nanmedian(days["zodiacal_light"].value), abs=1e-9)
     assert table["false_alarms"].tolist() == pytest.approx((table["hours"].value / 24 / (365.25 / 12)).tolist())
     assert (table["hours"] <= table["seen"]).all()
     assert answer.seen.table["hours"].value == pytest.approx(table["seen"].value)
@@ -60,6 +62,7 @@ def test_plan_numbers_are_consistent_and_missing_ones_are_told(answer: Any) -> N
     assert "Flare rates of Denebola, of the type 'A3V', are unknown except for an exponent of 1.3" in reported
     assert "EK Dra is never seen" in reported
     assert "the hours of different targets may coincide" in reported
+    assert answer.headline.endswith(", the most of 3 targets with known flare rates.")
     assert np.isnan(table["expected"][2])
     assert np.isfinite(table["E50"][2].value)
     assert table["expected"][3] == 0
@@ -166,11 +169,24 @@ def test_conditions_equal_those_of_stares_along_the_orbit() -> None:
     assert seen["temperature"].value == pytest.approx(frames.temperature_c.mean(), abs=0.2)
     still = plan(study.with_settings(["plan.along_orbit=false", "observation.temperature_c=21"]))
     assert still.stars["temperature"][0].value == 21.0
-    assert still.stars["hits"][0].value == 0.0 < seen["hits"].value
+    # The limit of protons leaves little more than the cosmic rays.
+    assert still.stars["hits"][0].value == 0.0 < 1.0 < seen["hits"].value < 1.1
     hot = study.with_settings(["observation.temperature_c=21"])
     rays = hot.with_settings(["processes.cosmic_rays.electrons=[5000, 10000]"])
-    signals = [float(plan(one).stars["signal_per_frame"][0]) for one in (rays, hot)]
+    planned = [plan(one) for one in (rays, hot)]
+    signals = [float(one.stars["signal_per_frame"][0]) for one in planned]
     assert signals[0] < 0.9 * signals[1] < 0.9 * still.stars["signal_per_frame"][0] < 0.9 * seen["signal_per_frame"]
+    assert "about the study's mean of 21 deg C" in " ".join(planned[1].assumptions["value"])
+
+
+def test_target_near_the_sun_has_the_study_s_sky() -> None:
+    """The table has no zodiacal light there; a message says so, and that the law of durations is the user's."""
+    star = "{name='near', coordinates='0 0', magnitude=9, spectral_type='M3V', distance_pc=10}"
+    base = ["orbit.start=2027-03-21", "orbit.days=1", "orbit.limits.sun_deg='none'", "plan.exponent=0.5"]
+    answer = plan(paper(f"plan.targets=[{star}]", *base, "plan.completeness='closed form'"))
+    assert "behind near is unknown so near the Sun: the study's sky is used" in " ".join(answer.messages)
+    assert np.isnan(answer.stars["sky"][0].value)
+    assert not any("Maehara" in source for source in answer.assumptions["source"])
 
 
 def test_targets_and_rates_are_read_from_tables(tmp_path: Path) -> None:
@@ -239,11 +255,20 @@ def test_messages_and_calendar_beyond_the_elements() -> None:
 
 
 def test_calendar_near_the_epoch_has_windows() -> None:
-    answer = visible(paper("orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2"))
+    """Half of each window is exposed; the tables state which limits are the user's, and which are in force."""
+    limits = ["orbit.limits.duty_cycle=0.5", "orbit.limits.anomaly=[[0, 0], [1, 0], [1, 1]]"]
+    answer = visible(paper("orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2", *limits))
     events = icalendar.Calendar.from_ical(answer.documents["visible.ics"]()).walk("VEVENT")
     assert len(events) == answer.table["windows"][0] > 20
     first, windows = events[0], answer.windows[0]
     assert (first["DTEND"].dt - first["DTSTART"].dt).total_seconds() == windows.length_s[0]
+    assert str(first["DESCRIPTION"]) == f"{windows.length_s[0] / 120:.0f} min of exposure"
+    hours = windows.length_s.sum() / 3600
+    assert all(text in answer.headline for text in (f"seen for {hours:.0f} h (", f"exposed for {hours / 2:.0f} h"))
+    assert answer.table["per_orbit"][0].value == pytest.approx(hours / 2 * 60 / (2 * 1440 / 94.635), rel=1e-4)
+    sources = dict(answer.assumptions["limit", "source"].iterrows())
+    assert sources["duty_cycle"].startswith("set by the user; default 1: assumption: the whole")
+    assert ("proton_flux" in sources, sources["sun_deg"][:10]) == (False, "assumption")
     assert answer.messages == answer.messages[-1:]  # nothing of the orbit: its elements are a week old
 
 
@@ -252,3 +277,6 @@ def test_toml_dates_are_read() -> None:
     for text, found in starts.items():
         times = paper(f"orbit.start={text}").orbit.times()
         assert (times.iso(0.0), times.iso(0.5, 1)) == (f"2027-01-{found}:00:00", f"2027-01-{found}:00:00.5")
+    # Its days begin on the day of the start, even if that is less than half a second before midnight.
+    late = visible(paper("orbit.targets=['eps Eri']", "orbit.start=2026-12-31T23:59:59.7", "orbit.days=1"))
+    assert (late.days, late.months["month"].tolist()) == (["2026-12-31", "2027-01-01"], ["2027-01"])

@@ -11,6 +11,7 @@ import pytest
 from astropy.table import QTable
 from scenes import instrument, quiescent, source
 from scipy.special import erf
+from scipy.stats import norm
 
 from mauvecl import Expectation, Instrument, PixelMap, Sky, Source, expect
 
@@ -34,6 +35,7 @@ def test_rates_equal_the_published_ones() -> None:
 
 @pytest.mark.parametrize("signal", ["net", "paper"])
 def test_closed_form_signal_to_noise(signal: Any) -> None:
+    """Compare one pixel, and warn of frames that fall below zero, which closed forms neglect."""
     # One pixel by hand: 10 frames, noise added in quadrature; the paper counts the zodiacal light as signal.
     p, x = 900, expect(SUN, MAUVE, exposure=50, sky=22.1, signal=signal)
     assert ("paper signal" in kinds(x)) == (signal == "paper")
@@ -47,6 +49,12 @@ def test_closed_form_signal_to_noise(signal: Any) -> None:
     assert x.snr()[p] == pytest.approx(counted / noise, rel=1e-6)
     assert x.variance_dn2[p] == pytest.approx(noise**2 + 10 / 12, rel=1e-6)
     assert x.mean_raw_dn[p] == pytest.approx(light / 10 + 445.5337 * 5 + 600, rel=1e-6)
+    assert x.element_wavelength_nm[[0, -1]] == pytest.approx([205.25, 698.75])
+    low = expect(SUN, MAUVE.with_(bias_dn=20, dark_scale_dn_per_s=0, read_noise_dn=12), exposure=50, signal=signal)
+    sd = np.sqrt(low.variance_dn2 / 10)
+    near = norm.sf((low.mean_raw_dn + 0.5) / sd) > 1e-4
+    assert f"frames of {near.sum()} of 1643 pixels fall below 0 DN" in " ".join(low.messages)
+    assert (near.any(), near.all(), "below 0 DN" in " ".join(x.messages)) == (True, False, False)
 
 
 @pytest.mark.parametrize(("exposure", "frame_s", "frames", "rounded"), [
@@ -81,6 +89,9 @@ def test_saturation_is_the_first_message() -> None:
     assert safe == pytest.approx(x.longest_safe_frame_s, abs=1e-3)
     assert not expect(star, MAUVE.with_(frame_s=safe), exposure=1).saturated.any()
     assert expect(star, MAUVE.with_(frame_s=safe + 0.002), exposure=1).saturated.any()
+    bright = expect(source("B2IV", -9.0), MAUVE, exposure=1)
+    safe = float(bright.messages[0].split("longest safe frame is ")[1].split(" s")[0])
+    assert safe == pytest.approx(bright.longest_safe_frame_s, rel=0.01)
     assert (QUIET.saturated.any(), "saturated" in kinds(QUIET), QUIET.longest_safe_frame_s > 60) == (False, False, True)
 
 

@@ -16,7 +16,7 @@ from synphot.models import BlackBodyNorm1D
 from synphot.units import FLAM
 
 import mauvecl
-from mauvecl import Expectation, Source, Study, expect, simulate, snr, visible
+from mauvecl import Expectation, PixelMap, Source, Study, expect, simulate, snr, visible
 
 LIBRARY = Path(mauvecl.__file__).parent / "host" / "stars" / "library"
 KNOWN = Table.read(LIBRARY / "well_known.ecsv", format="ascii.ecsv")
@@ -122,10 +122,10 @@ ALONE = quiescent("G2V", 7.4)
 B, C, FAR = "B,12.5,6.9,K5V", "C,47.0,8.0,F5V", "D,47.47,1.0,A0V"
 
 
-def seen(folder: Path, *rows: str, share: float = 1.0) -> Expectation:
+def seen(folder: Path, *rows: str, share: float = 1.0, **changes: Any) -> Expectation:
     (folder / "near.csv").write_text("\n".join(("name,separation,V,sptype", *rows)) + "\n")
     star = {"library": "G2V", "magnitude": 7.4, "neighbours": str(folder / "near.csv"), "neighbour_share": share}
-    study = {"star": [star], "observation": {"exposure_s": 50.0}}
+    study = {"star": [star], "observation": {"exposure_s": 50.0, "changes": changes}}
     return simulate(Study.build(study, "test").paper()).inputs[0]
 
 
@@ -152,6 +152,10 @@ def test_light_and_noise_equal_those_of_the_summed_spectrum(tmp_path: Path, shar
 def test_light_of_neighbours_follows_from_magnitude_share_and_place(tmp_path: Path) -> None:
     x = seen(tmp_path, "twin,1.0,8.4,G2V", "faint,1.0,9.9,G2V", share=0.5)
     assert x.target_share == pytest.approx(1 / (1 + 0.5 * (10**-0.4 + 10**-1.0)), rel=1e-9)
+    # The light of a twin falls on the same uneven pixels.
+    PixelMap(response=np.linspace(0.5, 1.5, 2048)).write(tmp_path / "map.ecsv")
+    twin = seen(tmp_path, "twin,1.0,7.4,G2V", pixel_map=str(tmp_path / "map.ecsv"))
+    np.testing.assert_allclose(twin.neighbour_electrons, twin.source_electrons, rtol=1e-12)
     # A star beyond the fibre needs neither magnitude nor type.
     for x in (seen(tmp_path, FAR), seen(tmp_path, "x,50,,"), seen(tmp_path, B, share=0.0)):
         np.testing.assert_array_equal(x.variance_dn2, ALONE.variance_dn2)

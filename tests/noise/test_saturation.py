@@ -90,8 +90,9 @@ def test_snr_of_saturated_pixels_follows_simulation(engine: Engine) -> None:
         found = engine.snr(x, realisations=N, seed=3).pixel
         gap = np.abs(found["mean"] - found["expected"])
         assert np.all(gap < 5 * found["std"] / np.sqrt(N) + 0.02 * np.maximum(found["std"], 0.05))
-        budget = x.noise_budget()
-        np.testing.assert_allclose(x.signal_dn / budget["total"].value, x.snr(), rtol=1e-12)
+        _, *parts, total = (column.value for column in x.noise_budget().itercols())
+        np.testing.assert_allclose(x.signal_dn / total, x.snr(), rtol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(parts, axis=0), total, rtol=1e-9)
 
 
 def test_flare_that_saturates_every_pixel_gives_nan(engine: Engine) -> None:
@@ -121,7 +122,9 @@ def test_rare_saturation_is_reported_and_entire_saturation_refused() -> None:
     """Report the share of exposures even if no mean is saturated, and refuse with the longest safe frame."""
     payload = instrument(part=True, output_min_nm=290.0, output_max_nm=350.0)
     (rarely,), (never,), (quiet,) = (star(magnitude=m, payload=payload) for m in (-0.25, 3.0, -6.0))
+    reached = 1 - np.prod(1 - rarely.cut_share) ** rarely.n_frames
     assert rarely.messages[0].startswith("SATURATED at times: pixels of G2V ")
+    assert f" DN, and reach it in {100 * reached:.3g} % of exposures" in rarely.messages[0]
     assert not never.messages[0].startswith("SATURATED")
     with pytest.raises(InputError, match="frames of at most") as caught:
         Engine().detect(quiet, [quiet], realisations=1000)

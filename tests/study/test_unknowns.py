@@ -103,7 +103,7 @@ def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:
         "x": {"quantity": "magnitude", "values": [7.0, 10.5]},
         "y": {"quantity": "amplitude", "values": [0.1, 0.24]},
     }
-    asked = study({"draws": 4, "known": ALL[2:]}, map=axes)
+    asked = study({"draws": 4, "known": ALL[2:], "light_loss": {"uniform": [0.25, 0.25]}}, map=axes)
     found = detection_map(asked, engine)
     each = [detection_map(one, engine) for one in limit(asked, engine).limits[0].unknown.draws.studies]
     values = np.array([one.probability for one in each])
@@ -113,7 +113,9 @@ def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:
     half = np.hypot(reach, np.sqrt(np.sum(own**2, axis=0)) / 4)
     np.testing.assert_allclose(found.low, np.maximum(found.probability - half, 0.0))
     np.testing.assert_allclose(found.high, np.minimum(found.probability + half, 1.0))
+    # A prior of zero width explains nothing.
     assert set(found.shares["matched"]) == {*ALL[:2], "the rest"}
+    assert 0.0 <= found.shares["matched"]["light_loss"] < 1e-12
 
 
 def test_values_of_the_study_are_not_drawn(engine: Engine) -> None:
