@@ -218,6 +218,16 @@ def test_estimated_variances_are_predicted(engine: Engine) -> None:
     kind = {"read_noise_dn": 3.0, "dark_scale_dn_per_s": 0.0, "magnitude": 6.0}
     assert departed(engine, **kind, comparison=Comparison(0, True))["chi2"].why == "variances estimated from the counts"
     assert not departed(engine, **kind)["chi2"].differs
+    # From the raw counts of a few realisations, with means that are no whole DN and hardly any noise.
+    payload = instrument(part=True, read_noise_dn=0.6, dark_scale_dn_per_s=0.0)
+    quiet, flare = star(amplitudes=(0.3,), exposure=5.0, payload=payload)
+    x = engine.realise(quiet, count=40, seed=3) - quiet.recorded_dn
+    known = quiet.read_noise_dn**2 + quiet.dark_variance_dn2 + 1 / 12
+    variance = known + quiet.gain_dn_per_electron * np.maximum(x + quiet.recorded_light_dn, 0.0)
+    found = engine.statistic_values(quiet, [flare], count=40, seed=3, comparison=Comparison(0, True))
+    np.testing.assert_allclose(found[0], np.sum(x**2 / variance, axis=1), rtol=1e-5)
+    sums, noise = (np.array([quiet.per_element(row) for row in rows]) for rows in (x, variance))
+    np.testing.assert_allclose(found[1], np.sum(sums**2 / noise, axis=1), rtol=1e-5)
 
 
 def test_undrawn_unknowns_are_reported(engine: Engine) -> None:
