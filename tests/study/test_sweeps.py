@@ -112,9 +112,11 @@ def test_each_cell_equals_its_own_detection(engine: Engine) -> None:
 
 
 def test_limits_follow_the_sweep(engine: Engine) -> None:
-    """A colder detector and a longer exposure have fainter limits."""
+    """A colder detector and a longer exposure have fainter limits, and the first sentence has the first exposure."""
     axes = [{"quantity": "detector_temperature", "values": [13.0, 21.0]}, EXPOSURES]
-    table = mauvecl.limit(study(axes), engine).table
+    answer = mauvecl.limit(study(axes), engine)
+    assert " in 5 s with " in answer.headline
+    table = answer.table
     assert list(table["detector_temperature"].value) == [13, 13, 21, 21]
     value = table["magnitude"].value
     assert value[0] > value[2]
@@ -145,6 +147,10 @@ def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -
     assert abs(faint["snr_off_by"]) > 0.1
     assert faint["why"] == "clipping"
     assert faint["fap_ratio"] != 1.0
+    # Nothing is said of false alarms that are not counted.
+    rare = gaussian(study([]).with_settings(["run.fap=1e-6", "run.tails=sampled"]), engine)
+    assert np.isnan(rare.cells["fap_ratio"][0])
+    assert "as many" not in rare.headline
 
 
 @pytest.mark.parametrize("name", ["mauvesim", "mauve"])
