@@ -194,6 +194,17 @@ def test_chance_with_unknowns_is_that_of_their_study() -> None:
     assert f"with a chance of {chances[0]}, with the usual unknowns of {chances[1]}" in sentence
 
 
+def test_template_of_the_flare_itself_loses_nothing(engine: Engine) -> None:
+    """Draw ten times the scatter that the statistic assumes; another template loses its angle to the flare's."""
+    settings = ["processes.detector_temperature={normal=[21, 0.5], between=[18, 24]}", "flare.amplitudes=[3]"]
+    settings += ["run.template_temperatures_k=[10000, 8000]"]
+    for nuisances in ({}, {"dark": 0.05}):
+        answer = detect(study(**nuisances).with_settings(settings[not nuisances :]), engine)
+        kept = [float(found[1]) for text in answer.messages if (found := re.search(r"keeps (\S+) % of the", text))]
+        assert kept[0] == 100.0
+        assert 50.0 < kept[1] < 99.9
+
+
 def test_table_of_unknowns_holds_the_smallest_flare_with_the_power(tmp_path: Path) -> None:
     """Compare a row with METHODS section 7, and the power at the smallest amplitude with 90 %."""
     found = unknown_table(study())
