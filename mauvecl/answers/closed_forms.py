@@ -250,7 +250,8 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     x, y = draws.values[finite], outcome[finite]
     if len(y) <= x.shape[1] + 1 or y.std() == 0.0:
         return dict.fromkeys((*names, REST), float("nan"))
-    scaled = (x - x.mean(axis=0)) / x.std(axis=0)
+    # A prior may have a single value.
+    scaled = (x - x.mean(axis=0)) / np.where(np.ptp(x, axis=0) > 0, x.std(axis=0), 1.0)
 
     def explained_by(some: tuple[int, ...]) -> float:
         straight = np.column_stack([scaled[:, some], np.ones(len(y))])

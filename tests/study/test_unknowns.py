@@ -98,12 +98,12 @@ def test_shares_equal_those_of_a_linear_model(averaged: Any) -> None:
 
 
 def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:
-    """The interval holds the error of each draw and that of few draws, and is cut at 0 and 1."""
+    """The interval holds the error of each draw and of few draws, cut at 0 and 1; a constant has no share."""
     axes = {
         "x": {"quantity": "magnitude", "values": [7.0, 10.5]},
         "y": {"quantity": "amplitude", "values": [0.1, 0.24]},
     }
-    asked = study({"draws": 4, "known": ALL[2:]}, map=axes)
+    asked = study({"draws": 4, "known": ALL[2:], "temperature_c": {"uniform": [20.0, 20.0]}}, map=axes)
     found = detection_map(asked, engine)
     each = [detection_map(one, engine) for one in limit(asked, engine).limits[0].unknown.draws.studies]
     values = np.array([one.probability for one in each])
@@ -114,6 +114,7 @@ def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:
     np.testing.assert_allclose(found.low, np.maximum(found.probability - half, 0.0))
     np.testing.assert_allclose(found.high, np.minimum(found.probability + half, 1.0))
     assert set(found.shares["matched"]) == {*ALL[:2], "the rest"}
+    assert found.shares["matched"]["temperature_c"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_values_of_the_study_are_not_drawn(engine: Engine) -> None:
