@@ -130,12 +130,9 @@ class DetectAnswer(Answer):
         chances = np.asarray(rows["probability"])
         known = int(np.isfinite(chances).sum())
         if not known:
-            if np.isnan(rows["threshold"]).any():
-                fap = self.study.run.fap
-                return (
-                    f"The chance of these flares is undefined: no threshold has a false-alarm probability of {fap:g}."
-                )
-            return f"{self.instrument_name} would see none of these flares: every pixel saturates."
+            never = f"no threshold has a false-alarm probability of {self.study.run.fap:g}"
+            why = never if np.isnan(rows["threshold"]).any() else "every pixel saturates"
+            return f"{self.instrument_name} would see none of these flares: {why}."
         place = int(np.nanargmin(np.abs(chances - 0.5)))
         row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""

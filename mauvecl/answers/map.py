@@ -240,7 +240,7 @@ def magnitudes_of(case: Case) -> Axis:
 
 
 def _shown(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.3g}"
+    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 @dataclass(eq=False)
