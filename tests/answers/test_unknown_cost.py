@@ -123,6 +123,9 @@ def test_usual_unknowns_follow_the_observation(engine: Engine) -> None:
     assert known.detector_temperature is None
     found = asked.nuisances.marginalised(expectations(asked)[0])
     assert dict(zip(found.names, found.sd, strict=True)) == {"dark": 0.3, "light": np.inf, "sky": 0.1}
+    # A stated error takes the place of the drawn one, of half a degree, in the cost as well.
+    (sentence,) = of_kind(detect(study(usual=True, dark=0.003), engine).messages, "cost of unknowns")
+    assert float(re.search(r"it is (\S+) by the plain", sentence)[1]) > 1.0
     dark_sky = asked.with_changes({"sky": {"none": True}}, None)
     assert dark_sky.nuisances.marginalised(expectations(dark_sky)[0]).names == ("dark", "light")
 
