@@ -20,7 +20,7 @@ from mauvecl.detection.departures import DEPARTURE_COLUMNS, departure_table
 from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, ROC_COLUMNS, ROC_ROWS
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.nuisances import read_at_pixels
-from mauvecl.detection.requests import shift_between
+from mauvecl.detection.requests import matched_snr, shift_between
 from mauvecl.detection.statistics import Linear, Matched, Setting
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
@@ -280,7 +280,7 @@ def _statistic_lines(prepared: Sequence[Case], stars: Sequence[StarDetection]) -
     for case, star in zip(prepared, stars, strict=True):
         detection, light = star.detection, case.study.flare.light().describe()
         for kelvin in case.study.run.template_temperatures_k:
-            right, name = detection.matched_snr(0), f"matched {kelvin:g} K"
+            right, name = matched_snr(detection.setting, detection.flares[0]), f"matched {kelvin:g} K"
             share = shift_between(detection.closed_form(name), detection.closed_form(name, 0)) / right if right else 0.0
             text = f"keeps {100 * share:.1f} % of the matched statistic's S/N"
             lines.append(f"{star.label}: looking for a flare of {kelvin:g} K in one of {light} {text}.")

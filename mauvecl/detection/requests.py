@@ -128,7 +128,7 @@ class Hypotheses:
                 sentences.append(Message(
                     f"WRONG SIGN: {treatment}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
                     f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing of "
-                    f"the flare, which matched has at {self.matched_snr(k):.3g}.", "wrong sign",
+                    f"the flare, which matched has at {matched_snr(self.setting, self.flares[k]):.3g}.", "wrong sign",
                 ))  # fmt: skip
         return tuple(sentences)
 
@@ -137,11 +137,6 @@ class Hypotheses:
         if flare in self.blinding or not isinstance(self.statistic(statistic), LinearStatistic):
             return 0.0
         return fall_between(self.closed_form(statistic, template=flare), self.closed_form(statistic, flare))
-
-    def matched_snr(self, flare: int) -> float:
-        """Return the standard deviations by which a flare raises `matched`, which need not be requested."""
-        matched, expectation = Matched(), self.flares[flare]
-        return shift_between(*(matched.closed_form(self.setting, x, expectation) for x in (self.quiet, expectation)))
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
         """Return a statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
@@ -166,6 +161,11 @@ class Hypotheses:
 def shift_between(null: Form, flare: Form) -> float:
     """Return the change of a statistic's mean by a flare, in standard deviations without it."""
     return (flare.mean - null.mean) / null.std
+
+
+def matched_snr(setting: Setting, flare: Expectation) -> float:
+    """Return the change of the mean of `matched` by a flare, in standard deviations without it."""
+    return shift_between(*(Matched().closed_form(setting, x, flare) for x in (setting.quiet, flare)))
 
 
 def fall_between(null: Form, flare: Form) -> float:

@@ -11,7 +11,6 @@ from scenes import paper, study_of_g2v
 
 import mauvecl
 from mauvecl import Engine, Study, exposure_for, shortest_exposure
-from mauvecl.detection.distributions import Interval
 
 STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
 
@@ -71,7 +70,7 @@ def test_limit_inverts_detect(engine: Engine) -> None:
     # An interval of the second simulation, and the verdicts for a limit that is no exposure, and for one that is.
     for p, verdicts in (((0.8, 0.91), ["confirms it"] * 2), ((0.905, 0.91), ["misses it narrowly", "exceeds it"]),
                         ((0.8, 0.81), ["DIFFERS"] * 2)):  # fmt: skip
-        check = replace(shortest.check, probability=Interval(p[0], *p))
+        check = replace(shortest.check, probability=replace(shortest.value, low=p[0], high=p[1]))
         assert [replace(x, check=check).verdict for x in (limit, shortest)] == verdicts
 
 
