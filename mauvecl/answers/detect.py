@@ -20,6 +20,7 @@ from mauvecl.detection.departures import DEPARTURE_COLUMNS, departure_table
 from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, ROC_COLUMNS, ROC_ROWS
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.nuisances import read_at_pixels
+from mauvecl.detection.requests import matched_snr, shift_between
 from mauvecl.detection.statistics import Linear, Matched, Setting
 from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
@@ -127,12 +128,15 @@ class DetectAnswer(Answer):
         statistic = RECOMMENDED if RECOMMENDED in statistics else statistics[0]
         rows = self.table[self.table["statistic"] == statistic]
         chances = np.asarray(rows["probability"])
-        if not np.isfinite(chances).any():
-            return f"{self.instrument_name} would see none of these flares: every pixel saturates."
+        known = int(np.isfinite(chances).sum())
+        if not known:
+            never = f"no threshold has a false-alarm probability of {self.study.run.fap:g}"
+            why = never if np.isnan(rows["threshold"]).any() else "every pixel saturates"
+            return f"{self.instrument_name} would see none of these flares: {why}."
         place = int(np.nanargmin(np.abs(chances - 0.5)))
         row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
-        least = f", the least certain of {len(rows)} flares" if len(rows) > 1 else ""
+        least = f", the least certain of {known} flares" if known > 1 else ""
         chance = f"{chance_text(row['probability'])} ({chance_range(row['low'], row['high'])}{ideal})"
         sentence = chance_of_flare(self.study, star.title, row["amplitude"], star.detection.quiet, chance)
         return f"{sentence}{least}."
@@ -276,9 +280,8 @@ def _statistic_lines(prepared: Sequence[Case], stars: Sequence[StarDetection]) -
     for case, star in zip(prepared, stars, strict=True):
         detection, light = star.detection, case.study.flare.light().describe()
         for kelvin in case.study.run.template_temperatures_k:
-            right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
-            name = f"matched {kelvin:g} K"
-            share = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
+            right, name = matched_snr(detection.setting, detection.flares[0]), f"matched {kelvin:g} K"
+            share = shift_between(detection.closed_form(name), detection.closed_form(name, 0)) / right if right else 0.0
             text = f"keeps {100 * share:.1f} % of the matched statistic's S/N"
             lines.append(f"{star.label}: looking for a flare of {kelvin:g} K in one of {light} {text}.")
         for k in range(len(star.amplitudes) if "paper" in detection.statistics else 0):
@@ -307,15 +310,16 @@ def _campaign(case: Case) -> list[str]:
         return f"{before} with the overlap of its stacks {interval.value:.3g} {ends}{after}"
 
     lines, tests = list[str](), many.tests
+    frames, count = (f"{n} {word}{'s'[: n != 1]}" for n, word in ((question.frames, "frame"), (tests, "test")))
     lines.append(
-        f"A campaign of {question.frames} frames makes {tests} tests: at {run.fap:g} per test {tests * run.fap:.3g} "
+        f"A campaign of {frames} makes {count}: at {run.fap:g} per test {tests * run.fap:.3g} "
         f"false alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
         f"{many.bound:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
     )
     if question.fap is not None:
         rate = per_test(question.fap, question.frames, stack, step=question.step, seed=run.seed)
         lines.append(
-            f"For a chance of {question.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
+            f"For a chance of {question.fap:g} of any false alarm in the campaign each of its {count} may have "
             f"{rate.independent:.4g} if they are independent, {rate.bound:.4g} in any case"
             f"{overlap(rate.overlapping, ', and')}: `fap={rate.bound:.4g}`."
         )
@@ -324,7 +328,7 @@ def _campaign(case: Case) -> list[str]:
             raise InputError.of("campaign.alarms", question.alarms, f"fewer than the {tests} tests")
         alarms = "false alarm" if question.alarms == 1 else "false alarms"
         lines.append(
-            f"For {question.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "
+            f"For {question.alarms:g} {alarms} expected in the campaign each of its {count} may have "
             f"{question.alarms / tests:.4g} for any dependence between them: `fap={question.alarms / tests:.4g}`."
         )
     return lines

@@ -61,8 +61,8 @@ WORST_COLUMNS = (
            others=("five_sigma_below",), detail=True),
     Column("five_sigma_below",
            description="how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least"),
-    Column("fap_ratio", description="most wrong false-alarm probability over the promised one; 1 if none differs",
-           heading="false alarms", format=".3f"),
+    Column("fap_ratio", description="most wrong false-alarm probability over the promised one; 1 if none differs, NaN "
+           "if they are too rare to be counted", heading="false alarms", format=number(".3f")),
     Column("statistic", description="detection statistic", heading="statistic", detail=True),
     Column("why", description="main cause of a difference from the closed form", heading="why", detail=True),
     Column("probability_off_by", "", "", "largest significant difference of a detection probability from the closed "
@@ -164,9 +164,10 @@ class GaussianAnswer(Answer):
         cells = self.cells
         snr = float(np.abs(cells["snr_off_by"]).max())
         worst = float(cells["fap_ratio"][_most_wrong(cells["fap_ratio"])])
+        many = f"{'as many' if worst == 1.0 else f'up to {worst:.3g} times as many'} as promised"
         return (
             f"The root-of-N formula is {f'off by at most {snr:.2g}' if snr else 'right'} in S/N, and its false alarms "
-            f"are {'as many' if worst == 1.0 else f'up to {worst:.3g} times as many'} as promised, in {len(cells)} "
+            f"are {'too rare to be counted' if np.isnan(worst) else many}, in {len(cells)} "
             f"case{'' if len(cells) == 1 else 's'}."
         )
 
@@ -190,7 +191,8 @@ class GaussianAnswer(Answer):
             sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
             worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
             off = tested[tested["differs"]]
-            wrong: Any = off[_most_wrong(off["ratio"])] if len(off) else {"ratio": 1.0, "statistic": "", "why": ""}
+            right = {"ratio": 1.0 if len(tested) else np.nan, "statistic": "", "why": ""}
+            wrong: Any = off[_most_wrong(off["ratio"])] if len(off) else right
             missed = flares["probability"] - flares["closed_form_probability"]
             # The interval includes the error of the threshold.
             is_sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL

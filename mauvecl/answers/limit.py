@@ -493,7 +493,7 @@ class LimitAnswer(Answer):
         limit = next((limit for limit in self.limits if limit.statistic == RECOMMENDED), self.limits[0])
         before, number = SPOKEN[question.of]
         flare = "flares" if question.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
-        within = "" if question.of == "exposure" else f" in {self.study.observation.exposure_s:g} s"
+        within = "" if question.of == "exposure" else f" in {limit.quiet.exposure_s:g} s"
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
         least = first_of(len(self.limits), "limits")
         return (

@@ -171,6 +171,8 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
     study, run, number_of_cells, messages = case.study, case.study.run, len(cells.x) * len(cells.y), list[str]()
     probability, _, _, closed_form, _ = values
     lost = np.isnan(closed_form[0])
+    for i, j in (cell for missing in cells.failed.values() for cell in missing):
+        lost[j, i] = False
     if lost.any():
         text = f"SATURATED: every pixel that counts saturates in {lost.sum()} of {lost.size} cells: no number there."
         messages.append(Message(text, SATURATED))
@@ -182,8 +184,8 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
                 f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
                 "number there; `mauvecl detect` names the probabilities that thresholds have.", "no threshold",
             ))  # fmt: skip
-    for why, number in cells.failed.items():
-        messages.append(Message(f"NO ANSWER in {number} of {number_of_cells} cells: {why}.", "no answer"))
+    for why, there in cells.failed.items():
+        messages.append(Message(f"NO ANSWER in {len(there)} of {number_of_cells} cells: {why}.", "no answer"))
     marginalised = "" if study.nuisances.none else "marginalised over unknowns, "
     lowered = Counter(statistic for statistic, *_ in cells.lowered)
     for statistic in (name for name in run.statistics if lowered[name]):
@@ -238,7 +240,7 @@ def magnitudes_of(case: Case) -> Axis:
 
 
 def _shown(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.3g}"
+    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 @dataclass(eq=False)
@@ -254,7 +256,8 @@ class MapCells:
     saturated: list[str] = field(default_factory=list)  # messages on flares that saturate
     # Weighted sums that flares lower: the statistic and the indices of the cell.
     lowered: set[tuple[str, int, int]] = field(default_factory=set)
-    failed: Counter[str] = field(default_factory=Counter)  # number of cells without an answer by the reason
+    # Indices of the cells without an answer by the reason; several draws of unknown values may lack that of one cell.
+    failed: defaultdict[str, set[tuple[int, int]]] = field(default_factory=lambda: defaultdict(set))
 
     def map_of(self, case: Case) -> Float:
         """Compute the map on the instrument of a case, shape (n_number, n_statistic, n_y, n_x)."""
@@ -268,8 +271,8 @@ class MapCells:
                     self._fill(values, cells, group[0], flares)
                 except InputError as error:
                     # Too few pixels may be left in some cells; the others have an answer.
-                    self.failed[str(error)] += len(cells)
-                    if self.failed[str(error)] == len(self.x) * len(self.y):
+                    self.failed[str(error)].update(cells)
+                    if len(self.failed[str(error)]) == len(self.x) * len(self.y):
                         raise
             return quiet, len(cells), of_kind(collect_messages(flares), SATURATED)
 

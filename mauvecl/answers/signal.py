@@ -321,9 +321,11 @@ class SnrAnswer(Answer):
 
     @property
     def shown_nm(self) -> list[float]:
-        """The requested wavelength, or those of `SHOWN_NM` within the spectrum."""
-        wavelength_nm, (first, last) = self.study.signal.wavelength_nm, self.inputs[0].wavelength_nm[[0, -1]]
-        return [nm for nm in SHOWN_NM if first <= nm <= last] if wavelength_nm is None else [wavelength_nm]
+        """The requested wavelength, those of `SHOWN_NM` within the spectrum, or its middle if it has none of them."""
+        wavelength_nm, (first, last) = self.study.signal.wavelength_nm, self.inputs[0].wavelength_nm[[0, -1]].tolist()
+        if wavelength_nm is not None:
+            return [wavelength_nm]
+        return [nm for nm in SHOWN_NM if first <= nm <= last] or [(first + last) / 2]
 
     def places(self, star: StarSnr, per: Per) -> list[int]:
         """Return the indices of the pixels or elements of a star at the shown wavelengths."""

@@ -14,6 +14,7 @@ from scipy.linalg import orth, solve_triangular
 from mauvecl.detection.distributions import QuadraticForm
 from mauvecl.detection.statistics import Differences, Setting, Statistic
 from mauvecl.host.arrays import Float
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -33,6 +34,15 @@ class Chi2(Statistic):
 
     def dof(self, setting: Setting) -> int:
         return int(setting.used.sum()) - setting.n_free
+
+    def check(self, setting: Setting) -> None:
+        super().check(setting)
+        if (dof := self.dof(setting)) < 1:
+            raise InputError(
+                f"statistic {self.name!r} has no degrees of freedom: {setting.n_free} free unknowns describe all "
+                f"{dof + setting.n_free} sums; use fewer unknowns or standard deviations instead of 'free'",
+                key="statistic",
+            )
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
         true, scatter = seen.variance * setting.used, seen.scatter

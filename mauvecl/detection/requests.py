@@ -123,13 +123,12 @@ class Hypotheses:
     def lowered(self) -> tuple[Message, ...]:
         """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
         sentences, treatment = [], "marginalised over unknowns, " if self.nuisances else ""
-        for name, (k, flare) in product(self.statistics, enumerate(self.flares)):
+        for name, k in product(self.statistics, range(len(self.flares))):
             if falls := self.fall(name, k):
-                matched = Matched().closed_form(self.setting, flare, flare)
                 sentences.append(Message(
                     f"WRONG SIGN: {treatment}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
                     f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing of "
-                    f"the flare, which matched has at {matched.mean / matched.std:.3g}.", "wrong sign",
+                    f"the flare, which matched has at {matched_snr(self.setting, self.flares[k]):.3g}.", "wrong sign",
                 ))  # fmt: skip
         return tuple(sentences)
 
@@ -159,9 +158,19 @@ class Hypotheses:
             raise InputError.of("flare", flare, f"between 0 and {len(self.flares) - 1}")
 
 
+def shift_between(null: Form, flare: Form) -> float:
+    """Return the change of a statistic's mean by a flare, in standard deviations without it."""
+    return (flare.mean - null.mean) / null.std
+
+
+def matched_snr(setting: Setting, flare: Expectation) -> float:
+    """Return the change of the mean of `matched` by a flare, in standard deviations without it."""
+    return shift_between(*(Matched().closed_form(setting, x, flare) for x in (setting.quiet, flare)))
+
+
 def fall_between(null: Form, flare: Form) -> float:
     """Return the standard deviations by which a flare lowers the mean of a statistic, or 0 if it does not."""
-    shift = (flare.mean - null.mean) / null.std
+    shift = shift_between(null, flare)
     # Less than a thousandth is rounding.
     return -shift if shift < -1e-3 else 0.0
 

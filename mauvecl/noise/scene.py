@@ -273,9 +273,10 @@ class Scene:
     ) -> NDArray[np.float32]:
         """Compute what the reference's fractions of a DN add to chi-squared and to each linear statistic.
 
-        Sums of resolution elements include them already. The shape is (n_scenario + n_linear,).
+        Sums of resolution elements include them already, as does every pixel that is divided by an estimated variance.
+        The shape is (n_scenario + n_linear,).
         """
-        chi2 = np.sum(self.levels["inverse_variance"] * self.fraction**2, axis=1)
+        chi2 = np.sum(self.levels["inverse_variance"] * self.fraction**2, axis=1) * (not self.comparison.estimated)
         scenario = np.searchsorted(linear_end, np.arange(len(weights)), side="right")
         linear = [float(weights[i] @ self.fraction[k]) if i < pixels_end[k] else 0.0 for i, k in enumerate(scenario)]
         return np.array([*chi2, *linear], np.float32)

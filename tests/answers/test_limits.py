@@ -1,6 +1,7 @@
 """Limits, maps and exposures have the requested power or S/N, by theory and by simulation, and are monotone."""
 
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,11 @@ def test_limit_inverts_detect(engine: Engine) -> None:
     assert shortest.value.value % 5 == 0
     assert abs(shortest.value.value - 50) <= 5
     assert shortest.value.low <= shortest.value.value <= shortest.value.high
+    # An interval of the second simulation, and the verdicts for a limit that is no exposure, and for one that is.
+    for p, verdicts in (((0.8, 0.91), ["confirms it"] * 2), ((0.905, 0.91), ["misses it narrowly", "exceeds it"]),
+                        ((0.8, 0.81), ["DIFFERS"] * 2)):  # fmt: skip
+        check = replace(shortest.check, probability=replace(shortest.value, low=p[0], high=p[1]))
+        assert [replace(x, check=check).verdict for x in (limit, shortest)] == verdicts
 
 
 @pytest.mark.parametrize(("verb", "faint", "kind"), [("limit", 25.0, "no limit"), ("exposure", 28.0, "no answer")])
@@ -119,6 +125,7 @@ def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, 
     chances = found.closed_form[found.statistics.index("matched")]
     assert chances[1, -1] < 0.1 < chances[1, -2]
     assert found.x == found.study.map.axes[0].points()
+    assert [float(column.heading) for column in found.views[0].columns[1:]] == list(found.x)
     assert not found.inputs[0].saturated.any()
     assert not np.isnan(found.probability).any()
     if star == "G2V":
@@ -147,6 +154,7 @@ def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) ->
         alone = engine.detect(quiet, [flare], realisations=20_000, seed=9, statistics=found.statistics)
         expected = [alone.detection_probability(1e-2, statistic)[0].value for statistic in found.statistics]
         assert list(found.probability[:, j, i]) == expected
+        np.testing.assert_allclose(found.closed_form[:, j, i], alone.table(1e-2)["closed_form_probability"])
     assert (found.low <= found.probability).all()
     assert (found.probability <= found.high).all()
 

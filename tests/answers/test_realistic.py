@@ -75,6 +75,10 @@ def test_headline_has_the_numbers_of_the_table(engine: Engine) -> None:
     wanted = [100 * row[name] for name in ("probability", "low", "high", "ideal")]
     assert shown == pytest.approx([min(value, 99.99) for value in wanted], abs=0.051)
     assert answer.headline.endswith("the least certain of 2 flares.")
+    # Of several stars, the name is that of the flare.
+    stars = detect(ASKED.with_settings(["sweep.axes=[{quantity='magnitude', values=[5, 9]}]"]), engine)
+    row = min(stars.table, key=lambda one: abs(one["probability"] - 0.5))
+    assert f"a flare of {100 * row['amplitude']:g} % on {row['star']} in" in stars.headline
     found = limit(ASKED, engine)
     numbers = [f"{found.table[name].value[0]:.2f}" for name in ("magnitude", "low", "high", "ideal")]
     assert re.findall(r"\d+\.\d\d", found.headline) == numbers

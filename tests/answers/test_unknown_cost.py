@@ -123,6 +123,9 @@ def test_usual_unknowns_follow_the_observation(engine: Engine) -> None:
     assert known.detector_temperature is None
     found = asked.nuisances.marginalised(expectations(asked)[0])
     assert dict(zip(found.names, found.sd, strict=True)) == {"dark": 0.3, "light": np.inf, "sky": 0.1}
+    # A stated error takes the place of the drawn one, of half a degree, in the cost as well.
+    (sentence,) = of_kind(detect(study(usual=True, dark=0.003), engine).messages, "cost of unknowns")
+    assert float(re.search(r"it is (\S+) by the plain", sentence)[1]) > 1.0
     dark_sky = asked.with_changes({"sky": {"none": True}}, None)
     assert dark_sky.nuisances.marginalised(expectations(dark_sky)[0]).names == ("dark", "light")
 
@@ -192,6 +195,17 @@ def test_chance_with_unknowns_is_that_of_their_study() -> None:
     (sentence,) = sentences
     assert "flare of 2 %" in sentence
     assert f"with a chance of {chances[0]}, with the usual unknowns of {chances[1]}" in sentence
+
+
+def test_template_of_the_flare_itself_loses_nothing(engine: Engine) -> None:
+    """Draw ten times the scatter that the statistic assumes; another template loses its angle to the flare's."""
+    settings = ["processes.detector_temperature={normal=[21, 0.5], between=[18, 24]}", "flare.amplitudes=[3]"]
+    settings += ["run.template_temperatures_k=[10000, 8000]"]
+    for nuisances in ({}, {"dark": 0.05}):
+        answer = detect(study(**nuisances).with_settings(settings[not nuisances :]), engine)
+        kept = [float(found[1]) for text in answer.messages if (found := re.search(r"keeps (\S+) % of the", text))]
+        assert kept[0] == 100.0
+        assert 50.0 < kept[1] < 99.9
 
 
 def test_table_of_unknowns_holds_the_smallest_flare_with_the_power(tmp_path: Path) -> None:

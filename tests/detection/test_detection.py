@@ -189,17 +189,24 @@ def test_nominal_payload_is_gaussian(engine: Engine) -> None:
 
 def test_skew_is_predicted(engine: Engine) -> None:
     """Predict Poisson's tail for few dark counts and little read noise, to a fifth of its effect."""
-    d = departed(engine, read_noise_dn=1.0, dark_scale_dn_per_s=0.2, magnitude=14.0)["chi2"]
+    kind = {"read_noise_dn": 1.0, "dark_scale_dn_per_s": 0.2, "magnitude": 14.0}
+    # The difference of two exposures is symmetric.
+    symmetric = departed(engine, **kind, comparison=Comparison(1))
+    assert symmetric["chi2"].ratio - 1 == pytest.approx(symmetric["chi2"].skew, abs=4 * symmetric["chi2"].error)
+    assert abs(symmetric["uv_excess"].skew) < 0.01
+    d = departed(engine, **kind)["chi2"]
     assert d.why == "skew of the noise"
     assert d.ratio - 1 == pytest.approx(d.skew, rel=0.2, abs=4 * d.error)
     assert d.skew > 0.3
 
 
 def test_clipping_is_predicted(engine: Engine) -> None:
-    """Predict the effect of clipping at zero, for a bias of 5 DN and a read noise of 12 DN."""
-    rows = departed(engine, bias_dn=5.0, dark_scale_dn_per_s=0.0, magnitude=12.0)
-    assert {d.why for d in rows.values()} == {"clipping"}
-    assert rows["uv_excess"].ratio - 1 == pytest.approx(rows["uv_excess"].clipping, rel=0.05)
+    """Predict the effect of clipping at zero, for a bias of 5 DN and a read noise of 12 DN; two exposures share it."""
+    for exposures in (1, 0):
+        compared = Comparison(exposures)
+        rows = departed(engine, bias_dn=5.0, dark_scale_dn_per_s=0.0, magnitude=12.0, comparison=compared)
+        assert {d.why for d in rows.values()} == {"clipping"}
+        assert rows["uv_excess"].ratio - 1 == pytest.approx(rows["uv_excess"].clipping, rel=0.05)
     assert rows["chi2"].ratio < 0.1
     assert rows["chi2"].clipping < -0.9
 
@@ -218,6 +225,16 @@ def test_estimated_variances_are_predicted(engine: Engine) -> None:
     kind = {"read_noise_dn": 3.0, "dark_scale_dn_per_s": 0.0, "magnitude": 6.0}
     assert departed(engine, **kind, comparison=Comparison(0, True))["chi2"].why == "variances estimated from the counts"
     assert not departed(engine, **kind)["chi2"].differs
+    # From the raw counts of a few realisations, with means that are no whole DN and hardly any noise.
+    payload = instrument(part=True, read_noise_dn=0.6, dark_scale_dn_per_s=0.0)
+    quiet, flare = star(amplitudes=(0.3,), exposure=5.0, payload=payload)
+    x = engine.realise(quiet, count=40, seed=3) - quiet.recorded_dn
+    known = quiet.read_noise_dn**2 + quiet.dark_variance_dn2 + 1 / 12
+    variance = known + quiet.gain_dn_per_electron * np.maximum(x + quiet.recorded_light_dn, 0.0)
+    found = engine.statistic_values(quiet, [flare], count=40, seed=3, comparison=Comparison(0, True))
+    np.testing.assert_allclose(found[0], np.sum(x**2 / variance, axis=1), rtol=1e-5)
+    sums, noise = (np.array([quiet.per_element(row) for row in rows]) for rows in (x, variance))
+    np.testing.assert_allclose(found[1], np.sum(sums**2 / noise, axis=1), rtol=1e-5)
 
 
 def test_undrawn_unknowns_are_reported(engine: Engine) -> None:
@@ -333,6 +350,11 @@ def test_many_flares_share_table_rows(engine: Engine) -> None:
     answer = detect(study, engine)
     # chi2 has a null and sixty flares, matched a null for each of its sixty; rows are shared among 2 x (60 + 60).
     assert len(answer.tails) == 100_000 // 240 * (61 + 120)
+    nulls = answer.tails[(answer.tails["statistic"] == "matched") & (answer.tails["amplitude"] == 0.0)]
+    for k in (0, 59):
+        kept = nulls["value"][nulls["template"] == amplitudes[k]]
+        own = answer.stars[0].detection.tail_samples("matched", template=k)
+        np.testing.assert_array_equal(kept, own["value"][: len(kept)])
     assert len(answer.roc) <= 100_000
     assert set(answer.roc["amplitude"]) == set(amplitudes)
     for rows in answer.roc.group_by(["statistic", "amplitude"]).groups:

@@ -224,6 +224,7 @@ def test_answers_report_missing_thresholds(engine: Engine) -> None:
     magnitude = float(optimize.brentq(faintest, -5.0, 10.0)) + 0.001
     answer = detect(study(magnitude), engine)
     assert np.isnan(answer.table["probability"]).all()
+    assert "saturates" not in answer.headline
     assert of_kind(answer.messages, "no threshold")
     axes = {"x": {"quantity": "magnitude", "values": [magnitude, magnitude + 3.0]},
             "y": {"quantity": "amplitude", "values": [1e-5, 2e-5]}}  # fmt: skip
@@ -233,12 +234,25 @@ def test_answers_report_missing_thresholds(engine: Engine) -> None:
     assert "2 of 4" in message
 
 
+def test_cell_whose_threshold_cannot_be_sampled_does_not_saturate(engine: Engine) -> None:
+    """Near saturation frames are drawn one by one, with both draws of unknown values in the same one of two cells."""
+    axes = {"x": {"quantity": "magnitude", "values": [-0.5, 7.0]}, "y": {"quantity": "amplitude", "values": [0.1]}}
+    run = {"realisations": 1000, "fap": 1e-4, "tails": "sampled"}
+    part = {"changes": {"output_min_nm": 270.0, "output_max_nm": 400.0}, "exposure_s": 10.0}
+    asked = study_of_g2v(map=axes, run=run, observation=part, unknowns={"draws": 2, "known": ["qe_scale"]})
+    found = detection_map(asked.paper(), engine)
+    np.testing.assert_array_equal(np.isnan(found.probability[0]), [[True, False]])
+    (message,) = of_kind(found.messages, "no answer")
+    assert "1 of 2" in message
+    assert not any("every pixel" in text for text in found.messages)
+
+
 NUMBER = r"([\d.e+-]*\d)"
 ENDS = rf"(?:.* overlap of its stacks {NUMBER} \[{NUMBER}, {NUMBER}\])?"
 #: Tests, probability of one, expected alarms, chance if independent and at most, and with overlap with its interval.
-MANY = rf"makes {NUMBER} tests: at {NUMBER} per test {NUMBER} .* is {NUMBER} if .* at most {NUMBER}{ENDS}"
+MANY = rf"makes {NUMBER} tests?: at {NUMBER} per test {NUMBER} .* is {NUMBER} if .* at most {NUMBER}{ENDS}"
 #: Wanted chance, tests, probability of one if independent and in any case, and with overlap with its interval.
-ONE = rf"chance of {NUMBER} .* its {NUMBER} tests may have {NUMBER} if .*?, {NUMBER} in any case{ENDS}"
+ONE = rf"chance of {NUMBER} .* its {NUMBER} tests? may have {NUMBER} if .*?, {NUMBER} in any case{ENDS}"
 
 
 def said(

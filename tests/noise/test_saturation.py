@@ -8,7 +8,7 @@ from marks import long_but
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl import CosmicRays, Engine, Expectation, InputError, Normal, Processes
+from mauvecl import CosmicRays, Engine, Expectation, InputError, Normal, Processes, Uniform
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 
@@ -67,8 +67,10 @@ def test_clipped_counts_equal_reference(engine: Engine) -> None:
         scene = prepare([x], mode="frames")
         np.testing.assert_array_equal(raw, reference.realise(scene, index, 9))
         np.testing.assert_array_equal(cut, reference.clipped(scene, index, 9).sum(axis=(1, 2)))
-        counts = engine.snr(x, realisations=N, seed=9, mode="frames").counts.clipped[:, 1]
-        trials = N * x.n_frames
+        found, trials = engine.snr(x, realisations=N, seed=9, mode="frames"), N * x.n_frames
+        counts = found.counts.clipped[:, 1]
+        np.testing.assert_allclose(found.pixel["clipped_high"], counts / trials)
+        assert not found.pixel["clipped_low"].any()
         spread = np.sqrt(trials * x.cut_share * (1 - x.cut_share)) + 1
         assert np.abs(counts - trials * x.cut_share).max() < 5 * spread.max()
 
@@ -80,6 +82,12 @@ def test_priors_that_reach_saturation_are_drawn_frame_by_frame(engine: Engine) -
     assert not prepare([stack]).frames
     brighter = Processes(qe_scale=Normal(1.5, 0.5, 0.5, 4.0))
     assert prepare([stack], processes=brighter).frames
+    # Neither of two priors reaches saturation alone; a single hit does.
+    together: dict[str, Uniform] = {"light_loss": Uniform(0.1, 0.34), "qe_scale": Uniform(0.9, 1.5)}
+    for names in (("light_loss",), ("qe_scale",), tuple(together)):
+        drawn = Processes(**{name: together[name] for name in names})
+        assert prepare([stack], processes=drawn).frames == (len(names) == 2)
+    assert prepare([stack], processes=Processes(cosmic_rays=CosmicRays(electrons=(9e4, 9e4)))).frames
     assert engine.realise(stack, count=2000, seed=2, processes=brighter).max() == 4 * 59_578
 
 

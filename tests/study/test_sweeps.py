@@ -112,9 +112,11 @@ def test_each_cell_equals_its_own_detection(engine: Engine) -> None:
 
 
 def test_limits_follow_the_sweep(engine: Engine) -> None:
-    """A colder detector and a longer exposure have fainter limits."""
+    """A colder detector and a longer exposure have fainter limits, and the first sentence has the first exposure."""
     axes = [{"quantity": "detector_temperature", "values": [13.0, 21.0]}, EXPOSURES]
-    table = mauvecl.limit(study(axes), engine).table
+    answer = mauvecl.limit(study(axes), engine)
+    assert " in 5 s with " in answer.headline
+    table = answer.table
     assert list(table["detector_temperature"].value) == [13, 13, 21, 21]
     value = table["magnitude"].value
     assert value[0] > value[2]
@@ -140,11 +142,19 @@ def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -
     first = (elements["magnitude"].value == 6) & (elements["exposure"].value == 5)
     count = quiet.per_element(np.ones(quiet.wavelength_nm.size))
     np.testing.assert_allclose(elements[first]["coverage"].value, quiet.per_element(direct) / count, atol=0.003)
-    clipped = gaussian(asked.with_instrument({"bias_dn": 5.0, "dark_scale_dn_per_s": 0.01}), engine).cells
+    low = gaussian(asked.with_instrument({"bias_dn": 5.0, "dark_scale_dn_per_s": 0.01}), engine)
+    # Counts are cut off at zero, not at saturation.
+    assert not any("saturation" in text for text in low.signal.messages)
+    clipped = low.cells
     (faint,) = clipped[(clipped["magnitude"].value == 9) & (clipped["exposure"].value == 5)]
     assert abs(faint["snr_off_by"]) > 0.1
     assert faint["why"] == "clipping"
     assert faint["fap_ratio"] != 1.0
+    assert faint["probability_off_by"] != 0.0
+    # Nothing is said of false alarms that are not counted.
+    rare = gaussian(study([]).with_settings(["run.fap=1e-6", "run.tails=sampled"]), engine)
+    assert np.isnan(rare.cells["fap_ratio"][0])
+    assert "as many" not in rare.headline
 
 
 @pytest.mark.parametrize("name", ["mauvesim", "mauve"])
@@ -153,7 +163,11 @@ def test_pixels_beyond_five_sigma_are_counted(name: str, temperature: float, eng
     """The saddle-point tail agrees with the exact sum over dark counts to 0.3 %; the distribution is skewed upward."""
     part = {"output_min_nm": 340.0, "output_max_nm": 350.0, "temperature_c": temperature}
     asked = study([{"quantity": "exposure", "values": [5.0]}], observation={"changes": part})
-    (cell,) = gaussian(asked.with_settings([f"observation.instrument={name}"]), engine).cells
+    answer = gaussian(asked.with_settings([f"observation.instrument={name}"]), engine)
+    (cell,) = answer.cells
+    # A part of the spectrum without any of the usual wavelengths shows its middle.
+    assert answer.signal.shown_nm == [pytest.approx(345.0, abs=0.2)]
+    assert len(answer.signal.views[0].table) == 1
     (quiet,) = star(exposure=5.0, payload=instrument(name, **part))
     poisson = quiet.photon_noise == "poisson"
     found: dict[int, list[float]] = {1: [], -1: []}

@@ -98,7 +98,7 @@ def test_shares_equal_those_of_a_linear_model(averaged: Any) -> None:
 
 
 def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:
-    """The interval holds the error of each draw and that of few draws, and is cut at 0 and 1."""
+    """The interval holds the error of each draw and of few draws, cut at 0 and 1; a constant has no share."""
     axes = {
         "x": {"quantity": "magnitude", "values": [7.0, 10.5]},
         "y": {"quantity": "amplitude", "values": [0.1, 0.24]},
