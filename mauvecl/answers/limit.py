@@ -462,7 +462,7 @@ def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
 class LimitAnswer(Answer):
     """Answer of `limit`."""
 
-    USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed")
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed", "sweep")
 
     study: Study
     limits: list[Limit]
