@@ -163,7 +163,7 @@ def picture_of(kind: str, name: str, **options: Any) -> Callable[[Callable[..., 
     """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
 
     `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `options` are as
-    for `chart.Entry`. A function that is a picture of several classes is decorated once.
+    for `chart.PictureFunction`. A function that is a picture of several classes is decorated once.
     """
 
     def registered(draw: Callable[..., Any]) -> Callable[..., Any]:
