@@ -155,7 +155,7 @@ PERIOD_COLUMNS = (
 class ChangeAnswer(Answer):
     """Answer of `change`."""
 
-    USES = ("instrument", "sky", "nuisances")
+    USES = ("instrument", "sky", "nuisances", "sweep")
 
     study: Study
     changes: list[ChangeRow]  # every change of every star in every cell of the sweep

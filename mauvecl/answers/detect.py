@@ -92,7 +92,7 @@ def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectatio
 class DetectAnswer(Answer):
     """Answer of `detect`."""
 
-    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 
     study: Study
     stars: list[StarDetection]  # one per star and cell of the sweep

@@ -139,7 +139,7 @@ def _promises(result: SnrResult) -> QTable:
 class GaussianAnswer(Answer):
     """Answer of `gaussian`."""
 
-    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 
     study: Study
     signal: SnrAnswer

@@ -246,7 +246,7 @@ def _search(answer: InjectAnswer) -> dict[str, object]:
 class InjectAnswer(Answer):
     """Answer of `inject`."""
 
-    USES = ("instrument", "sky", "flare", "processes", "stare", "seed")
+    USES = ("instrument", "sky", "flare", "processes", "stare", "seed", "sweep")
 
     study: Study
     stars: list[StarCompleteness]

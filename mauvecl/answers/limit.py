@@ -11,7 +11,7 @@ from functools import cache, cached_property
 from itertools import pairwise, product
 from operator import itemgetter
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from scipy import special
@@ -439,12 +439,17 @@ def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
 
 def _unknown_columns(digits: str) -> tuple[Column, ...]:
     """Return the columns of limits over draws of what is unknown of the instrument."""
+
+    def largest(row: Limit) -> tuple[str, float]:
+        name, share = next(iter(cast("UnknownEffect", row.unknown).shares.items()))
+        return ("" if np.isnan(share) else name), share
+
     return (
         *interval_columns("unknown_{}", lambda row: row.unknown.range, "", "the central 95 % of the limits",
                           "95 % of limits", lambda low, high: f"{low:{digits}} to {high:{digits}}"),
-        Column("matters_most", lambda row: next(iter(row.unknown.shares)),
-               description="unknown that explains most of the limits' variance"),
-        Column("its_share", lambda row: next(iter(row.unknown.shares.values())),
+        Column("matters_most", lambda row: largest(row)[0],
+               description="unknown that explains most of the limits' variance; empty if too few draws tell"),
+        Column("its_share", lambda row: largest(row)[1],
                description="share of the limits' variance that this unknown explains"),
     )  # fmt: skip
 
@@ -462,7 +467,7 @@ def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
 class LimitAnswer(Answer):
     """Answer of `limit`."""
 
-    USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed")
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed", "sweep")
 
     study: Study
     limits: list[Limit]

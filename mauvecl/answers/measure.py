@@ -429,7 +429,7 @@ def _bin_columns(stare: MeasuredStare) -> list[Column]:
 class MeasureAnswer(Answer):
     """Answer of `measure`."""
 
-    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
+    USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 
     study: Study
     flares: list[MeasuredFlare]  # all models of each flare of each star and cell of the sweep

@@ -290,7 +290,7 @@ REALISATIONS = ("study.run.realisations", "study")
 class SnrAnswer(Answer):
     """Answer of `snr`."""
 
-    USES = ("instrument", "sky", "processes", "seed")
+    USES = ("instrument", "sky", "processes", "seed", "sweep")
 
     study: Study
     stars: list[StarSnr]  # one per star and cell of the sweep

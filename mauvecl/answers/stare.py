@@ -282,7 +282,7 @@ SEED = ("study", "study.run.seed")
 class StareAnswer(Answer):
     """Answer of `stare`."""
 
-    USES = ("instrument", "sky", "flare", "processes", "stare", "seed")
+    USES = ("instrument", "sky", "flare", "processes", "stare", "seed", "sweep")
 
     study: Study
     stares: list[StarStare]  # one per star and cell of the sweep

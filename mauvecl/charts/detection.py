@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,7 +14,16 @@ from numpy.typing import NDArray
 
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, in_rows, picture_of, written
+from mauvecl.charts.matplotlib import (
+    COLOURS,
+    COLUMN,
+    MAX_COLUMNS,
+    UNBROKEN,
+    cell_edges,
+    in_rows,
+    picture_of,
+    written,
+)
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
@@ -291,16 +301,18 @@ def quantity_axis(study: Study, name: str, **options: Any) -> PlotAxis:
 @picture_of("MapAnswer", "map")
 def detection_map(answer: MapAnswer) -> Picture:
     """Plot the detection probability over two quantities, one panel per statistic."""
-    question, study, places, axes = answer.study.map, answer.study, list[Any](), list[PlotAxis]()
+    question, study, places, edges, axes = answer.study.map, answer.study, list[Any](), list[Any](), list[PlotAxis]()
     for sweep, values in zip(question.axes, (answer.x, answer.y), strict=True):
         named = isinstance(values[0], str)
         places.append(np.arange(len(values)) if named else np.array(values, float))
-        ticks = (places[-1], values) if named else None
-        axes.append(quantity_axis(study, sweep.quantity, log=sweep.log and not named, ticks=ticks))
-    (x, y), (x_axis, y_axis) = places, axes
+        ticks, log = (places[-1], values) if named else None, sweep.log and not named
+        edges.append(cell_edges(np.sort(places[-1]), log=log))
+        axes.append(quantity_axis(study, sweep.quantity, log=log, ticks=ticks))
+    # Values may be given in any order.
+    (columns, rows), (x, y), (x_axis, y_axis) = map(np.argsort, places), map(np.sort, places), axes
     contoured, row = bool(question.contours) and min(x.size, y.size) > 1, []
-    for statistic, p in zip(answer.statistics, answer.probability, strict=True):
-        series: list[Series] = [chart.Mesh("detection probability", at=(x, y, p))]
+    for statistic, p in zip(answer.statistics, answer.probability[:, rows[:, None], columns], strict=True):
+        series: list[Series] = [chart.Mesh("detection probability", at=(*edges, p))]
         if contoured:
             series.append(chart.Levels("detected", levels=tuple(question.contours), at=(x, y, p)))
         title = statistic_label(statistic).partition(" (")[0]
@@ -397,17 +409,20 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
     from mauvecl.answers.signal import place_of
 
     first, row = answer.study.sweep.axes[0].quantity, []
+    bands = sorted({star.band for star in answer.study.star})
+    magnitude = re.compile(rf" ({'|'.join(map(re.escape, bands))}) = [^ ]+")
     for wavelength in answer.shown_nm:
         lines: dict[str, list[Any]] = {}
         for star in answer.stars:
-            name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
+            # The axis names the band, unless stars have different ones.
+            name = magnitude.sub(r" \1" * (len(bands) > 1), star.label) if first == "magnitude" else star.label
             name_of_line = full_label(name, {k: v for k, v in star.at.items() if k != first})
             element = star.result.element[place_of(star.result.expectation, wavelength, "element")]
             ends = (max(element[q], 1e-3) for q in ("q2.5", "q97.5"))
             lines.setdefault(name_of_line, []).append((star.at[first], element["expected"], *ends))
         series: list[Series] = []
         for (name, points), colour in zip(lines.items(), cycle(COLOURS), strict=False):
-            x, expected, low, high = zip(*points, strict=True)
+            x, expected, low, high = zip(*(points if first == "star" else sorted(points)), strict=True)
             lengths = np.maximum(np.subtract(expected, low), 0), np.maximum(np.subtract(high, expected), 0)
             series += [Line(name, colour, at=(x, expected)), Dots("", colour, size=7, at=(x, expected, lengths))]
         y_axis = PlotAxis("S/N per 10.5 nm element", log=True, limits=(0.1, None))

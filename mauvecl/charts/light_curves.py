@@ -14,7 +14,7 @@ from scipy.special import ndtri
 from mauvecl.charts import chart
 from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Chart, Dots, Levels, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, picture_of
+from mauvecl.charts.matplotlib import COLOURS, cell_edges, picture_of
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.schema.columns import FirstItems, part_note
 
@@ -59,7 +59,7 @@ def maps(answer: InjectAnswer) -> Picture:
             # A single half-width defines no cell width.
             return Panel(PlotAxis("completeness"), size, [Line("", "star", at=(f.completeness[0], y))], star.title)
 
-        mesh = Mesh("completeness", at=(_edges(x), _edges(y), z))
+        mesh = Mesh("completeness", at=(cell_edges(x, log=True), cell_edges(y, log=True), z))
         return Panel(HALF_WIDTH, size, [mesh, Levels("found", at=(x, y, z))], star.title)
 
     return _stars(answer, panel, below=True)
@@ -94,18 +94,12 @@ def energies(answer: InjectAnswer) -> Picture:
     def panel(star: Any) -> Panel:
         x, y, meshes = np.array(star.injected.half_widths_s), star.injected.sizes, list[Series]()
         if x.size > 1:
-            at = _edges(x), _edges(y), np.log10(star.fitted["energy_ratio"].T)
+            at = cell_edges(x, log=True), cell_edges(y, log=True), np.log10(star.fitted["energy_ratio"].T)
             label = "recovered / injected energy (dex)"
             meshes.append(Mesh(label, low=-0.3, high=0.3, palette="RdBu_r", at=at))
         return Panel(HALF_WIDTH, PlotAxis(SIZES[star.size], log=True), meshes, star.title)
 
     return _stars(answer, panel, "medians; grey: none found")
-
-
-def _edges(middles: Any) -> Any:
-    """Return the edges of cells whose centres are about evenly spaced in the logarithm."""
-    steps = np.sqrt(middles[1:] / middles[:-1])
-    return np.concatenate([[middles[0] / steps[0]], middles[:-1] * steps, [middles[-1] * steps[-1]]])
 
 
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
@@ -195,7 +189,7 @@ def spectra_panel(
         image = excess / np.sqrt(variance)
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
     half = (wavelength_nm[1] - wavelength_nm[0]) / 2 if wavelength_nm.size > 1 else 5.0
-    time = np.arange(len(image) + 1) * step * stare.frame_s / scale
+    time = (stare.numbers[0] + np.arange(len(image) + 1) * step) * stare.frame_s / scale
     nm = np.linspace(wavelength_nm[0] - half, wavelength_nm[-1] + half, wavelength_nm.size + 1)
     label = "standard deviations from the median"
     mesh = Mesh(label, low=-reach, high=reach, palette="RdBu_r", at=(time, nm, image.T))
@@ -337,7 +331,7 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     sd = np.broadcast_to(noise.used, spectra.excess.shape)
     marks, verdicts = [], [row.verdict for row in answer.rows]
     for event, verdict in zip(analysis.events, verdicts, strict=True):
-        first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
+        first, last = stare.start_s[[event.first, event.last]]
         ends = np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0]
         marks.append((ends, VERDICTS[verdict]))
     panel, _ = spectra_panel(stare, spectra.excess, sd, noise.wavelength_nm, marks)

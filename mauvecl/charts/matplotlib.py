@@ -124,6 +124,14 @@ def in_rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
     return [panels[k : k + columns] for k in range(0, len(panels), columns)]
 
 
+def cell_edges(middles: Any, *, log: bool = False) -> Any:
+    """Return the edges of cells halfway between ascending middles, in the logarithm if `log`."""
+    at = np.log(middles) if log else np.asarray(middles, float)
+    half = np.diff(at) / 2 if at.size > 1 else np.array([0.5 if log else abs(at[0]) / 10 or 0.5])
+    edges = np.concatenate([at[:1] - half[:1], at[:-1] + half[: at.size - 1], at[-1:] + half[-1:]])
+    return np.exp(edges) if log else edges
+
+
 def in_figure(unit: str) -> str:
     """Return a unit, as astropy spells it, as the label of an axis has it."""
     from astropy.units import Unit
@@ -155,7 +163,7 @@ def picture_of(kind: str, name: str, **options: Any) -> Callable[[Callable[..., 
     """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
 
     `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `options` are as
-    for `chart.Entry`. A function that is a picture of several classes is decorated once.
+    for `chart.PictureFunction`. A function that is a picture of several classes is decorated once.
     """
 
     def registered(draw: Callable[..., Any]) -> Callable[..., Any]:

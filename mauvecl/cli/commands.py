@@ -421,7 +421,7 @@ def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.study.cases import assumptions_of, collect_messages
 
     messages = collect_messages([scene.expectation for scene in store.scenes], store.study.processes)
-    clauses = assumptions_of(store.study, ("instrument", "sky", "flare", "processes", "seed"))
+    clauses = assumptions_of(store.study, ("instrument", "sky", "flare", "processes", "sweep", "seed"))
     assumed = f"Assumed: {'; '.join(clauses)}."
     session.say([*messages, assumed])
     rows = [

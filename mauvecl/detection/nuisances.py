@@ -251,7 +251,7 @@ def at_pixels(source: str, kind: str, rows: Float, wavelength_nm: Float) -> Floa
     bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():
         raise InputError(
-            f"{source} must be 0 or of a size from {SMALLEST:g} to {LARGEST:g}, but hold {rows[bad][0]!r}", key=source
+            f"{source} must be 0 or of a size from {SMALLEST:g} to {LARGEST:g}, but hold {rows[bad][0]:g}", key=source
         )
     values = np.interp(wavelength_nm, rows[:, 0], rows[:, 1], left=0.0, right=0.0)
     if not values.any():

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 #: Parts of a study that answers use.
-Use = Literal["instrument", "sky", "flare", "orbit", "processes", "nuisances", "stare", "values", "templates", "seed"]
+Use = Literal[
+    "instrument", "sky", "flare", "orbit", "processes", "nuisances", "stare", "values", "templates", "sweep", "seed"
+]  # fmt: skip
 #: Parts that hold unknowns: processes of draws, nuisance parameters of statistics, changes during a stare, and
 #: instrument values that are averaged over.
 UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
@@ -44,9 +46,10 @@ UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
     """Return the assumptions of a study about the parts that an answer uses, one clause each.
 
-    The answer varies the quantities `varied` in addition to those that the study sweeps.
+    The answer varies the quantities `varied` in addition to those of the sweep, if it uses that.
     """
-    swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
+    axes = study.sweep.axes
+    swept = {axis.quantity for axis in axes if "sweep" in uses} | set(varied)
     orbit, limits = study.orbit.tle, study.orbit.limits
     angles = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
     least = ", ".join(f"{name} {value:g} deg" for name, value in angles.items() if value is not None)
@@ -63,6 +66,7 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     # Verbs of an orbit look at targets, not at the study's star.
     observes = "instrument" in uses and "orbit" not in uses
     unused = [key for use, keys in _given_unknowns(study).items() if use not in uses for key in keys]
+    unused += ["sweep.axes"] if axes and "sweep" not in uses else []
     unused += [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
     ignored = [f"not used: {', '.join(unused)}"] if unused else []
     return [*(clause() for part, clause in words.items() if part in parts), *ignored]

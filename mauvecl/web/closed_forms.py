@@ -120,6 +120,10 @@ class FieldValues:
         return [value] if page_field.path[-1] == "amplitudes" else value
 
 
+#: Light other than the star's in an expectation.
+BEHIND = ("sky_electrons", "neighbour_electrons")
+
+
 class InterpolatedForm:
     """Closed form that is exact at some points and interpolated in the probit between them."""
 
@@ -234,15 +238,15 @@ class ClosedForms:
         star = f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
         return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
-    def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:
-        """Return the closed forms for factors on the light, with `sky` also the sky's, and on the amplitude, (n_rise,).
+    def at(self, light: float, rises: Float, *, others: bool = False) -> list[DetectionForms]:
+        """Return the closed forms for factors on the light, with `others` all light's, and on the amplitude, (n_rise,).
 
         The list is empty if the star saturates every pixel.
         """
         q, base = self.question, self.quiet
         statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
-        behind = base.sky_electrons * (light if sky else 1.0)
-        quiet = replace(base, source_electrons=light * base.source_electrons, sky_electrons=behind)
+        behind = {name: getattr(base, name) * (light if others else 1.0) for name in BEHIND}
+        quiet = replace(base, source_electrons=light * base.source_electrons, **behind)
         setting = self.case.setting(quiet)
         if not setting.used.any():
             return []
@@ -290,7 +294,7 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
                 if not (assumed.case.study.nuisances.usual or assumed.slow or value != value):
                     # This takes no time.
                     lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
-                    ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), sky=True)]
+                    ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), others=True)]
                     percent = f"{100 * THROUGHPUT:g} %"
                     origin += f"; {chance_range(min(ends), max(ends))} if the throughput is {percent} lower or higher"
         except InputError as error:

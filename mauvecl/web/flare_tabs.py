@@ -125,7 +125,7 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
     PlotAxis("detection probability", limits=(-0.03, 1.05)),
     (
         Line("closed form", "flare", width=2, tips=("magnitude", "detected")),
-        Rule("wanted: 90 %", "threshold", "power", along="y"),
+        Rule("wanted probability", "threshold", "power", along="y"),
         Dots("simulated", size=8),
         OwnMarker(),
     ),

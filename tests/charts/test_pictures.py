@@ -135,16 +135,46 @@ def labelled(figure: Any, label: str) -> list[np.ndarray]:
     return [np.asarray(line.get_ydata()) for axis in figure.axes for line in axis.lines if line.get_label() == label]
 
 
+def edges(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges of a mesh's cells along x and y."""
+    corners = np.asarray(mesh.get_coordinates())
+    return corners[0, :, 0], corners[:, 0, 1]
+
+
 def test_stare_without_found_flares_has_a_layout_and_gaps() -> None:
-    study = paper(*ONE, "flare.amplitudes=[0.5]", "stare.duration_s=300", "stare.gaps=[[100, 150]]",
+    study = paper(*ONE, "flare.amplitudes=[0.5]", "stare.duration_s=320", "stare.gaps=[[0, 20], [120, 170]]",
                   "stare.half_width_s=20", "stare.search=false")  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        (figure, *_) = (figure for _, figure, _ in drawn(mauvecl.stare(study, mauvecl.Stares())))
+        figure, spectra = (figure for _, figure, _ in drawn(mauvecl.stare(study, mauvecl.Stares())))
+    seconds = edges(spectra.axes[0].collections[0])[0]
+    assert (seconds[0], seconds[-1]) == pytest.approx((20, 320))
     bands = labelled(figure, "star and flares alone")
     assert len(bands) == 5
     # Twenty frames before the gap and thirty after it.
     assert all(np.flatnonzero(np.isnan(band)).tolist() == [20, 21] and band.size == 52 for band in bands)
+
+
+def test_maps_and_sweeps_are_drawn_as_their_tables_have_them(engine: Engine) -> None:
+    """Values are in any order, along few and along many decades, and magnitudes in another band than V."""
+    axes = ["map.x={quantity='exposure', values=[50, 5, 20]}",
+            "map.y={quantity='amplitude', start=1e-4, stop=1, steps=3, log=true}"]  # fmt: skip
+    found = mauvecl.map(paper(*FEW, *ONE, *ONLY, *axes), engine)
+    mesh = found.plot().axes[0].collections[0]
+    x, y = edges(mesh)
+    assert y == pytest.approx(np.geomspace(1e-5, 10, 4))
+    for row in found.table:
+        cell = np.searchsorted(y, row["amplitude"]) - 1, np.searchsorted(x, row["exposure"].value) - 1
+        assert mesh.get_array().reshape(3, 3)[cell] == row["probability"]
+    sweep = "sweep.axes=[{quantity='magnitude', values=[9, 7]}, {quantity='exposure', values=[50, 5]}]"
+    swept = mauvecl.snr(paper(*FEW, "star=[{library='G2V', band='B'}]", "signal.wavelength_nm=400", sweep), engine)
+    (axis,) = swept.pictures["snr-sweep"]().axes
+    assert axis.get_xlabel() == "magnitude (B)"
+    rows = swept.element[np.abs(swept.element["wavelength"].value - 400) < 5.3]
+    for seconds in (50, 5):
+        (line,) = (line for line in axis.lines if line.get_label() == f"G2V, exposure {seconds} s")
+        wanted = np.sort(rows["expected"][rows["exposure"].value == seconds])[::-1]
+        assert line.get_xydata() == pytest.approx(np.column_stack([[7, 9], wanted]))
 
 
 def test_level_of_observed_frames_is_not_drawn_in_long_gaps() -> None:

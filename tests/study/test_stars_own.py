@@ -29,13 +29,21 @@ def test_each_star_has_its_own_photosphere() -> None:
         flaring = star.flaring(0.1, geometry="replaces", photosphere_temperature=kelvin)
         wanted = expect(flaring, Instrument.load("mauvesim").with_(**PART["changes"]), exposure=50)
         np.testing.assert_allclose(found, wanted.source_electrons, rtol=1e-12)
-    own = study({"library": "G2V", "effective_temperature_k": 5000.0}, geometry="replaces")
+    # In a stare it is below every flare, of which the first is as far from the start as from the next.
+    few = ["stare={duration_s=60, search=false, bands_nm=[]}", "flare.amplitudes=[0.1, 0.2]"]
+    stared = stare(study({"library": "G2V"}, geometry="replaces").with_settings(few))
+    assert stared.events["peak_time"].value.tolist() == [20.0, 40.0]
+    staring = stared.stares[0].staring
+    rise = both[0] - staring.quiet.source_electrons
+    np.testing.assert_allclose(staring.flare_electrons, [rise / 0.1], rtol=1e-9, atol=1e-9 * rise.max())
+    own = study({"library": "G2V", "effective_temperature_k": 5000.0, "distance_pc": 10.0}, geometry="replaces")
     one = study({"library": "G2V"}, geometry="replaces", photosphere_temperature_k=5000.0)
     np.testing.assert_array_equal(light(own), light(one))
     assert not np.array_equal(light(own)[0], both[0])
     assert Study.build(own.model_dump(), "again") == own
-    # Another star has its own temperature.
-    assert own.at("star", "M3V").star[0].effective_temperature_k is None
+    # Another star has its own temperature and distance.
+    other = own.at("star", "M3V").star[0]
+    assert (other.effective_temperature_k, other.distance_pc) == (None, None)
     # Its V in the list is no magnitude in another band.
     bands = {"Kepler": None, "V": 8.81, "Johnson V": 8.81}
     vega = {band: study({"library": "Vega", "magnitude": None, "band": band}) for band in bands}

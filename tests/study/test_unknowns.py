@@ -44,7 +44,9 @@ def test_draws_follow_their_priors(averaged: Any) -> None:
 def test_prior_of_zero_width_changes_nothing(engine: Engine) -> None:
     """A prior of zero width gives the limit of the nominal instrument, and no draw if all values are known."""
     sure = {"light_loss": {"uniform": [0.34, 0.34]}, "known": [name for name in ALL if name != "light_loss"]}
-    (one,), (two,) = (limit(study(given), engine).limits for given in (sure | {"draws": 2}, {"draws": 0}))
+    first, second = (limit(study(given), engine) for given in (sure | {"draws": 2}, {"draws": 0}))
+    (one,), (two,) = first.limits, second.limits
+    assert first.table["matters_most"].tolist() == [""], "nothing moves the limit"
     assert one.closed_form == pytest.approx(two.closed_form, abs=1e-4)
     assert one.unknown.range == pytest.approx((two.closed_form, two.closed_form), abs=1e-4)
     assert abs(one.value.value - two.value.value) < 0.03

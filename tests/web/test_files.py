@@ -351,6 +351,12 @@ async def test_neighbours_of_the_page_are_those_of_the_command_line(talk: Talk, 
     command = await taken(talk, link(**entered, **near, **FEW), "detection", tmp_path)
     assert alone == none_of_it
     assert blended < alone - 0.004
+    # A lower throughput dims the neighbour as it dims the star.
+    dimmer, dark = -2.5 * np.log10(0.7), {"sky": "none"} | entered | near
+    fainter = {"magnitude": f"{9 + dimmer:.9f}", "neighbours": table.replace(",8,", f",{8 + dimmer:.9f},")}
+    dim = (await talk.chances(link(**dark | fainter)))[1]
+    interval = (await talk.answer(link(**dark)))["answer"]["numbers"][1]["interval"]
+    assert f"; {100 * dim:.1f} % to " in interval
     assert "--neighbours neighbours.csv --neighbours-of 'Gaia DR3 1'" in command
     (one, two) = (answered(tmp_path, words)["detection"] for words in (command, "detect study.toml"))
     same_numbers(one, two, "threshold", "probability")
