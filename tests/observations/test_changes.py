@@ -43,6 +43,13 @@ def test_two_visits_are_the_two_sided_test_of_a_difference(fap: float, power: fl
     assert row["smallest_scatter"] / row["error"] == pytest.approx(scatter, rel=1e-4)
 
 
+@pytest.mark.parametrize(("exposures", "stated"), [((10.0,), "two visits of 10 s"), ((10.0, 100.0), "two visits,")])
+def test_texts_state_the_exposure_of_all_rows(exposures: tuple[float, ...], stated: str) -> None:
+    answer = asked("change.of=['320-700']", f"sweep.axes=[{{quantity='exposure', values={[*exposures]}}}]")
+    assert stated in answer.views[0].title
+    assert ("50 s" in answer.headline, "50 s" in answer.views[1].title) == (False, False)
+
+
 def test_smallest_changes_have_the_power() -> None:
     """Draws of 30 visits: 20 000 tests each, within 4 binomial standard errors (once in 16 000 times)."""
     number, fap, power, n = 30, 0.01, 0.8, 20_000
