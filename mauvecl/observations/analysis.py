@@ -255,7 +255,8 @@ class Analysis:
         reasons = self.level.reasons
         if (reasons != 0).any():
             lost = np.count_nonzero(reasons)
-            yield f"{lost} of {reasons.size} frames are not searched; the table of frames states the reason of each."
+            are = "is" if lost == 1 else "are"
+            yield f"{lost} of {reasons.size} frames {are} not searched; the table of frames states the reason of each."
         if lost := np.count_nonzero(reasons & Reason.LOSS):
             yield (
                 f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses; flares "
@@ -281,11 +282,10 @@ class Analysis:
             )
         if self.level.process.terms and not self.dark_misleads:
             # A light curve that shows few periods of a process has another standard deviation than the process.
-            spread = self.level.level[self.level.used].std() / self.survey.level
             terms = self.level.process.describe(self.survey.level / self.survey.scale)
             yield (
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
-                f"{100 * spread:.2g} %, by {terms}."
+                f"{100 * self.level.spread:.2g} %, by {terms}."
             )
         if self.spectra is not None and self.dark_misleads:
             series = self.spectra

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import spectrum_of
 from mauvecl.host.arrays import Bool, Float
-from mauvecl.observations.level import PER_MAD
+from mauvecl.observations.process import PER_MAD
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

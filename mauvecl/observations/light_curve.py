@@ -22,7 +22,6 @@ from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import (
     FAR,
     MOST_BELOW,
-    PER_MAD,
     QuiescentLevel,
     check_usable,
     counts_per_unit,
@@ -33,7 +32,15 @@ from mauvecl.observations.level import (
     relative_level,
     single_frames,
 )
-from mauvecl.observations.process import UNREPORTED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
+from mauvecl.observations.process import (
+    PER_MAD,
+    UNREPORTED,
+    BinnedLightCurve,
+    Process,
+    Steps,
+    criterion_of_process,
+    fit_process,
+)
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 
@@ -504,4 +511,5 @@ def quiescent_light(
         np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
         for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
     )
-    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process)
+    spread = float(level[used].std()) / survey.level
+    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process, spread)

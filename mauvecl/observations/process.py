@@ -24,6 +24,8 @@ from mauvecl.schema.errors import InputError
 Item = TypeVar("Item")
 Kind = Literal["correlated", "smooth", "rotation", "sharp rotation"]
 
+#: Standard deviation of a normal distribution in units of its median absolute deviation.
+PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
 #: Largest number of values to which the parameters of a process are fitted; longer light curves are binned.
 MAX_FITTED = 20_000
 #: Largest number of terms.
@@ -317,7 +319,7 @@ class BinnedLightCurve:
         """Robust standard deviation of a value, from differences of neighbours."""
         steps = np.diff(self.values)[np.diff(self.time_s) < 1.5 * self.step_s]
         steps = steps if steps.size else np.diff(self.values)
-        spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
+        spread = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0)
         return spread if spread > 0 else float(np.std(self.values))
 
     @property

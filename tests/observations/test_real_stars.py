@@ -290,6 +290,10 @@ def test_events_do_not_depend_on_the_unit_of_the_light() -> None:
     whole, small = (analysed(noisy(407, time, size * light, 10 * size)).analysis for size in (1.0, 1e-17))
     assert small.threshold == pytest.approx(whole.threshold, rel=1e-6)
     assert [one.value for one in small.events] == pytest.approx([one.value for one in whole.events], rel=1e-6)
+    # Durations below zero are relative to the size of the level.
+    (event,) = analysed(noisy(407, time, light - 2000, 10.0)).analysis.events
+    assert event.summed_s == pytest.approx(whole.events[0].summed_s, rel=0.01)
+    assert event.summed_error_s == pytest.approx(whole.events[0].summed_error_s, rel=0.1)
 
 
 def test_counts_of_which_most_are_zero_have_their_mean() -> None:

@@ -290,6 +290,21 @@ def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
     assert np.abs(level - truth)[near].max() < 6 * NOISE
 
 
+def test_large_step_leaves_no_other_change_of_the_light() -> None:
+    """A star whose light turns by 0.2 % becomes brighter by 10 %: the turning light is relative to the brighter one."""
+    time = np.arange(600) * FRAME_S
+    light = 1 + 0.002 * np.sin(2 * np.pi * time / (3.1 * DAY_S)) + 0.1 * (np.arange(600) >= 270)
+    answer = analysed(noisy(4, time, light, NOISE), per="month")
+    said = " ".join(answer.messages)
+    assert "The level changes once suddenly for a day or more, by +10 % at the most" in said
+    stated = re.search(r"a standard deviation of (\S+) %, by rotation", said)
+    assert stated is not None
+    assert float(stated[1]) == pytest.approx(0.2 / np.sqrt(2) / 1.05, rel=0.1)
+    assert answer.analysis.level.used.all()
+    rates = r"detected above \S+ \(0.0329 false alarms .*\), candidates above \S+ \(1 false alarm per star-day\)"
+    assert re.search(rates, answer.views[0].title)
+
+
 @pytest.mark.parametrize("what", ["long flare", "dip of half a day", "fast trend"])
 def test_changes_that_do_not_last_are_no_steps(what: str) -> None:
     """Observe twenty days with a flare that takes a day to decay, a dip of half a day, or a change within two days."""
