@@ -9,17 +9,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.host.arrays import Bool, Float
+from mauvecl.host.arrays import PER_MAD, Bool, Float
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.process import (
-    MAX_TRIED,
-    PER_MAD,
-    BinnedLightCurve,
-    Process,
-    Steps,
-    criterion_of_process,
-    fit_process,
-)
+from mauvecl.observations.process import MAX_TRIED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
-from mauvecl.host.arrays import Bool, Float, true_runs
+from mauvecl.host.arrays import PER_MAD, Bool, Float, true_runs
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.events import END_FRAMES, LONG_S, MIN_QUIET, detect_events, light_of_flare
 from mauvecl.observations.frames import Frames, Reason
@@ -32,15 +32,7 @@ from mauvecl.observations.level import (
     relative_level,
     single_frames,
 )
-from mauvecl.observations.process import (
-    PER_MAD,
-    UNREPORTED,
-    BinnedLightCurve,
-    Process,
-    Steps,
-    criterion_of_process,
-    fit_process,
-)
+from mauvecl.observations.process import UNREPORTED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
 

@@ -18,14 +18,12 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import scipy
 
-from mauvecl.host.arrays import Float
+from mauvecl.host.arrays import PER_MAD, Float
 from mauvecl.schema.errors import InputError
 
 Item = TypeVar("Item")
 Kind = Literal["correlated", "smooth", "rotation", "sharp rotation"]
 
-#: Standard deviation of a normal distribution in units of its median absolute deviation.
-PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
 #: Largest number of values to which the parameters of a process are fitted; longer light curves are binned.
 MAX_FITTED = 20_000
 #: Largest number of terms.

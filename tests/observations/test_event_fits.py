@@ -142,13 +142,6 @@ def test_level_norms_and_covariances_are_those_of_the_matrices(term: processes.P
     np.testing.assert_allclose(model.covariance(time, noise).squared_norms(columns, 30, time.size), exact, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("correlation", "error", "alike"), [
-    (0.2, 0.0399, False), (0.2, 0.0401, True), (0.119, 0.01, True), (-0.121, 0.01, False),
-])  # fmt: skip
-def test_residuals_are_correlated_above_five_standard_errors(correlation: float, error: float, alike: bool) -> None:
-    assert levels.NoiseComparison(np.array([0.0, correlation]), np.full(2, error)).alike is alike
-
-
 def test_coefficients_are_those_of_celerite2() -> None:
     """All bits, for parameters within and beyond the bounds of fits."""
     rng = np.random.default_rng(9)

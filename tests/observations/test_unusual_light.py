@@ -262,7 +262,7 @@ def test_visits_over_years_take_little_memory() -> None:
 DAY_S = 86_400.0
 #: Frames of half an hour for 41 days, the frames before which the level changes, and by how much.
 FRAME_S, N_FRAMES, NOISE = 1765.0, 2000, 4e-4
-STEPS = {600: -0.03, 1150: 0.012, 1600: 0.03}
+STEPS = {600: 0.1, 1150: 0.012, 1600: -0.03}
 #: Peaks (d), half-widths (s) and amplitudes of flares with an S/N of 20 or more.
 BESIDE = ((3.7, 1500.0, 0.012), (14.4, 900.0, 0.02), (25.5, 1800.0, 0.03), (34.2, 2900.0, 0.02))
 
@@ -278,9 +278,14 @@ def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
         truth[first:] += size
     light = truth + sum(size * flare(time, FRAME_S, peak * DAY_S, half_width) for peak, half_width, size in BESIDE)
     answer = analysed(noisy([507, int(turns)], time, light, NOISE), per="month")
-    stated = re.search(r"The level changes 3 times suddenly .* by (\S+) % at the most", " ".join(answer.messages))
-    assert stated is not None
-    assert abs(float(stated[1])) == pytest.approx(3.0, abs=0.2)
+    said = " ".join(answer.messages)
+    assert re.search(r"The level changes 3 times suddenly .* by \+10 % at the most", said)
+    # Without the steps; the slow change is in part of them.
+    stated = re.search(r"standard deviation of (\S+) %, by rotation", said)
+    assert (stated is not None) == turns
+    assert stated is None or 1.0 < float(stated[1]) < 2.5
+    rates = r"detected above \S+ \(0.0329 false alarms .*\), candidates above \S+ \(1 false alarm per star-day\)"
+    assert re.search(rates, answer.views[0].title)
     found = answer.events[answer.events["verdict"] == "detected"]
     start, stop = (found[name].to_value("d") for name in ("tstart", "tstop"))
     assert all(((start <= peak) & (peak <= stop)).any() for peak, *_ in BESIDE)
@@ -288,21 +293,6 @@ def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
     level = np.asarray(answer.frames["level"], float)
     near = np.concatenate([[first - 1, first] for first in STEPS])
     assert np.abs(level - truth)[near].max() < 6 * NOISE
-
-
-def test_large_step_leaves_no_other_change_of_the_light() -> None:
-    """A star whose light turns by 0.2 % becomes brighter by 10 %: the turning light is relative to the brighter one."""
-    time = np.arange(600) * FRAME_S
-    light = 1 + 0.002 * np.sin(2 * np.pi * time / (3.1 * DAY_S)) + 0.1 * (np.arange(600) >= 270)
-    answer = analysed(noisy(4, time, light, NOISE), per="month")
-    said = " ".join(answer.messages)
-    assert "The level changes once suddenly for a day or more, by +10 % at the most" in said
-    stated = re.search(r"a standard deviation of (\S+) %, by rotation", said)
-    assert stated is not None
-    assert float(stated[1]) == pytest.approx(0.2 / np.sqrt(2) / 1.05, rel=0.1)
-    assert answer.analysis.level.used.all()
-    rates = r"detected above \S+ \(0.0329 false alarms .*\), candidates above \S+ \(1 false alarm per star-day\)"
-    assert re.search(rates, answer.views[0].title)
 
 
 @pytest.mark.parametrize("what", ["long flare", "dip of half a day", "fast trend"])
