@@ -466,7 +466,10 @@ class AnalyseAnswer(Answer):
         number, undetected = verdicts.count("detected"), len(verdicts) - verdicts.count("detected")
         flares = f"{number} flare{' is' if number == 1 else 's are'}" if number else "No flare is"
         more = f", and {undetected} more event{'' if undetected == 1 else 's'} listed" if undetected else ""
-        expected = self.analysis.rate * self.analysis.days
+        # Dips raise the threshold, and simulated light curves do not show the rates of many alarms in each.
+        analysis = self.analysis
+        reached = max(alarms.rate(analysis.threshold) for alarms in (analysis.modelled, analysis.measured))
+        expected = min(analysis.rate, reached) * analysis.days
         return (
             f"{flares} detected in {self.analysis.days:.3g} star-days of {self.analysis.frames.name}, where "
             f"{expected:.2g} are expected from noise alone{more}."
@@ -477,14 +480,13 @@ class AnalyseAnswer(Answer):
         analysis = self.analysis
         where = f"in {analysis.days:.3g} star-days of {analysis.frames.name}"
         rate, frequent = (
-            f"{rate:.3g} false alarm{'' if rate == 1 else 's'} per star-day"
+            f"at most {rate:.3g} false alarm{'' if rate == 1 else 's'} per star-day"
             for rate in (analysis.rate, max(analysis.rate, CANDIDATES))
         )
-        reason = "the largest dip" if analysis.dip == analysis.threshold else rate
         candidates = f"{analysis.candidates:.2f} ({frequent})"
         if not analysis.events:
             return [View(f"Nothing above {candidates} {where}."), *super().views]
-        title = f"Events {where}; detected above {analysis.threshold:.2f} ({reason}), candidates above {candidates}"
+        title = f"Events {where}; detected above {analysis.threshold:.2f} ({rate}), candidates above {candidates}"
         return [AnalyseAnswer.events.view(self, title), *super().views]
 
     @property

@@ -149,6 +149,11 @@ def test_probability_of_an_event_is_that_of_the_larger_rate() -> None:
     rates = np.array([events["rate_normal"].to_value("1 / d"), events["rate_measured"].to_value("1 / d")])
     assert (rates[0] != rates[1]).any()
     np.testing.assert_allclose(events["probability"], -np.expm1(-rates.max(axis=0) * analysis.days), rtol=1e-12)
+    number = np.count_nonzero(events["verdict"] == "detected")
+    assert answer.headline.startswith(f"{number} flares are detected in {3000 / 1440:.3g} star-days")
+    # The rates of more than some seven alarms in each simulated light curve are not known.
+    (expected,) = re.findall(r"where (\S+) are expected", answer.headline)
+    assert stats.poisson.ppf(0.001, float(expected)) <= number <= stats.poisson.ppf(0.999, float(expected))
 
 
 @pytest.mark.parametrize(

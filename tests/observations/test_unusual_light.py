@@ -284,7 +284,7 @@ def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
     stated = re.search(r"standard deviation of (\S+) %, by rotation", said)
     assert (stated is not None) == turns
     assert stated is None or 1.0 < float(stated[1]) < 2.5
-    rates = r"detected above \S+ \(0.0329 false alarms .*\), candidates above \S+ \(1 false alarm per star-day\)"
+    rates = r"above \S+ \(at most 0.0329 false alarms .*\), candidates above \S+ \(at most 1 false alarm per star-day\)"
     assert re.search(rates, answer.views[0].title)
     found = answer.events[answer.events["verdict"] == "detected"]
     start, stop = (found[name].to_value("d") for name in ("tstart", "tstop"))
