@@ -174,7 +174,7 @@ class ChangeAnswer(Answer):
     #: One row per star, cell and line index.
     index_table = TableOf(
         "indices", INDEX_COLUMNS, "indices", place=True, key="indices", about=(),
-        title=lambda answer: f"Line indices in {answer.study.observation.exposure_s:g} s",
+        title=lambda answer: f"Line indices in {answer.exposure}" if answer.exposure else "Line indices",
     )  # fmt: skip
     #: One row per star, cell, change and magnitude.
     magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, about=(),
@@ -194,10 +194,16 @@ class ChangeAnswer(Answer):
         return (*self.USES, "orbit", "seed") if self.periods else self.USES
 
     @property
+    def exposure(self) -> str:
+        """Exposure of a visit, in words; empty if it is swept."""
+        exposures = {quiet.exposure_s for quiet in self.inputs}
+        return f"{exposures.pop():g} s" if len(exposures) == 1 else ""
+
+    @property
     def visits(self) -> str:
         """Number and exposure of the visits, in words."""
         visits = self.study.change.visits
-        return f"{'two' if visits == 2 else visits} visits of {self.study.observation.exposure_s:g} s"
+        return f"{'two' if visits == 2 else visits} visits{self.exposure and f' of {self.exposure}'}"
 
     @property
     def headline(self) -> str:
@@ -250,10 +256,11 @@ def change(study: Study, engine: Engine | Pool | None = None, progress: Progress
     recovery = None
     if question.periods:
         o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
+        longest_s = max(case.study.observation.exposure_s for case in prepared)
         visibility = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
         # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
         recovery = visits.recover_periods(
-            visits.visit_times_d(visibility.windows(0), question.visits, study.observation.exposure_s, study.run.seed),
+            visits.visit_times_d(visibility.windows(0), question.visits, longest_s, study.run.seed),
             np.geomspace(question.shortest_d, question.longest_d, question.steps),
             np.geomspace(*AMPLITUDES, question.steps),
             fap=question.period_fap, trials=question.trials, seed=study.run.seed,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares.settings import RANK
 from mauvecl.flares.shapes import shape_of
-from mauvecl.host.arrays import Bool, Float
+from mauvecl.host.arrays import Float
 from mauvecl.observations.events import LONG_S, Kind, ObservedEvent, detect_events, measure_events, most_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
@@ -22,7 +22,6 @@ from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import (
     NO_COLOUR_K,
-    DetectedEvent,
     SeriesSurvey,
     SimulatedRate,
     innovations,
@@ -255,7 +254,8 @@ class Analysis:
         reasons = self.level.reasons
         if (reasons != 0).any():
             lost = np.count_nonzero(reasons)
-            yield f"{lost} of {reasons.size} frames are not searched; the table of frames states the reason of each."
+            are = "is" if lost == 1 else "are"
+            yield f"{lost} of {reasons.size} frames {are} not searched; the table of frames states the reason of each."
         if lost := np.count_nonzero(reasons & Reason.LOSS):
             yield (
                 f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses; flares "
@@ -281,11 +281,10 @@ class Analysis:
             )
         if self.level.process.terms and not self.dark_misleads:
             # A light curve that shows few periods of a process has another standard deviation than the process.
-            spread = self.level.level[self.level.used].std() / self.survey.level
             terms = self.level.process.describe(self.survey.level / self.survey.scale)
             yield (
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
-                f"{100 * spread:.2g} %, by {terms}."
+                f"{100 * self.level.spread:.2g} %, by {terms}."
             )
         if self.spectra is not None and self.dark_misleads:
             series = self.spectra
@@ -356,29 +355,20 @@ def analyse_frames(
     causes: list[Kind] = ["flare" if spectrum is None else spectrum.cause for spectrum in spectra]
     events = measure_events(survey, in_events, detected, causes, event_steps)
     measurements = [
-        _flare_of_event(survey, series, in_events, measured.kind, event)
+        measure_flare(survey, series, in_events, event) if series is not None and measured.kind == "flare"
+        else "no spectra of the instrument are given" if series is None else f"its kind is {measured.kind}"
         for measured, event in zip(events, detected, strict=True)
-    ]
+    ]  # fmt: skip
     quiet = ~in_events
     residual = innovations(survey, quiet)
-    middle = survey.bank.directions[len(survey.bank.directions) // 2]
     numbers = survey.stare.numbers[quiet]
     return Analysis(
         frames, frames.white_light[0], level, survey, rate, *rates,
-        threshold=threshold, candidates=candidates, dip=dip, events=events,
+        threshold=threshold, candidates=candidates, dip=dip, events=events, measurements=measurements,
         completeness=inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
-        scatter=binned_scatter(numbers, residual @ middle), residual=residual, quiet=quiet,
-        likeness=likeness(numbers, residual), spectra=series, event_spectra=spectra, measurements=measurements,
+        scatter=binned_scatter(numbers, residual @ survey.bank.directions[len(survey.bank.directions) // 2]),
+        residual=residual, quiet=quiet, likeness=likeness(numbers, residual), spectra=series, event_spectra=spectra,
     )  # fmt: skip
-
-
-def _flare_of_event(
-    survey: SeriesSurvey, series: SpectralSeries | None, in_events: Bool, kind: Kind, event: DetectedEvent
-) -> Measurement | str:
-    """Return the flare that is fitted to the spectrum of an event, or the reason why none is."""
-    if series is None:
-        return "no spectra of the instrument are given"
-    return measure_flare(survey, series, in_events, event) if kind == "flare" else f"its kind is {kind}"
 
 
 def _thresholds(

@@ -183,11 +183,10 @@ class Window:
     quiet_level: float = 1.0  # of the star at the peak, by the frames without events, in units of the survey's level
 
     @classmethod
-    def of(cls, survey: SeriesSurvey, in_events: Bool, event: DetectedEvent, direction: int | None = None) -> Window:
+    def of(cls, survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> Window:
         """Collect the frames of an event, and those around it that belong to no event."""
-        direction = event.direction if direction is None else direction
-        unit = survey.bank.directions[direction]
-        row = survey.templates.chosen[direction]
+        unit = survey.bank.directions[event.direction]
+        row = survey.templates.chosen[event.direction]
         scale = float(np.linalg.norm(survey.templates.directions[row]))
         photon = float(unit @ survey.templates.noise[row] @ unit)
         excess = float(unit**2 @ np.array([process.excess for process in survey.processes]) ** 2)

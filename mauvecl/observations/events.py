@@ -277,7 +277,8 @@ def _sum_light(survey: SeriesSurvey, in_events: Bool, level: Float, event: Detec
         # Durations are relative to the level at the peak.
         middle = time[inside] + survey.stare.frame_s / 2
         peak = inside.start + min(int(np.searchsorted(middle, event.peak_s)), numbers.size - 1)
-        weights[peak] += total / factor / max(float(level[begin + peak]), 1e-12)
+        if (at_peak := float(level[begin + peak])) > 0:
+            weights[peak] += total / factor / at_peak
         covariance = process.covariance(time[quiet], noise[quiet])
         of_constant = covariance.solve(np.ones(int(quiet.sum())))
         shared = process.times(time, weights)
@@ -434,19 +435,20 @@ def _posterior(in_events: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixtur
     mixture, survey, event = join(mixtures), window.survey, window.event
     if len(survey.bank.directions) == 1:
         return mixture
-    # Flares of other temperatures have another light for the same sum: the S/N of each, and the value of its amplitude.
+    # Flares of other temperatures have another light for the same sum: the S/N of each, and its amplitude.
     scores = []
     for direction in range(len(survey.bank.directions)):
-        other = Window.of(survey, in_events, event, direction)
+        other = Window.of(survey, in_events, replace(event, direction=direction))
         noise = np.diag(other.process) + other.noise
         model = other.model(survey.bank.shape, event.peak_s, event.half_width_s)[0]
         weight, outside = model / noise, ~other.inside
         level = float(np.average(other.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0
-        scores.append((float(weight @ (other.values - level)) / np.sqrt(float(weight @ model)), other.scale))
-    snr, scale = scores[event.direction]
+        slope, information = float(weight @ (other.values - level)), float(weight @ model)
+        scores.append((slope / np.sqrt(information), slope / information))
+    snr, amplitude = scores[event.direction]
     scaled = []
-    for value, unit in scores:
+    for value, other_amplitude in scores:
         if value > 0:
-            factor, log_weight = scale / unit * value / snr, 0.5 * (value**2 - snr**2)
+            factor, log_weight = other_amplitude / amplitude, 0.5 * (value**2 - snr**2)
             scaled.append(NormalMixture(mixture.log_weight + log_weight, factor * mixture.mean, factor * mixture.sd))
     return join(scaled)

@@ -11,8 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import spectrum_of
-from mauvecl.host.arrays import Bool, Float
-from mauvecl.observations.level import PER_MAD
+from mauvecl.host.arrays import PER_MAD, Bool, Float
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

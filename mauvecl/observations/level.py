@@ -9,14 +9,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.host.arrays import Bool, Float
+from mauvecl.host.arrays import PER_MAD, Bool, Float
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.process import MAX_TRIED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
 
-#: Standard deviation of a normal distribution in units of its median absolute deviation.
-PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
 #: Distance from the level, in standard deviations, beyond which a frame below it lacks the light of the star, and a
 #: single frame above it is a spike.
 FAR = 5.0
@@ -60,6 +58,7 @@ class QuiescentLevel:
     quiet: Bool  # shape (n_frame,); frames that are searched and belong to no event
     reasons: NDArray[np.int64]  # shape (n_frame,); why frames are not searched; see `frames.Reason`
     process: Process  # in standard deviations of the noise of a typical frame
+    spread: float  # standard deviation of the level without its steps, relative to the typical level
     changes: tuple[tuple[int, float], ...] = ()  # first frames after steps of the level, and its relative changes
 
     def times(self, relative: Float) -> QuiescentLevel:
@@ -329,7 +328,7 @@ MOST_STEPS = 30
 #: by the step to within a factor, s (assumed).
 FLARE_S, LENGTHS_S, LASTS = DAY_S / 4, (2 * DAY_S, 4 * DAY_S), 2.0
 #: Smallest step relative to its standard error, and without the frames that may belong to a flare (assumed).
-SIGNIFICANT, AFTER_FLARE = 6.0, 2.5
+STEP_ERRORS, AFTER_FLARE = 6.0, 2.5
 #: Largest number of fits of the process and the steps.
 ROUNDS = 4
 #: Largest ratio of the levels before and after a step (assumed).
@@ -345,9 +344,8 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
     constant = np.ones(flux.size)
     values = flux / BinnedLightCurve(time_s, flux, constant, frame_s).noise
     places, sizes = _find_sudden_changes(time_s, values)
-    typical = float(np.median(values))
     process: Process | None = None
-    if not places.size or not typical > 0:
+    if not places.size or not np.median(values) > 0:
         return constant
 
     def binned(light: Float) -> BinnedLightCurve:
@@ -363,7 +361,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         no_flare = quiet & ~np.any(rises, axis=0)
         later_change, later_error = _fit_steps(process, time_s, without_steps, no_flare, places, frame_s)
         later_sizes, sizes = sizes + later_change, sizes + change
-        steps = (np.abs(sizes) > SIGNIFICANT * error) & (later_sizes / np.sign(sizes) > AFTER_FLARE * later_error)
+        steps = (np.abs(sizes) > STEP_ERRORS * error) & (later_sizes / np.sign(sizes) > AFTER_FLARE * later_error)
         settled = steps.all() and (np.abs(change) < error).all()
         places, sizes = places[steps], sizes[steps]
         if settled or not places.size:
@@ -376,7 +374,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
         data = binned(light)
         size = float(np.log(data.values.size))
         costs.append(2 * n_steps * size + criterion_of_process(fit_process(data, start), data, size))
-    level = 1.0 + added / typical
+    level = 1.0 + added / float(np.median(values - added))
     level = level / np.median(level)
     return level if costs[0] < costs[1] and level.min() > 1 / LARGEST and level.max() < LARGEST else constant
 

@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
-from mauvecl.host.arrays import Bool, Float, true_runs
+from mauvecl.host.arrays import PER_MAD, Bool, Float, true_runs
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.events import END_FRAMES, LONG_S, MIN_QUIET, detect_events, light_of_flare
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import (
     FAR,
     MOST_BELOW,
-    PER_MAD,
     QuiescentLevel,
     check_usable,
     counts_per_unit,
@@ -504,4 +503,5 @@ def quiescent_light(
         np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
         for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
     )
-    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process)
+    spread = float(level[used].std()) / survey.level
+    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process, spread)

@@ -409,6 +409,9 @@ class Change:
             if file is None:
                 raise InputError("the change 'spectrum' needs a file; give `change.file`", key="change.file")
             of_star, of_file = (photons(source.wavelength_nm, source.flux_flam, band) for source in (star, file))
+            if not of_file > 0:
+                fault = f"the spectrum of {file.name} must have light in the band {band}, but has none"
+                raise InputError(fault, key="change.band")
             nm, flux = file.wavelength_nm, of_star / of_file * file.flux_flam
             meaning = f"light of {file.name} over that of the star in {band}"
         elif (limits := _parse_band(name)) is not None:

@@ -43,6 +43,11 @@ def test_two_visits_are_the_two_sided_test_of_a_difference(fap: float, power: fl
     assert row["smallest_scatter"] / row["error"] == pytest.approx(scatter, rel=1e-4)
 
 
+def test_texts_name_no_exposure_that_rows_do_not_have() -> None:
+    answer = asked("sweep.axes=[{quantity='exposure', values=[10.0, 100.0]}]")
+    assert "50 s" not in " ".join([answer.headline, *(view.title for view in answer.views)])
+
+
 def test_smallest_changes_have_the_power() -> None:
     """Draws of 30 visits: 20 000 tests each, within 4 binomial standard errors (once in 16 000 times)."""
     number, fap, power, n = 30, 0.01, 0.8, 20_000
@@ -143,6 +148,10 @@ def test_spectrum_from_a_file_is_measured_in_its_band(tmp_path: Path) -> None:
     (row,) = asked("change.of=['spectrum']", f"change.file='{tmp_path / 'hot.csv'}'", "change.band='V'").changes
     lit = expect(hot.at_magnitude(9.0), MAUVE, exposure=50.0, sky=Sky.none())
     np.testing.assert_allclose(row.change.counts_dn, lit.net_source_dn, rtol=1e-6)
+    ultraviolet = Source.from_arrays(hot.wavelength_nm, np.where(hot.wavelength_nm < 300, hot.flux_flam, 0.0))
+    written(ultraviolet, tmp_path / "hot.csv")
+    with pytest.raises(ValueError, match="must have light in the band V"):
+        asked("change.of=['spectrum']", f"change.file='{tmp_path / 'hot.csv'}'", "change.band='V'")
 
 
 def peaks(time: np.ndarray, values: np.ndarray, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -115,6 +115,9 @@ def test_correlations_do_not_bridge_gaps() -> None:
     pairs = np.arange(4000) + np.arange(4000) // 2 * 50
     for second, alike in ((first, False), (np.roll(first, -1), True), (other, True)):
         assert levels.likeness(pairs, np.column_stack([first, second]).reshape(-1, 1)).alike == alike
+    # Five standard errors or 0.12.
+    for correlation, error, alike in ((0.2, 0.0401, True), (0.2, 0.0399, False), (-0.121, 0.01, False)):
+        assert levels.NoiseComparison(np.array([correlation]), np.array([error])).alike == alike
     # Visits of 40 frames have few pairs at long lags: 4000 correlations exceed five errors once in some 200 runs.
     rng = np.random.default_rng(303)
     numbers = (1000 * np.arange(12)[:, None] + np.arange(40)).ravel()

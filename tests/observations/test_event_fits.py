@@ -142,6 +142,17 @@ def test_level_norms_and_covariances_are_those_of_the_matrices(term: processes.P
     np.testing.assert_allclose(model.covariance(time, noise).squared_norms(columns, 30, time.size), exact, rtol=1e-9)
 
 
+def test_bins_of_a_long_light_curve_are_means_with_their_variance() -> None:
+    frames = np.delete(np.arange(24.0), [5, 6, 7, 14])
+    data = processes.BinnedLightCurve.of(10 * frames, frames**2, 1 + frames, 10.0, largest=7)
+    # Of three frames each, of which one is too few.
+    ends = ((0, 3), (3, 5), (9, 12), (12, 14), (15, 18), (18, 21), (21, 24))
+    bins = [np.arange(*map(float, pair)) for pair in ends]
+    expected = [(10 * of.mean(), (of**2).mean(), (1 + of).sum() / of.size**2) for of in bins]
+    np.testing.assert_allclose(np.column_stack([data.time_s, data.values, data.variance]), expected)
+    assert data.step_s == 30.0
+
+
 def test_coefficients_are_those_of_celerite2() -> None:
     """All bits, for parameters within and beyond the bounds of fits."""
     rng = np.random.default_rng(9)

@@ -67,10 +67,11 @@ def test_time_series_of_astropy_are_frames() -> None:
     assert (frames.unit, frames.scale, frames.reference_mjd) == ("Jy", "tdb", pytest.approx(61_000.0))
     # Binned ones need a mapping.
     series = BinnedTimeSeries(time_bin_start=WHEN, time_bin_size=18.0 * u.s, data={"flux": LIGHT[:, 0]})
-    how = frame_files.FrameMapping(time="time_bin_start", time_at="start", exposure="time_bin_size", flux="flux")
-    frames = frame_files.frames_of(series, how)
-    np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0 + 9.0, atol=2e-5)
-    np.testing.assert_allclose(frames.exposure_s, 18.0)
+    how = frame_files.FrameMapping(time="time_bin_start", exposure="time_bin_size", flux="flux")
+    for at, shift_s in (("start", 9.0), ("middle", 0.0), ("end", -9.0)):
+        frames = frame_files.frames_of(series, how.model_copy(update={"time_at": at}))
+        np.testing.assert_allclose(frames.time_s, np.arange(N) * 20.0 + shift_s, atol=2e-5)
+        np.testing.assert_allclose(frames.exposure_s, 18.0)
 
 
 @pytest.mark.parametrize("kind", [StdDevUncertainty, InverseVariance, None])

@@ -149,6 +149,11 @@ def test_probability_of_an_event_is_that_of_the_larger_rate() -> None:
     rates = np.array([events["rate_normal"].to_value("1 / d"), events["rate_measured"].to_value("1 / d")])
     assert (rates[0] != rates[1]).any()
     np.testing.assert_allclose(events["probability"], -np.expm1(-rates.max(axis=0) * analysis.days), rtol=1e-12)
+    number = np.count_nonzero(events["verdict"] == "detected")
+    assert answer.headline.startswith(f"{number} flares are detected in {3000 / 1440:.3g} star-days")
+    # The rates of more than some seven alarms in each simulated light curve are not known.
+    (expected,) = re.findall(r"where (\S+) are expected", answer.headline)
+    assert stats.poisson.ppf(0.001, float(expected)) <= number <= stats.poisson.ppf(0.999, float(expected))
 
 
 @pytest.mark.parametrize(
@@ -290,6 +295,10 @@ def test_events_do_not_depend_on_the_unit_of_the_light() -> None:
     whole, small = (analysed(noisy(407, time, size * light, 10 * size)).analysis for size in (1.0, 1e-17))
     assert small.threshold == pytest.approx(whole.threshold, rel=1e-6)
     assert [one.value for one in small.events] == pytest.approx([one.value for one in whole.events], rel=1e-6)
+    # Durations below zero are relative to the size of the level.
+    (event,) = analysed(noisy(407, time, light - 2000, 10.0)).analysis.events
+    assert event.summed_s == pytest.approx(whole.events[0].summed_s, rel=0.01)
+    assert event.summed_error_s == pytest.approx(whole.events[0].summed_error_s, rel=0.1)
 
 
 def test_counts_of_which_most_are_zero_have_their_mean() -> None:
