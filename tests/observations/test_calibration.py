@@ -135,6 +135,22 @@ def test_one_star_determines_throughput_alone() -> None:
     assert np.median(one.throughput.error) > 0.05
     assert any(text.startswith("NOT DETERMINED") for text in one.messages)
     assert any(text.startswith("One star") for text in one.messages)
+    assert "to 1 observation," in one.headline
+
+
+def test_maps_of_the_nominal_pixels_count_once() -> None:
+    """The fitted instrument has the light of the true one at any gain of its pixels, and their dark current."""
+    slope = np.linspace(-0.1, 0.1, NOMINAL.pixels)
+    maps = mauvecl.PixelMap(gain=1 + slope, dark=1.2 - slope)
+    true, rng = NOMINAL.with_(pixel_map=maps), np.random.default_rng(6)
+    study = study_of((("A0V", 5.0),), dark=False).with_instrument({"pixel_map": maps})
+    found = calibrate(study, frames=(frames_of(true, star("A0V", 5.0), [21.0], 40, rng),))
+    right, fitted = (expected(star("A0V", 5.0), one) for one in (true, found.instrument))
+    np.testing.assert_allclose(fitted.light_dn[5:-5], right.light_dn[5:-5], rtol=0.03)
+    np.testing.assert_allclose(fitted.dark_dn, right.dark_dn)
+    assert value_of(found, "dark current").nominal == pytest.approx(value_of(found, "dark current").value)
+    gain = value_of(found, "gain")
+    assert abs(gain.value - true.gain_dn_per_electron) < FAR * gain.error
 
 
 @pytest.mark.long
