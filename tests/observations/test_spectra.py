@@ -235,7 +235,16 @@ def test_light_of_a_second_is_that_of_frames_of_any_exposure(exposure_s: float) 
     frames = element_frames(np.ones((N, 48)))
     other = frame_model(STUDY, replace(frames, exposure_s=np.full(N, exposure_s)))
     assert not isinstance(other, str)
-    assert other.bins @ other.quiet.light_dn * other.per_dn == pytest.approx(light(), rel=1e-9)
+    quiet = other.bins @ other.quiet.light_dn * other.per_dn
+    assert quiet == pytest.approx(light(), rel=1e-9)
+    # The variance of two exposures, and what a raw one has besides the star.
+    two = other.exposure(quiet, other.variance(quiet), 2)
+    assert two.variance_dn2 * other.per_dn**2 == pytest.approx(2 * other.variance(quiet), rel=1e-9)
+    raw = replace(other, raw=True)
+    dark = other.quiet.recorded_dn - other.quiet.light_dn
+    assert raw.offset == pytest.approx(other.bins @ dark * other.per_dn, rel=1e-9)
+    # A degree warms the dark current of all the time.
+    assert raw.unknowns(quiet)["dark"] == pytest.approx(model().unknowns(light())["dark"], rel=1e-9)
 
 
 @pytest.mark.long
