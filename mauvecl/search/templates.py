@@ -213,7 +213,7 @@ class Templates:
     @property
     def coloured(self) -> bool:
         """True if the sums of a flare depend on its temperature by more than a factor."""
-        return self.directions.shape[1] > 1
+        return len(self.directions.T) > 1
 
     @property
     def loss(self) -> Float:
