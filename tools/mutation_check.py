@@ -526,7 +526,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "the light of a second for that of a frame": (
         "test_fit_recovers_values_and_throughput",
-        ("self.transfer.noise.gain * electrons * frames.exposure_s", "self.transfer.noise.gain * electrons"),
+        ("self.transfer.noise.gain) * electrons * frames.exposure_s", "self.transfer.noise.gain) * electrons"),
     ),
     "a colour relative to a known star": (
         "test_tables_of_default_questions_are_unchanged[analyse-spectra]",

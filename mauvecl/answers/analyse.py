@@ -553,7 +553,12 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
     if frames.flux.ndim == 1:
         return ""
     (case, *_), named = cases(study, swept=False), len(study.star) == 1
-    observation = study.observation.model_copy(update={"exposure_s": float(np.median(frames.exposure_s))})
+    exposure_s, changes = float(np.median(frames.exposure_s)), study.observation.changes
+    # An exposure consists of as many frames of equal length as come nearest to those of the instrument.
+    n_frames = max(1, round(exposure_s / case.instrument.frame_s))
+    if exposure_s != n_frames * case.instrument.frame_s:
+        changes = changes | {"frame_s": exposure_s / n_frames}
+    observation = study.observation.model_copy(update={"exposure_s": exposure_s, "changes": changes})
     case = case.with_sections(observation=observation, star=study.star if named else (ANY_STAR,))
     source = case.source
     try:

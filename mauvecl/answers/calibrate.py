@@ -132,8 +132,8 @@ class CalibrateAnswer(Answer):
     #: One row per value of the instrument.
     values_table = TableOf(
         "calibrate", COLUMNS, "values", key="rows", about=("dark.reference_c", "transfer.dark_unit", "study"),
-        title=lambda answer: f"{answer.nominal.name} fitted to {len(answer.stars)} standard star"
-        f"{'s' if len(answer.stars) > 1 else ''}; dark current at {answer.dark.reference_c:.1f} C",
+        title=lambda answer: f"{answer.nominal.name} fitted to {len(answer.stars)} observation"
+        f"{'s' if len(answer.stars) > 1 else ''} of standard stars; dark current at {answer.dark.reference_c:.1f} C",
     )  # fmt: skip
     #: One row per pixel: fitted and nominal throughput.
     throughput_table = TableOf(
@@ -161,11 +161,12 @@ class CalibrateAnswer(Answer):
         """Values of the instrument, fitted or assumed."""
         d, t, f, n = self.dark, self.transfer, self.throughput, self.nominal
         level = float(np.mean(d.level_dn_per_s))
-        at = float(n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * d.reference_c))
+        at = float(n.per_pixel("dark", 1.0).mean() * n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * d.reference_c))
+        bias = float(n.per_pixel("bias_dn", n.bias_dn).mean())
         rows = [
             FittedValue("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s"),
             FittedValue("dark slope", d.slope_per_c, d.slope_error, n.dark_slope_per_c, "1 / deg_C"),
-            FittedValue("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN"),
+            FittedValue("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), bias, "DN"),
             FittedValue("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron"),
             FittedValue("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN"),
         ]
@@ -189,8 +190,9 @@ class CalibrateAnswer(Answer):
     @property
     def headline(self) -> str:
         """The error of the throughput."""
+        n = len(self.observations)
         return (
-            f"The throughput of {self.nominal.name} is fitted to {len(self.observations)} observations, with a "
+            f"The throughput of {self.nominal.name} is fitted to {n} observation{'s' if n > 1 else ''}, with a "
             f"standard error of {100 * float(np.median(self.throughput.error)):.2g} % in the median pixel."
         )
 
@@ -318,8 +320,9 @@ class CalibrateAnswer(Answer):
         origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
         # Pixels that are not read have the mean of the others.
         level, bias, read = self.dark.level_dn_per_s, self.dark.bias_dn, self.nominal.read_pixels
-        dark, every_bias = np.ones(moved.pixels), np.full(moved.pixels, bias.mean())
-        dark[read], every_bias[read] = level / level.mean(), bias
+        level = level / (self.nominal.dark_dn_per_s if "dark current" in self.dark.assumed else level.mean())
+        dark, every_bias = np.full(moved.pixels, level.mean()), np.full(moved.pixels, bias.mean())
+        dark[read], every_bias[read] = level, bias
         by_pixel: dict[str, Any] = {"pixel": np.arange(moved.pixels), "dark": dark}
         for name, unit in (("response", 1), ("gain", 1), ("read_noise_dn", u.DN)):
             if (column := getattr(self.nominal.pixel_map, name, None)) is not None:

@@ -61,7 +61,8 @@ def survey_star(case: Case) -> Survey:
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
-    survey = Survey(Components(quiet, electrons_of_flare, templates.weights), stare, bank, templates)
+    components = Components(quiet, electrons_of_flare, templates.weights)
+    survey = Survey(components, stare, bank, templates, flare.temperature_k)
     if level.cycle and not len(survey.curves):
         raise InputError("search.cycle needs an unknown cycle of the stare: stare.cycles", key="search.cycle")
     return survey
@@ -280,8 +281,8 @@ class InjectAnswer(Answer):
     def views(self) -> list[View]:
         views = [InjectAnswer.search.view(self, f"The search: {self.study.search.rate_text} of frames")]
         for star in self.stars:
-            unit = f" ({SIZE_UNITS[star.size]})" if SIZE_UNITS[star.size] else ""
-            title = f"{star.title}: {star.size}{unit} of which a half (E50) and nine tenths (E90) are found"
+            size = star.size.replace("_", " ") + (f" ({SIZE_UNITS[star.size]})" if SIZE_UNITS[star.size] else "")
+            title = f"{star.title}: {size} of which a half (E50) and nine tenths (E90) are found"
             views.append(View(title, star.limit_columns, star.limits))
         return views
 
@@ -348,7 +349,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     peaks = map_in_order(engine, at_one_peak, range(positions))
     arrays = list(reported(peaks, positions, lambda done, total: report(done / total)))
     known_snr = 0.0
-    if any(case.stare.jitters.values()):
+    if frame_nuisances(survey.components.quiet, case.stare, choice.spreads()) is not None:
         (flare,) = case.one_frame.expect(case.one_frame.flaring(SMALL))
         known_snr = frame_signal(survey.components.quiet, flare, SMALL)
     critical = np.stack([array["critical"].T for array in arrays], axis=1) * per_amplitude[:, None]

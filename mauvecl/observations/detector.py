@@ -171,10 +171,11 @@ def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
 def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit, nominal: Instrument) -> Float:
     """Measure the variance of frames from differences of consecutive ones, where light and dark may jitter.
 
-    The rows of the result, shape (4, n_value), are the variance, light and dark of each usable pixel of each
-    observation (of dark frames, at each temperature) and the degrees of freedom of the variance.
+    The rows of the result, shape (5, n_value), are the variance, light and dark of each usable pixel of each
+    observation (of dark frames, at each temperature), the degrees of freedom of the variance, and the relative gain of
+    the pixel by the nominal map.
     """
-    measured = []
+    measured, gains = [], nominal.per_pixel("gain", 1.0)
     for frames in observations:
         breaks = np.flatnonzero(np.abs(np.diff(frames.temperature_c)) > SAME_TEMPERATURE_C) + 1
         for rows in np.split(np.arange(frames.n_frames), breaks if frames.star is None else []):
@@ -189,7 +190,8 @@ def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit,
             variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, counts]))
             # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann
             # 1941).
-            measured.append([variance, light, counts, np.full(light.size, 2 * n**2 / (3 * n - 1))])
+            dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
+            measured.append([variance, light, counts, dof, gains[usable]])
     return np.concatenate(measured, axis=1)
 
 
@@ -199,8 +201,9 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     Values that the data do not determine stay nominal. The standard error of the dark of a mean frame, `dark_error_dn`,
     adds to that of the read noise.
     """
-    variance, light, dark, dof = measured
-    fits = {"DN": _fit(light, dark, variance, dof), "electrons": _fit(light + dark, np.zeros_like(dark), variance, dof)}
+    variance, light, dark, dof, gains = measured
+    fits = {"DN": _fit(gains * light, dark, variance, dof),
+            "electrons": _fit(gains * (light + dark), np.zeros_like(dark), variance, dof)}  # fmt: skip
     better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
     assumed: tuple[str, ...] = ("unit of the dark counts",)
     if abs(better) > MIN_CHI2_DIFFERENCE:
@@ -209,9 +212,9 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     errors = np.sqrt(np.diag(covariance))
     if not gain > MIN_SNR * errors[1]:
         before, unknown = NoiseModel.nominal(nominal), ("gain", "read noise", "unit of the dark counts")
-        model, assumed_error = before.variance(light, dark), np.diag([0.0, (ASSUMED_GAIN_ERROR * before.gain) ** 2])
-        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, np.nan, 0, light, variance, model,
-                              unknown)  # fmt: skip
+        assumed_error = np.diag([0.0, (ASSUMED_GAIN_ERROR * before.gain) ** 2])
+        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, np.nan, 0, light, variance,
+                              before.variance(gains * light, dark), unknown)  # fmt: skip
     read = max(float(read), ROUNDING)
     noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
     read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))

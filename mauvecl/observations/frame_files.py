@@ -426,7 +426,7 @@ def _read_light(
     light, sd, flags, more = reduced or read_light(flux, error, _excluding_bits(quantities.get("quality"), bits))
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
-    light, sd = without_indefinite(light), None if sd is None else without_indefinite(sd)
+    sd = None if sd is None else without_indefinite(sd)
     marks, notes = marks_in(light, "value", "values")
     light = np.where(np.isin(light, marks), np.nan, light) if marks else light
     unused = [name for name in file.columns if FLAGS & {*words_of(name)}]

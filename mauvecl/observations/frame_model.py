@@ -83,7 +83,7 @@ class FrameModel:
         raw = cls(quiet, flare, bins, per_dn, True)
         # Where a pixel has far less light than bias and dark current, these were subtracted.
         included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
-        return raw if included.all() else replace(raw, raw=False)
+        return raw if included.all() and not frames.net else replace(raw, raw=False)
 
     @cached_property
     def offset(self) -> Float:
@@ -263,7 +263,8 @@ def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     assert frames.wavelength_nm is not None
     flux = frames.flux[:, fine]
     # Sums of pixels do not saturate.
-    ceiling = model.quiet.n_frames * model.quiet.ceiling_dn if model.raw else np.inf
+    single = model.raw & (model.bins.sum(axis=1) == 1)
+    ceiling = np.where(single, model.quiet.n_frames * model.quiet.ceiling_dn, np.inf)
     saturated = usable & (flux >= ceiling).any(axis=1)
     flux = flux - model.offset
     good = usable & ~saturated

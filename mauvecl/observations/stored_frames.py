@@ -18,7 +18,7 @@ from mauvecl.host.tables.files import check_folder, limit_bytes, parsing
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import match_name
 from mauvecl.host.tables.opening import read_table
-from mauvecl.host.tables.table import MemoryTable, TableFile, Values
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values, without_indefinite
 from mauvecl.observations.frames import MAX_FRAMES, live_pixels
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError, missing_package
@@ -283,13 +283,13 @@ def weighted_sums(
 
 
 def _without_flagged_pixels(flux: Values, quality: Values | None) -> Values:
-    """Return light that is NaN in pixels with their own quality flag."""
-    if quality is None or len(quality.shape) == 1:
-        return flux
+    """Return light that is NaN where it is missing, and in pixels with their own quality flag."""
 
     def read(piece: slice) -> Float:
-        values, flags = flux.rows(piece), quality.rows(piece) != 0
-        values[flags & ~flags.all(axis=1, keepdims=True)] = np.nan
+        values = without_indefinite(flux.rows(piece))
+        if quality is not None and len(quality.shape) == 2:
+            flags = quality.rows(piece) != 0
+            values[flags & ~flags.all(axis=1, keepdims=True)] = np.nan
         return values
 
     return replace(flux, read=read)
@@ -314,8 +314,8 @@ def _statistics(
     for piece in flux.pieces:
         values = flux.rows(piece)
         finite += np.isfinite(values).sum(axis=0)
-        if quality is not None and len(quality.shape) == 1:
-            values[quality.rows(piece) != 0] = np.nan
+        if quality is not None:
+            values[(quality.rows(piece).reshape(len(values), -1) != 0).all(axis=1)] = np.nan
         fine = np.isfinite(values)
         values[~fine] = np.nan
         steps = np.diff(values, axis=0, prepend=before)

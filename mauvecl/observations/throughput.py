@@ -231,14 +231,15 @@ class ThroughputModel:
                 slope, bend = (wide - narrow) / (2 * step), (wide + narrow - 2 * electrons) / (2 * step**2)
                 electrons = electrons + local * (slope + local * bend)
             electrons = np.maximum(electrons * self.nominal.per_pixel("response", 1.0), 0.0) + self.sky_electrons
-            light.append(self.transfer.noise.gain * electrons * frames.exposure_s)
+            light.append(self.nominal.per_pixel("gain", self.transfer.noise.gain) * electrons * frames.exposure_s)
         return np.array(light) if self.order == "physical" else np.array(light) * np.exp(log_factor)
 
     def variance_dn2(self, light_dn: Float) -> Float:
         """Return the variance of the mean frames of all stars, shape (n_star, n_pixel)."""
         frames = np.array([observation.n_frames for observation in self.stars])
         dark = self.dark_terms[:, :1] * self.dark.level_dn_per_s
-        return np.asarray(self.transfer.noise.variance(light_dn, dark) / frames[:, None])
+        gains = self.nominal.per_pixel("gain", 1.0)
+        return np.asarray(self.transfer.noise.variance(gains * light_dn, dark) / frames[:, None])
 
     def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
         """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""

@@ -176,8 +176,7 @@ class _StareSearch:
         rho, peak = float(values[direction, onset]), float(self.sums.survey.search.peaks_s(row)[onset])
         size = float(np.linalg.norm(templates.directions[templates.chosen[direction]]))
         amplitude = max(rho / float(row.per_amplitude[onset]), 1e-3) / size
-        kelvin = templates.temperatures_k[templates.chosen[direction]]
-        theta = np.array([np.log(amplitude), peak, np.log(width), np.log(kelvin)])
+        theta = np.array([np.log(amplitude), peak, np.log(width), self.sums.survey.log_k(direction)])
         return Candidate(theta, rho, (peak, width))
 
     def searched(self) -> list[Candidate]:
@@ -332,8 +331,8 @@ def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Mea
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    area = sums.survey.bank.shape.equivalent_duration
-    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=True)
+    area, coloured = sums.survey.bank.shape.equivalent_duration, sums.survey.templates.coloured
+    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured)
     return fitted, *_intervals(rows, best, j, snr, covariance, energy)
 
 
@@ -343,7 +342,9 @@ def _intervals(
     """Return the intervals of a flare's values, and a note."""
     area = np.log(rows.sums.survey.bank.shape.equivalent_duration)
     quantities = QUANTITIES | ({} if energy is None else {"energy": ProfiledQuantity(AMPLITUDE, energy)})
-    intervals, notes = {"energy": (np.nan, np.nan)}, []
+    intervals, notes = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan)), []
+    if not rows.sums.survey.templates.coloured:
+        del quantities["temperature_k"]
     for name, quantity in quantities.items():
         middle, slope = quantity.of(best.theta[j])
         sd = float(np.sqrt(slope @ covariance @ slope))

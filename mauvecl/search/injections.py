@@ -370,9 +370,9 @@ class CriticalAmplitudes:
                 if values[direction, template] < self.threshold:
                     continue
                 sums = noise[:, frames].T + amplitude * rise + np.sqrt(amplitude) * glow
-                kelvin = survey.templates.temperatures_k[survey.templates.chosen[direction]]
                 size, width = values[direction, template] / b[direction, template], site.widths_s[template]
-                start = np.array([[np.log(size), site.peaks_s[template], np.log(width), np.log(kelvin)]])
+                peak_s, log_k = site.peaks_s[template], survey.log_k(int(direction))
+                start = np.array([[np.log(size), peak_s, np.log(width), log_k]])
                 comparison = self._comparison(site, self.amplitudes[d, s], _fitted(survey, sums, start))
                 for name, values in comparison.items():
                     estimates[name][d, s] = values[0]

@@ -26,6 +26,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.fits.flare_model import MeanSums
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
@@ -363,6 +364,21 @@ class Survey:
     stare: Stare
     bank: Bank
     templates: Templates  # from which bank and components are made
+    temperature_k: float  # of flares, where their sums do not depend on it
+
+    @cached_property
+    def mean_sums(self) -> MeanSums:
+        """Mean sums of a flare of unit amplitude over log temperature."""
+        log_k, values = np.log(self.templates.temperatures_k), self.templates.directions
+        sums = MeanSums(values, np.zeros((0, values.shape[1])), log_k)
+        return sums if self.templates.coloured else replace(sums, hot=np.full_like(values, sums.spline(self.log_k(0))))
+
+    def log_k(self, direction: int) -> float:
+        """Return the logarithm of the temperature for a direction of the bank."""
+        kelvin, templates = self.temperature_k, self.templates
+        if templates.coloured:
+            kelvin = templates.temperatures_k[templates.chosen[direction]]
+        return float(np.log(np.clip(kelvin, templates.temperatures_k[0], templates.temperatures_k[-1])))
 
     @cached_property
     def coefficients(self) -> Float:

@@ -16,6 +16,7 @@ from scenes import source as star
 
 import mauvecl
 from mauvecl import Expectation, FlareModel, Frames, Instrument, Sky, Source, Study, calibrate, expect, measure, plan
+from mauvecl.observations.throughput import ThroughputModel
 
 NOMINAL = Instrument.load("mauvesim")
 SKY = Sky.of_brightness(22.1)
@@ -135,6 +136,28 @@ def test_one_star_determines_throughput_alone() -> None:
     assert np.median(one.throughput.error) > 0.05
     assert any(text.startswith("NOT DETERMINED") for text in one.messages)
     assert any(text.startswith("One star") for text in one.messages)
+    assert "to 1 observation," in one.headline
+    # The zodiacal light exceeds that of a star of V = 13.
+    faint, right = replace(one.stars[0], star=star("A0V", 13.0)), expected(star("A0V", 13.0), NOMINAL)
+    how: Any = {"knots": 12, "sky": SKY, "order": one.study.observation.order, "light_error": 0.0}
+    (light_dn,) = ThroughputModel([faint], NOMINAL, one.dark, one.transfer, **how).light_dn(np.zeros(1643), np.zeros(0))
+    gain = NOMINAL.gain_dn_per_electron / one.transfer.noise.gain
+    np.testing.assert_allclose(light_dn * gain, right.light_dn, rtol=1e-6)
+
+
+def test_maps_of_the_nominal_pixels_count_once() -> None:
+    """The fitted instrument has the light of the true one at any gain of its pixels, and their dark current."""
+    slope = np.linspace(-0.1, 0.1, NOMINAL.pixels)
+    maps = mauvecl.PixelMap(gain=1 + slope, dark=1.2 - slope)
+    true, rng = NOMINAL.with_(pixel_map=maps), np.random.default_rng(6)
+    study = study_of((("A0V", 5.0),), dark=False).with_instrument({"pixel_map": maps})
+    found = calibrate(study, frames=(frames_of(true, star("A0V", 5.0), [21.0], 40, rng),))
+    right, fitted = (expected(star("A0V", 5.0), one) for one in (true, found.instrument))
+    np.testing.assert_allclose(fitted.light_dn[5:-5], right.light_dn[5:-5], rtol=0.03)
+    np.testing.assert_allclose(fitted.dark_dn, right.dark_dn)
+    assert value_of(found, "dark current").nominal == pytest.approx(value_of(found, "dark current").value)
+    gain = value_of(found, "gain")
+    assert abs(gain.value - true.gain_dn_per_electron) < FAR * gain.error
 
 
 @pytest.mark.long
@@ -291,6 +314,8 @@ def test_written_instrument_is_the_fitted_one_whose_values_vary_together(tmp_pat
     ratio, error = (np.interp(nm, fitted.wavelength_nm, each) for each in (np.exp(fitted.log_factor), fitted.error))
     np.testing.assert_allclose(middle.throughput(nm) / NOMINAL.throughput(nm), ratio, rtol=3e-3)
     np.testing.assert_allclose(errors.sd(nm), error, rtol=0.01)
+    (shift, stretch), ends = fitted.shape_nm[:2], np.linspace(-1, 1, fitted.wavelength_nm.size)
+    np.testing.assert_allclose(middle.wavelength_nm, fitted.wavelength_nm + shift + stretch * ends, atol=1e-9)
     values = {one.name: one.error / one.value for one in found.values}
     of = {"gain": "conversion_uv_per_electron", "read noise": "read_noise_dn", "dark slope": "dark_slope_per_c"}
     for name, key in of.items():

@@ -50,6 +50,9 @@ def test_the_errors_are_those_of_the_chosen_flux() -> None:
     table.remove_column("flux")
     frames = frame_files.frames_of(table)
     assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
+    columns = {"time": np.arange(30.0), "flux": np.resize([-100.0, 100.0], 30), "flux_err": 5 * ones}
+    frames = frame_files.frames_of(Table(columns, units={"time": "s", "flux": "ppm", "flux_err": "ppm"}))
+    assert (frames.flux[0], frames.error[0]) == pytest.approx((1 - 1e-4, 5e-6))
 
 
 N = 30

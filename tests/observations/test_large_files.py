@@ -88,8 +88,9 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     rng, n, path = np.random.default_rng(29), 1500, tmp_path / "rows.fits"
     flux = rng.normal(1000.0, 5.0, (n, 50)) * np.linspace(0.5, 1.5, 50)
     error = 0.01 * flux
-    flux[:, 4], flux[11, 5] = np.nan, np.nan
-    columns = {"T": 20.0 * np.arange(n), "QUAL": (np.arange(n) == 7).astype(int), "FLUX": flux, "ERR": error,
+    flux[:, 4], flux[11, 5] = 9.97e36, np.nan
+    bad = (np.arange(n) == 7).astype(int)
+    columns = {"T": 20.0 * np.arange(n), "QUAL": bad, "DQ": np.tile(bad[:, None], 50), "FLUX": flux, "ERR": error,
                "W": np.tile(np.linspace(250.5, 650.5, 50), (n, 1))}  # fmt: skip
     Table(columns, units={"T": "s", "FLUX": "adu/s", "ERR": "adu/s", "W": "nm"}).write(path)
     how: dict[str, Any] = {"flux": "FLUX", "error": "ERR", "quality": "QUAL", "wavelength": "W", "exposure_s": 18.0}
@@ -102,7 +103,9 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
         np.testing.assert_allclose(found, wanted)
     np.testing.assert_array_equal(pieces.quality, whole.quality)
     assert "1 pixel is not finite in most frames" in pieces.remarks[-1]
-    pixels = frame_files.reduce_frames(path, mapping=mapping).pixels
+    pixels, same = (frame_files.reduce_frames(path, mapping=mapping.model_copy(update={"quality": name})).pixels
+                    for name in ("QUAL", "DQ"))  # fmt: skip
+    np.testing.assert_array_equal(same.mean, pixels.mean)
     quiet = np.delete(flux, 7, axis=0)
     np.testing.assert_allclose(pixels.mean[:4], quiet[:, :4].mean(axis=0))
     assert pixels.count[[3, 4, 5]].tolist() == [1499, 0, 1498]

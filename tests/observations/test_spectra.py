@@ -213,15 +213,38 @@ def test_saturated_pixels_and_missing_errors_of_raw_frames_are_stated() -> None:
 def test_counts_with_and_without_bias_and_dark_current_are_distinguished() -> None:
     """Relative sizes of flares depend on it: bias and dark current are a hundred times the light of this star."""
     raw, quiet, levels = raw_counts(312, 40), model().quiet, list[float]()
-    for flux in (raw, raw - quiet.bias_dn - quiet.dark_dn):
-        frames = raw_frames(flux)
+    elements = np.add.reduceat(raw, np.flatnonzero(np.diff(quiet.element, prepend=-1)), axis=1)
+    summed = replace(raw_frames(raw), flux=elements, wavelength_nm=quiet.element_wavelength_nm)
+    for frames in (raw_frames(raw), summed, raw_frames(raw - quiet.bias_dn - quiet.dark_dn)):
         found = frame_model(STUDY, frames)
         assert not isinstance(found, str)
-        assert found.raw == (flux is raw)
+        assert found.raw == (np.median(frames.flux) > np.median(quiet.bias_dn))
         levels.append(float(np.median(models.clean_spectra(frames, found).frames.white_light[0])))
-    assert levels[0] == pytest.approx(levels[1], rel=1e-6)
+        # A star far brighter than bias and dark current, which are known to be subtracted.
+        net = frame_model(STUDY, replace(frames, net=True))
+        assert not isinstance(net, str)
+        assert not net.raw
+    assert levels[1:] == pytest.approx(levels[:2], rel=1e-6)
     # The noise of 40 frames is 1 % of the light.
     assert levels[0] == pytest.approx(quiet.light_dn.sum(), rel=0.06)
+
+
+@pytest.mark.parametrize("exposure_s", [3.0, 5.00002, 12.0, 50.0])
+def test_light_of_a_second_is_that_of_frames_of_any_exposure(exposure_s: float) -> None:
+    """Also where an exposure is no multiple of the instrument's frames, such as by the rounding of its times."""
+    frames = element_frames(np.ones((N, 48)))
+    other = frame_model(STUDY, replace(frames, exposure_s=np.full(N, exposure_s)))
+    assert not isinstance(other, str)
+    quiet = other.bins @ other.quiet.light_dn * other.per_dn
+    assert quiet == pytest.approx(light(), rel=1e-9)
+    # The variance of two exposures, and what a raw one has besides the star.
+    two = other.exposure(quiet, other.variance(quiet), 2)
+    assert two.variance_dn2 * other.per_dn**2 == pytest.approx(2 * other.variance(quiet), rel=1e-9)
+    raw = replace(other, raw=True)
+    dark = other.quiet.recorded_dn - other.quiet.light_dn
+    assert raw.offset == pytest.approx(other.bins @ dark * other.per_dn, rel=1e-9)
+    # A degree warms the dark current of all the time.
+    assert raw.unknowns(quiet)["dark"] == pytest.approx(model().unknowns(light())["dark"], rel=1e-9)
 
 
 @pytest.mark.long
