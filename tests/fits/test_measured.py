@@ -159,6 +159,22 @@ def test_intervals_of_a_bright_flare_of_another_shape_follow_its_standard_errors
         assert np.abs(np.log(ratios[:, found.column(name)])).max() < 0.25, (name, ratios[:, found.column(name)])
 
 
+def test_intervals_of_an_open_cooling_contain_their_estimates() -> None:
+    """Fit 6 faint flares, whose final temperatures range from the least one of the model to that of the peak."""
+    x, rng = quiet(), np.random.default_rng(0)
+    mean = x.recorded_dn + 0.2 * (recorded(Cooling(12_000.0, 5000.0, 150.0), Stare.of(300.0)) - x.recorded_dn)
+    variance = x.variance_dn2 + x.gain_dn_per_electron * (mean - x.recorded_dn)
+    ends = []
+    for _ in range(6):
+        raw = mean + np.sqrt(variance) * rng.standard_normal(mean.shape)
+        found = fit_cooling(raw, x, model(), **START)
+        within = np.array([found.low[1, 0], found.low[0, 0], found.estimates[0], found.high[0, 0], found.high[1, 0]])
+        assert (within[1:] >= within[:-1] * (1 - 1e-3)).all(), within
+        ends.append(found.estimates[0, 4])
+        assert np.exp(model().log_k[0]) * (1 - 1e-9) <= ends[-1] <= found.estimates[0, 3]
+    assert min(ends) < 3010.0
+
+
 @pytest.mark.long
 def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
     found = fit_cooling(recorded(STEADY, Stare.of(150.0)), quiet(), model(), levels=(0.95,), **START)
