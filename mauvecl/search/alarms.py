@@ -332,8 +332,8 @@ def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Mea
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    area = sums.survey.bank.shape.equivalent_duration
-    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=True)
+    area, coloured = sums.survey.bank.shape.equivalent_duration, sums.survey.templates.coloured
+    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured)
     return fitted, *_intervals(rows, best, j, snr, covariance, energy)
 
 
@@ -345,6 +345,9 @@ def _intervals(
     quantities = QUANTITIES | ({} if energy is None else {"energy": ProfiledQuantity(AMPLITUDE, energy)})
     intervals, notes = {"energy": (np.nan, np.nan)}, []
     for name, quantity in quantities.items():
+        if quantity.column == KELVIN and not rows.sums.survey.templates.coloured:
+            intervals[name] = (np.nan, np.nan)
+            continue
         middle, slope = quantity.of(best.theta[j])
         sd = float(np.sqrt(slope @ covariance @ slope))
         low, high, is_open = middle - sd, middle + sd, False

@@ -94,7 +94,7 @@ class SummedStare:
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
-        widths, kelvin = self.survey.bank.half_widths_s, self.survey.templates.mean_sums.log_k
+        widths, kelvin = self.survey.bank.half_widths_s, self.survey.mean_sums.log_k
         first, last = self.edges[0, 0], self.edges[-1, 1]
         narrow, wide = np.log(widths[0] / BEYOND_BANK), np.log(widths[-1] * BEYOND_BANK)
         low, high = LOG_AMPLITUDES
@@ -109,14 +109,14 @@ class SummedStare:
         """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
         total = np.zeros_like(self.net)[frames]
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None] * self.survey.templates.mean_sums.spline(flare[KELVIN])
+            total[inside] += mean[:, None] * self.survey.mean_sums.spline(flare[KELVIN])
         return total
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
         """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
-        total, templates = self.survey.covariance[frames].copy(), self.survey.templates
+        total = self.survey.covariance[frames].copy()
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None, None] * templates.noise[templates.nearest(float(np.exp(flare[KELVIN])))]
+            total[inside] += mean[:, None, None] * self.survey.photon_noise(flare[KELVIN])
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.
@@ -209,7 +209,7 @@ class Block:
     def model(self, theta: Float) -> tuple[Float, Float]:
         """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
         times, (first, last) = self._times
-        shape, spline = self.sums.survey.bank.shape, self.sums.survey.templates.mean_sums.spline
+        shape, spline = self.sums.survey.bank.shape, self.sums.survey.mean_sums.spline
         length = times[last] - times[first]
         width = np.exp(theta[:, WIDTH, None])
         tau = (times - theta[:, PEAK, None]) / width  # (n_flare, n_time)
@@ -251,7 +251,7 @@ class Block:
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
         _, rows = self.residuals(theta.ravel())
-        scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-150)
         inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), hermitian=True) / np.outer(scale, scale)
         return np.asarray(inverse.reshape(theta.shape * 2))
 
@@ -292,7 +292,7 @@ class FittedFlares:
     amplitude_error: Float
     half_width_s: Float
     half_width_error_s: Float
-    temperature_k: Float  # NaN if the templates have only one temperature
+    temperature_k: Float  # NaN if the sums do not tell the temperature
     temperature_error_k: Float
     equivalent_duration_s: Float  # proportional to the energy
     equivalent_duration_error_s: Float

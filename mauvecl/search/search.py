@@ -26,6 +26,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.fits.flare_model import MeanSums
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.flares.stare_scene import StaresRequest, method_for
@@ -373,6 +374,20 @@ class Survey:
     def response(self) -> Float:
         """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
         return np.asarray(self.components.component_means[len(STEADY)])
+
+    @cached_property
+    def mean_sums(self) -> MeanSums:
+        """Mean sums of a flare of unit amplitude over log temperature; of the first component if they tell none."""
+        log_k, values = np.log(self.templates.temperatures_k), self.templates.directions
+        if not self.templates.coloured:
+            values = np.tile(self.response, (log_k.size, 1))
+        return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
+
+    def photon_noise(self, log_k: float) -> Float:
+        """Return the covariance of a frame's sums that a flare of unit amplitude adds, (n_sum, n_sum)."""
+        if self.templates.coloured:
+            return np.asarray(self.templates.noise[self.templates.nearest(float(np.exp(log_k)))])
+        return np.asarray(self.components.sum_cumulants(2)[1][len(STEADY)])
 
     @property
     def unit_snr(self) -> float:

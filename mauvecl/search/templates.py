@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from mauvecl.detection.nuisances import Nuisances
-from mauvecl.fits.flare_model import MeanSums, spanning_weights
+from mauvecl.fits.flare_model import spanning_weights
 from mauvecl.flares.settings import RANK, WINDOW_S
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.noise.unknowns import CHANGED_PART
@@ -214,15 +214,6 @@ class Templates:
     def coloured(self) -> bool:
         """True if the sums of a flare depend on its temperature by more than a factor."""
         return len(self.temperatures_k) > 1 and self.directions.shape[1] > 1
-
-    @cached_property
-    def mean_sums(self) -> MeanSums:
-        """Mean sums of a flare of unit amplitude over log temperature."""
-        log_k, values = np.log(self.temperatures_k), self.directions
-        if log_k.size == 1:
-            # The same at any temperature.
-            log_k, values = log_k + np.array([-1.0, 1.0]), np.tile(values, (2, 1))
-        return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
 
     @property
     def loss(self) -> Float:

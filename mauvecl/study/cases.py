@@ -51,7 +51,7 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     angles = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
     least = ", ".join(f"{name} {value:g} deg" for name, value in angles.items() if value is not None)
     words: dict[str, Callable[[], str]] = {
-        "instrument": lambda: _instrument(study, swept, along_orbit="orbit" in uses and study.plan.along_orbit),
+        "instrument": lambda: _instrument(study, swept, uses),
         "sky": lambda: "sky as swept" if "sky" in swept else study.sky.describe(),
         "flare": lambda: _flare(study, swept),
         "orbit": lambda: f"orbit of {orbit.name if orbit else 'embedded elements'}; least angles: {least or 'none'}",
@@ -68,15 +68,17 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     return [*(clause() for part, clause in words.items() if part in parts), *ignored]
 
 
-def _instrument(study: Study, swept: set[str], *, along_orbit: bool) -> str:
+def _instrument(study: Study, swept: set[str], uses: Collection[str]) -> str:
     o = study.observation
     text = f"instrument {o.instrument}"
     if o.changes:
         text += f" with another {', '.join(o.changes)}"
     if "detector_temperature" in swept:
         return f"{text}, detector temperature as swept"
-    if along_orbit and o.temperature_c is None:
+    if "orbit" in uses and study.plan.along_orbit and o.temperature_c is None:
         return f"{text}, detector temperature along the orbit"
+    if "orbit" not in uses and "stare" in uses and study.stare.along_orbit:
+        return f"{text}, detector temperature of the stare along the orbit"
     return f"{text}, detector at {study.observation.load_instrument().temperature_c:g} deg C"
 
 
