@@ -407,14 +407,16 @@ def stare(
         lost, drifts = star.pointing_loss, star.staring.stare.pointing
         if lost is not None and drifts is not None:
             messages.append(
-                f"POINTING DRIFTS: {star.drifting_frames} of {lost.size} frames at {star.title} lose light, up to "
+                f"POINTING DRIFTS: {star.drifting_frames} of {lost.size} frames at {star.title} "
+                f"{'loses' if star.drifting_frames == 1 else 'lose'} light, up to "
                 f"{100 * lost.max():.3g} %; assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on "
                 f"average, with up to {100 * drifts.depth:g} % of the light lost. The search marginalises over the "
                 "level of each frame."
             )
         saturated = np.count_nonzero(star.staring.quality)
         if saturated:
-            text = f"SATURATED: {saturated} frames of the stare at {star.title}; their quality is 1."
+            frames_of = f"{saturated} frame{'' if saturated == 1 else 's'} of the stare at {star.title}"
+            text = f"SATURATED: {frames_of}, marked by a quality of 1."
             messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)
 

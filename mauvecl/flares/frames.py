@@ -266,10 +266,10 @@ class StareExpectation:
     def raw(self, draw: Draw) -> Float:
         """Return drawn raw counts of each pixel, DN, shape (n_frame, n_pixel); saturated pixels hold their mean."""
         frames = np.tile(self.quiet.recorded_dn, (self.stare.n_frames, 1))
-        pixels = np.flatnonzero(self.used)
+        pixels, of_one_pixel = np.flatnonzero(self.used), np.eye(self.used.size)
         for begin in range(0, pixels.size, MOST_STATISTICS):
             part = pixels[begin : begin + MOST_STATISTICS]
-            frames[:, part] += draw(self.components(np.eye(self.used.size)[part]))
+            frames[:, part] += draw(self.components(of_one_pixel[part]))
         return frames
 
     @property

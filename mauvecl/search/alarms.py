@@ -332,8 +332,7 @@ def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Mea
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    area, coloured = sums.survey.bank.shape.equivalent_duration, sums.survey.templates.coloured
-    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured)
+    fitted = FittedFlares.of(theta[None], covariance[None], sums.survey, np.array([snr]))
     return fitted, *_intervals(rows, best, j, snr, covariance, energy)
 
 

@@ -396,9 +396,8 @@ def _fitted(survey: Survey, sums: Single, start: Float) -> FittedFlares:
     block = SummedStare(survey, sums.astype(np.float64)).block(start, per_group=per_group)
     best = block.fit(start)
     snr = np.sqrt(max(block.without(best, 0).chi2 - best.chi2, 0.0))
-    area, coloured = survey.bank.shape.equivalent_duration, survey.templates.coloured
     covariance = block.covariance(best.theta)[:, :, 0].transpose(0, 2, 1)
-    return FittedFlares.of(best.theta, covariance, area, np.array([snr]), coloured=coloured)
+    return FittedFlares.of(best.theta, covariance, survey, np.array([snr]))
 
 
 def _multiple(values: Single, step: float) -> Single:
