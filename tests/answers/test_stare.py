@@ -76,6 +76,7 @@ def test_fits_file_has_the_columns_of_lightkurve(found):
         assert "ORIGIN" not in hdus[0].header
         assert table.header["MJDREFI"] == 61041
         assert (table.header["TIMESYS"], table.header["TREFPOS"]) == ("UTC", "TOPOCENTER")
+        np.testing.assert_allclose([86_400 * table.header[name] for name in ("EXPOSURE", "TSTOP")], [250, 300])
         assert hdus[0].header["CCD-TEMP"] == 21.0
         assert table.columns.names[:6] == ["TIME", "CADENCENO", "QUALITY", "FLUX", "FLUX_ERR", "MEAN"]
         assert table.columns["TIME"].unit == "d"

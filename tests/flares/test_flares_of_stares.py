@@ -201,6 +201,20 @@ def test_curves_are_averaged_over_frames(curve):
     np.testing.assert_allclose(curve.mean_over(start, 5.0), exact, atol=1e-12)
 
 
+def test_orbits_and_priors_of_exposures_are_those_of_frames():
+    """A normal prior is an offset of its relative standard deviation about its mean, in quadrature with the stare's."""
+    asked = paper("stare.search=false", "stare.duration_s=250", "stare.orbit_s=100", "stare.orbit_gap_s=30",
+                  "stare.gaps=[[0, 10]]", "stare.offsets.temperature=0.4",
+                  "processes.light_loss={normal=[0.4, 0.03], between=[0.1, 0.7]}",
+                  "processes.detector_temperature={normal=[20, 0.3], between=[15, 25]}")  # fmt: skip
+    found = stare(asked).stares[0].staring.stare
+    np.testing.assert_allclose(found.gtis, [[10, 70], [100, 170], [200, 250]])
+    np.testing.assert_allclose(found.light, 0.6 / (1 - MAUVE.light_loss))
+    np.testing.assert_allclose(found.temperature_c, 20.0)
+    sds = {unknown.name: unknown.sd for unknown in found.unknowns}
+    assert sds == pytest.approx({"light offset": 0.05, "temperature offset": 0.5})
+
+
 def test_known_conditions_and_unknowns_are_separate():
     stare = Stare.of(
         Study().stare.orbit_s, thermal=0.5, temperature_c=13.0, variability=points((0.0, 0.0), (6000.0, 0.06)),
@@ -272,6 +286,7 @@ def test_source_of_the_orbit_is_stated() -> None:
     assert "detector temperature of the stare along the orbit" in answer.assumed
     with fits.open(io.BytesIO(answer.documents["light-curve-1.fits"]())) as hdus:
         assert hdus[1].header["MJDREFI"] + hdus[1].header["MJDREFF"] == Time(START).mjd
-        assert hdus[0].header["RA_OBJ"] == pytest.approx(53.2327, abs=1e-3)
+        place = [hdus[0].header[name] for name in ("RA_OBJ", "DEC_OBJ")]
+        assert place == pytest.approx([53.2327, -9.4583], abs=1e-3)
     assert sum("mean Sun-synchronous" in line for line in stare(asked("2027-01-10")).messages) == 1
     assert not any("orbit" in line for line in stare(paper("stare.search=false")).messages)
