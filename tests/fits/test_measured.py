@@ -203,7 +203,7 @@ def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
     assert abs(fit_cooling(spoiled, quiet(), model(), cooling=False, levels=(), **START).estimates[0, 3] - 9000) > 500
 
 
-def test_pointing_drifts_are_unknown_levels_of_light() -> None:
+def test_pointing_drifts_and_jitters_are_unknown_levels_of_light() -> None:
     """A drift of 10 % costs a joint fit as much as such a jitter, and a bin as much as such an offset."""
     drifts = Study().with_settings(["stare.pointing={rate_per_h=10, duration_s=30, depth=0.1}"]).stare.pointing
     drifting, plain = Stare.of(150.0, pointing=drifts), Stare.of(150.0)
@@ -216,12 +216,18 @@ def test_pointing_drifts_are_unknown_levels_of_light() -> None:
     np.testing.assert_allclose(found.errors, jitter.errors, rtol=1e-9)
     free = Nuisances.of(quiet(), {"dark": np.inf})
     assert joint(drifting, nuisances=free).dof == found.dof - 1
-    along, offset, known = (
-        measure_along(frames, quiet(), model(), stare=stare, snr_per_bin=60.0, levels=(0.5,)).found.errors
-        for stare in (drifting, Stare.of(150.0, offsets={"light": 0.1}), plain)
-    )
-    np.testing.assert_allclose(along, offset, rtol=1e-9)
-    assert (along[:, 1] > 2 * known[:, 1]).all()
+
+    def binned(**changes: Any) -> Any:
+        stare = Stare.of(150.0, **changes)
+        return measure_along(frames, quiet(), model(), stare=stare, snr_per_bin=60.0, levels=(0.5,))
+
+    along, offset, known = binned(pointing=drifts), binned(offsets={"light": 0.1}), binned()
+    np.testing.assert_allclose(along.found.errors, offset.found.errors, rtol=1e-9)
+    assert (along.found.errors[:, 1] > 2 * known.found.errors[:, 1]).all()
+    # Jitters average over the frames of a bin.
+    one, other = binned(jitters={"light": 0.1}), binned(offsets={"light": 0.1 / np.sqrt(known.count[-1])})
+    np.testing.assert_allclose(one.found.errors[-1], other.found.errors[-1], rtol=1e-9)
+    assert known.count[-1] > 1
 
 
 @pytest.mark.parametrize(("unknown", "count"), [
