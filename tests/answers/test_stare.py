@@ -167,6 +167,7 @@ def test_unknowns_of_a_stare_are_drawn_if_requested(stares, found):
 def test_table_counts_the_saturated_frames(stares):
     bright = stare(SHORT.with_settings(["star.0.magnitude=2.2", "flare.amplitudes=[3]"]), stares)
     assert 0 < bright.table["saturated_frames"][0] == bright.stares[0].staring.quality.sum() < 50
+    assert "everything known but the noise; known changes of the stare: thermal; seed" in bright.assumed
     assert bright.headline == "The stare has 1 flare in 50 frames of G2V V = 2.2, which is not searched for."
 
 

@@ -56,6 +56,7 @@ def test_light_of_the_frames_is_that_of_the_flares_and_gaps_have_none() -> None:
          "cooling": {"end_k": 10_000.0, "fold_s": 100.0}},
     ]  # fmt: skip
     answer = drawn(events, stare={"gaps": [[450.0, 650.0]]})
+    assert "flares of 10000 K or as events state, added" in answer.assumed
     table = answer.light_curve()
     assert len(table) == 400 - 40
     assert not ((table["time"].value > 450) & (table["time"].value < 650)).any()
