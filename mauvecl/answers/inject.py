@@ -61,8 +61,7 @@ def survey_star(case: Case) -> Survey:
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
-    components = Components(quiet, electrons_of_flare, templates.weights)
-    survey = Survey(components, stare, bank, templates, flare.temperature_k)
+    survey = Survey(Components(quiet, electrons_of_flare, templates.weights), stare, bank, templates)
     if level.cycle and not len(survey.curves):
         raise InputError("search.cycle needs an unknown cycle of the stare: stare.cycles", key="search.cycle")
     return survey

@@ -36,6 +36,7 @@ from mauvecl.schema.fields import DAY_S
 from mauvecl.search import false_alarms
 from mauvecl.search.alarms import Alarm, alarms
 from mauvecl.study.cases import Case, cases, collect_messages, place_columns
+from mauvecl.study.plan import targets_of
 from mauvecl.study.questions import check_sweep
 from mauvecl.study.stare import orbit_lines, threshold_line
 from mauvecl.study.study import Study
@@ -145,7 +146,8 @@ class FoundFlare(StarInCell):
 
     alarm: Alarm
     bolometric_erg: float  # of the fit; NaN if the star's size is unknown
-    # Number of the nearest flare of the stare within a half-width and two frames, from 1 on; 0 if there is none.
+    # Number of the nearest flare of the stare within a half-width and two frames, from 1 on; 0 if there is none, and -1
+    # if the fit gives no time.
     event: int
 
 
@@ -234,15 +236,15 @@ FOUND_COLUMNS = (
              "amplitude_error"),
     *_fitted("half_width", "half_width_s", "s", "t_1/2 of the search's shape", "half-width (s)", with_error,
              "half_width_error", detail=True),
-    *_fitted("temperature", "temperature_k", "K", "blackbody temperature", "temperature (K)", with_error,
-             "temperature_error"),
+    *_fitted("temperature", "temperature_k", "K", "blackbody temperature; one sum of a frame tells none, and fits take "
+             "that of the study's flare", "temperature (K)", with_error, "temperature_error"),
     *_fitted("equivalent_duration", "equivalent_duration_s", "s", "in the flare's band"),
     Column("energy_bolometric", "bolometric_erg", "erg", "", "bolometric (erg)", number(".3g")),
     *interval_columns("energy_bolometric_{}", lambda row: row.alarm.intervals["energy"], "erg", "its 68 % interval"),
     Column("value", "alarm.rho", "", "the search's statistic when it was found: S/N of the template that fits best",
            "value", ".2f", detail=True),
-    Column("event", "", "", "row of the star's flares that it is nearest to, from 1 on; 0: none near", "flare",
-           lambda event: str(event) if event else "none", kind=int),
+    Column("event", "", "", "row of the star's flares that it is nearest to, from 1 on; 0: none near; -1: not measured",
+           "flare", lambda event: str(event) if event > 0 else "" if event else "none", kind=int),
     Column("window", "alarm.block", "",
            "number of the window that it was fitted in; flares of one number were fitted together", kind=int),
     Column("chi2", "alarm.chi2", "", "of this fit"),
@@ -313,13 +315,15 @@ class StareAnswer(Answer):
         stare = self.stares[0]
         frames, flares = stare.staring.stare.n_frames, len(stare.flares)
         least = first_of(len(self.stares), "stares")
-        drawn = f"flare{'' if flares == 1 else 's'} in {frames} frames of {stare.title}"
+        drawn = f"flare{'' if flares == 1 else 's'} in {frames} frame{'' if frames == 1 else 's'} of {stare.title}"
         if np.isnan(stare.threshold):
-            return f"The stare has {flares} {drawn}, which are not searched for{least}."
-        number_found = len({flare.event for flare in stare.found if flare.event})
-        false = sum(not flare.event for flare in stare.found)
+            are = "is" if flares == 1 else "are"
+            return f"The stare has {flares} {drawn}, which {are} not searched for{least}."
+        events = [flare.event for flare in stare.found]
+        number_found, false, unknown = len({*events} - {0, -1}), events.count(0), events.count(-1)
         alarms = f"{false or 'no'} false alarm{'' if false == 1 else 's'}"
-        return f"The search finds {number_found} of {flares} {drawn} and raises {alarms}{least}."
+        rest = f"; {unknown} alarm{' is' if unknown == 1 else 's are'} not measured" if unknown else ""
+        return f"The search finds {number_found} of {flares} {drawn} and raises {alarms}{least}{rest}."
 
     @property
     def views(self) -> list[View]:
@@ -353,8 +357,12 @@ class StareAnswer(Answer):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """A FITS file of each star and cell: light curve, good time intervals, dynamic spectrum."""
-        study = self.study
-        of = partial(light_curve_file, sky=study.sky, seed=study.run.seed, number=study.stare.number)
+        study, sky = self.study, self.study.sky
+        if study.stare.along_orbit:
+            (target,) = targets_of(study.orbit, study.plan)
+            place = f"{target.ra_deg} {target.dec_deg}"
+            sky = sky.model_copy(update={"time": study.orbit.start, "target": place})
+        of = partial(light_curve_file, sky=sky, seed=study.run.seed, number=study.stare.number)
         return {f"light-curve-{n}.fits": partial(of, star) for n, star in enumerate(self.stares, 1)}
 
     @property
@@ -399,14 +407,16 @@ def stare(
         lost, drifts = star.pointing_loss, star.staring.stare.pointing
         if lost is not None and drifts is not None:
             messages.append(
-                f"POINTING DRIFTS: {star.drifting_frames} of {lost.size} frames at {star.title} lose light, up to "
+                f"POINTING DRIFTS: {star.drifting_frames} of {lost.size} frames at {star.title} "
+                f"{'loses' if star.drifting_frames == 1 else 'lose'} light, up to "
                 f"{100 * lost.max():.3g} %; assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on "
                 f"average, with up to {100 * drifts.depth:g} % of the light lost. The search marginalises over the "
                 "level of each frame."
             )
         saturated = np.count_nonzero(star.staring.quality)
         if saturated:
-            text = f"SATURATED: {saturated} frames of the stare at {star.title}; their quality is 1."
+            frames_of = f"{saturated} frame{'' if saturated == 1 else 's'} of the stare at {star.title}"
+            text = f"SATURATED: {frames_of}, marked by a quality of 1."
             messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)
 
@@ -446,7 +456,6 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
     study, staring = case.study, case.stare_expectation
     try:
         survey = survey_star(case)
-        survey = replace(survey, components=staring.components(survey.templates.weights))
 
         def computed() -> Arrays:
             tail = false_alarms.sampled_rate(survey, study.run.seed)
@@ -456,8 +465,9 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
     except InputError as error:
         return {"unsearched": Message(f"{case.label} is not searched: {error}.", "not searched")}
     threshold = float(tail["threshold"])
-    scale = log_energy(case, survey.templates.temperatures_k)
-    raised = alarms(survey, draw(survey.components), threshold, scale)
+    coloured = survey.templates.coloured
+    scale = log_energy(case, survey.templates.temperatures_k if coloured else (study.flare.temperature_k,))
+    raised = alarms(survey, draw(staring.components(survey.templates.weights)), threshold, scale)
     flares = [_found_flare(case, alarm) for alarm in raised]
     return {"threshold": threshold, "shifted": bool(tail["shifted"]), "found": flares}
 
@@ -465,7 +475,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> dict[str, 
 def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
     """Return an alarm with the energy of its flare and the number of the nearest flare of the stare."""
     if not alarm.measured:
-        return FoundFlare(case.label, case.at, alarm, float("nan"), 0)
+        return FoundFlare(case.label, case.at, alarm, float("nan"), -1)
     fit = alarm.recovered
     kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
     values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
@@ -486,9 +496,12 @@ def log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
     unit = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
     events = [replace(unit, temperature=k) for k in kelvin]
     energies = np.array([_found_energy(case, event) for event in events])
-    if len(kelvin) < 2 or not (np.isfinite(energies) & (energies > 0)).all():
+    if not (np.isfinite(energies) & (energies > 0)).all():
         return None
-    spline = CubicSpline(np.log(kelvin), np.log(energies / unit.equivalent_duration_s))
+    logs = np.log(energies / unit.equivalent_duration_s)
+    if logs.size == 1:
+        return lambda _: (float(logs[0]), 0.0)
+    spline = CubicSpline(np.log(kelvin), logs)
     return lambda x: (float(spline(x)), float(spline(x, 1)))
 
 

@@ -23,6 +23,8 @@ LARGEST_SINE = 1.0 - 1e-9
 NEWTON_STEPS, LONGEST, CONVERGED, RIDGE = 200, 1.5, 1e-3, 1e-10
 #: Factor on the lengths of all steps after one that turns back.
 SHORTER = 0.5
+#: Largest number of holds and releases per parameter.
+TURNS = 3
 
 
 def least_squares(
@@ -62,8 +64,7 @@ def interval_end(
 
     The end is the lower one if `rise` is negative. The second value is 1, or the share of the rise (below 1) that
     chi-squared has reached where the search stops without an end within the limits of the parameters. Each step goes
-    to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals. A parameter that
-    reaches a limit stays there.
+    to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals, within the limits.
 
     Parameters
     ----------
@@ -79,30 +80,66 @@ def interval_end(
         Numbers of the parameters that change, all by default.
     """
     (low, high), there, unit = limits, theta.copy(), np.sqrt(abs(rise))
-    free = np.arange(theta.size) if free is None else free
+    fitted = np.arange(theta.size) if free is None else free
     damping, last_change = 1.0, np.zeros(1)
     for _ in range(NEWTON_STEPS):
         residuals, derivatives = linearised(there)
         # A parameter without any effect, such as the cooling time of a flare that does not cool, keeps its value.
         power = np.sum(derivatives**2, axis=0)
-        free = free[power[free] > 0.0]
-        jacobian, slope = derivatives[:, free], quantity(there)[1][free]
+        free = fitted[power[fitted] > 0.0]
+        jacobian, slope = derivatives[:, free], np.sign(rise) * quantity(there)[1][free]
         information = jacobian.T @ jacobian + np.diag(RIDGE * power[free])
-        back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
-        if not slope @ along > 0.0:
-            break
-        room = chi2 + abs(rise) - float(residuals @ residuals + residuals @ jacobian @ back)
-        step = back + np.sign(rise) * np.sqrt(max(room, 0.0) / (slope @ along)) * along
+        distances = (low - there)[free], (high - there)[free]
+        room = chi2 + abs(rise) - float(residuals @ residuals)
+        step, held = _bounded_step(information, residuals @ jacobian, slope, room, distances)
         change = jacobian @ step
         # Steps across a kink, where the peak changes frames, would not become shorter.
         damping *= SHORTER if np.sum(change * last_change) < 0.0 else 1.0
         length, last_change = float(np.linalg.norm(change)) / unit, change
-        share = min(1.0, LONGEST / length) * damping
+        share = min(1.0, LONGEST / max(length, LONGEST)) * damping
         there[free] += share * step
-        outside = (there < low) | (there > high)
-        if outside[free].any():
-            there, free = np.clip(there, low, high), free[~outside[free]]
-        elif share * length < CONVERGED:
-            return quantity(there)[0], 1.0
+        if share * length < CONVERGED:
+            there[free[held]] += (1.0 - share) * step[held]
+            there = np.clip(there, low, high)
+            value, slope = quantity(there)
+            if slope[free[~held]].any():
+                return value, 1.0
+            break
     reached = (float(residuals @ residuals) - chi2) / abs(rise)
     return quantity(there)[0], min(reached, float(np.nextafter(1.0, 0.0)))
+
+
+def _bounded_step(
+    information: Float, gradient: Float, slope: Float, room: float, distances: tuple[Float, Float]
+) -> tuple[Float, NDArray[np.bool_]]:  # fmt: skip
+    """Return the step to where a quantity is largest, and which parameters reach a limit.
+
+    Chi-squared may rise by `room`; a step s changes it by 2 gradient s + s information s. The step lies between the
+    `distances` from the limits. Parameters beyond a limit are held there, and released where the Lagrangian of the
+    others rises inwards.
+    """
+    low, high = distances
+    step, held = np.zeros(slope.size), np.zeros(slope.size, np.bool_)
+    for _ in range(TURNS * slope.size + 1):
+        free, fixed = np.flatnonzero(~held), step[held]
+        rest = gradient + information[:, held] @ fixed
+        pair = np.column_stack([-rest, slope])[free]
+        back, along = np.linalg.solve(information[np.ix_(free, free)], pair).T
+        left = room - float(fixed @ (gradient + rest)[held]) - float(rest[free] @ back)
+        power = float(slope[free] @ along)
+        pace = np.sqrt(max(left, 0.0) / power) if power > 0.0 else 0.0
+        step[free] = back + pace * along
+        beyond = (step < low) | (step > high)
+        if beyond.any():
+            step, held = np.clip(step, low, high), held | beyond
+            continue
+        uphill = pace * slope - gradient - information @ step
+        if not power > 0.0 and left > 0.0:
+            # Only limits end the quantity.
+            uphill = np.where(slope == 0.0, uphill, slope)
+        inwards = np.where(step <= low, uphill, -uphill) / np.sqrt(np.diag(information))
+        inwards[~held] = 0.0
+        if not (inwards > 0.0).any():
+            break
+        held[np.argmax(inwards)] = False
+    return step, held

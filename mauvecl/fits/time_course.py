@@ -32,7 +32,7 @@ from mauvecl.noise.unknowns import CHANGED_PART, CHANGING, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, table_of
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Duration, Moment, Probability, Range, Wavelength
+from mauvecl.schema.fields import Amplitude, Duration, Moment, Probability, Range, Wavelength, range_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -253,7 +253,8 @@ def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> 
 #: Whitens sums, (n, n_frame, n_sum), to the shape (n, n_frame n_sum), or to more columns if levels are unknown.
 Whiten = Callable[[Float], Float]
 
-#: Parameters, all but the first as logarithms; the temperature at the end is relative to that at the peak.
+#: Parameters, all but the first as logarithms; that of the temperature at the end is the share of the way from the
+#: coolest temperature of the model to that at the peak.
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
 #: Number of fits after the first, each with the covariances of the previous fit.
 REFITS = 3
@@ -304,19 +305,19 @@ class _Data:
     def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
         width, amplitude, fold = np.exp(theta[[1, 2, 5]])
         rise = amplitude * self.light * self.shape.mean_over(self.edges, theta[0], width)
+        since, (coolest, hottest) = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0), self.model.log_k[[0, -1]]
         # Temperatures over that at the peak, as in `Cooling`.
-        since, end = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0), min(float(np.exp(theta[4])), 1.0)
-        cooled = end + (1.0 - end) * np.exp(-since / fold)
-        log_k, (coolest, hottest) = theta[3] + np.log(cooled), self.model.log_k[[0, -1]]
+        left, above = np.exp(-since / fold), theta[3] - coolest
+        end = float(np.exp((theta[4] - 1.0) * above))
+        cooled = end + (1.0 - end) * left
+        log_k, falling, ended = theta[3] + np.log(cooled), (1.0 - end) * left / cooled, end * (1.0 - left) / cooled
         tau, span = (self.edges - theta[0]) / width, np.diff(self.edges, axis=1)[:, 0]
         at, factor = self.shape.at(tau), amplitude * self.light / span
         of_rise, of_log_k = np.zeros((2, len(PARAMETERS), rise.size))
         of_rise[0], of_rise[1] = factor * (at[:, 0] - at[:, 1]), rise - factor * width * np.diff(at * tau, axis=1)[:, 0]
         of_rise[2] = rise
-        falling = (cooled - end) / cooled
-        of_log_k[0], of_log_k[3], of_log_k[5] = (since > 0.0) * falling / fold, 1.0, falling * since / fold
-        if theta[4] < 0.0:
-            of_log_k[4] = end / cooled * (1.0 - (cooled - end) / (1.0 - end))
+        of_log_k[0], of_log_k[5] = (since > 0.0) * falling / fold, falling * since / fold
+        of_log_k[3], of_log_k[4] = 1.0 + (theta[4] - 1.0) * ended, above * ended
         of_log_k *= (log_k > coolest) & (log_k < hottest)
         return rise, np.clip(log_k, coolest, hottest), of_rise, of_log_k
 
@@ -381,10 +382,12 @@ class _Quantity:
             total = float(np.sum(data.intrinsic(rise) * light))
             slope = data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total
             return self.factor * total, slope
-        # The temperature at the end is relative to that at the peak.
-        gradient = np.zeros(len(PARAMETERS))
-        gradient[[self.place, 3] if self.place == 4 else self.place] = 1.0
-        return float(theta[0] if self.place == 0 else np.exp(gradient @ theta)), gradient
+        value, gradient = theta[self.place], np.eye(len(PARAMETERS))[self.place]
+        if self.place == 4:
+            coolest = data.model.log_k[0]
+            gradient[3:5] = theta[4], theta[3] - coolest
+            value = coolest + theta[4] * (theta[3] - coolest)
+        return float(value if self.place == 0 else np.exp(value)), gradient
 
 
 class CoolingCourse(NamedTuple):
@@ -486,8 +489,12 @@ def cooling_course(
     cooling = event.temperature
     if not isinstance(cooling, Cooling):
         cooling = Cooling(cooling, cooling, stare.frame_s)
-    logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
-    theta = np.array([event.peak_s, *logs])
+    width, amplitude, peak, end, fold = np.log(
+        [event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k, cooling.fold_s]
+    )
+    coolest = model.log_k[0]
+    share = 1.0 if end == peak else (end - coolest) / (peak - coolest)
+    theta = np.array([event.peak_s, width, amplitude, peak, share, fold])
     values = {quantity.name: quantity.at(theta, data)[0] for quantity in _quantities(data, stare, cooling=True)}
     rise, log_k, *_ = data.flare(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
@@ -560,8 +567,10 @@ def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cool
     best = int(np.argmax(np.maximum(along, 0.0) ** 2 / power))
     amplitude, log_k = max(float(along[best] / power[best]), 1e-6), data.reduction.log_k[nodes][best]
     # A flare that cools is somewhat hotter at the peak than on average.
-    first, last = (0.1, -0.3) if cooling else (0.0, 0.0)
-    return np.array([peak_s, np.log(half_width_s), np.log(amplitude), log_k + first, last, np.log(2.0 * half_width_s)])
+    log_k, end = (log_k + 0.1, log_k - 0.2) if cooling else (log_k, log_k)
+    coolest = data.model.log_k[0]
+    share = (end - coolest) / (log_k - coolest) if cooling else 1.0
+    return np.array([peak_s, np.log(half_width_s), np.log(amplitude), log_k, share, np.log(2.0 * half_width_s)])
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
@@ -599,9 +608,8 @@ class _BestFit:
         first, last = data.edges[0, 0], data.edges[-1, 0]
         duration_s, coolest, hottest = last - first + frame_s, data.model.log_k[0], data.model.log_k[-1]
         limits = (
-            np.array([first - duration_s, *np.log([0.1 * frame_s, 1e-9]), coolest + 1e-9, coolest - hottest,
-                      np.log(frame_s)]),
-            np.array([first + 2 * duration_s, *np.log([duration_s, 1e9]), hottest - 1e-9, 0.0,
+            np.array([first - duration_s, *np.log([0.1 * frame_s, 1e-9]), coolest + 1e-9, 0.0, np.log(frame_s)]),
+            np.array([first + 2 * duration_s, *np.log([duration_s, range_of(Amplitude).high]), hottest - 1e-9, 1.0,
                       np.log(100 * duration_s)]),
         )  # fmt: skip
         whiten = data.whitening(None)

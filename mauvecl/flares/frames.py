@@ -235,10 +235,14 @@ class StareExpectation:
 
     def snr(self, flare: Float) -> float:
         """Return the matched-filter S/N of a flare with mean amplitudes of shape (n_frame, n_flare)."""
-        constant, each = self._bare.pixel_cumulants(2)
-        variance = (constant + each[: len(STEADY)].sum(axis=0))[self.used]
-        spectra = self._bare.mean_dn[len(STEADY) :, self.used]
-        return float(np.sqrt(np.einsum("tk,kl,tl->", flare, spectra / variance @ spectra.T, flare, optimize=True)))
+        constant, each = (values[..., self.used] for values in self._bare.pixel_cumulants(2))
+        spectra, power = self._bare.mean_dn[len(STEADY) :, self.used], 0.0
+        lit = np.flatnonzero(flare.any(axis=1))
+        for begin in range(0, lit.size, BLOCK):
+            rows = lit[begin : begin + BLOCK]
+            variance = constant + self.coefficients[rows, : len(STEADY)] @ each[: len(STEADY)]
+            power += float(np.sum((self.stare.light[rows, None] * flare[rows] @ spectra) ** 2 / variance))
+        return float(np.sqrt(power))
 
     def net(self, weights: Float, draw: Draw, kind: type[np.floating[Any]] = np.float64) -> tuple[Any, Any, Any]:
         """Draw net light in weighted sums of pixels; return it with its standard deviation and mean, DN/s.
@@ -262,10 +266,10 @@ class StareExpectation:
     def raw(self, draw: Draw) -> Float:
         """Return drawn raw counts of each pixel, DN, shape (n_frame, n_pixel); saturated pixels hold their mean."""
         frames = np.tile(self.quiet.recorded_dn, (self.stare.n_frames, 1))
-        pixels = np.flatnonzero(self.used)
+        pixels, of_one_pixel = np.flatnonzero(self.used), np.eye(self.used.size)
         for begin in range(0, pixels.size, MOST_STATISTICS):
             part = pixels[begin : begin + MOST_STATISTICS]
-            frames[:, part] += draw(self.components(np.eye(self.used.size)[part]))
+            frames[:, part] += draw(self.components(of_one_pixel[part]))
         return frames
 
     @property

@@ -176,7 +176,8 @@ class _StareSearch:
         rho, peak = float(values[direction, onset]), float(self.sums.survey.search.peaks_s(row)[onset])
         size = float(np.linalg.norm(templates.directions[templates.chosen[direction]]))
         amplitude = max(rho / float(row.per_amplitude[onset]), 1e-3) / size
-        theta = np.array([np.log(amplitude), peak, np.log(width), self.sums.survey.log_k(direction)])
+        kelvin = templates.temperatures_k[templates.chosen[direction]]
+        theta = np.array([np.log(amplitude), peak, np.log(width), np.log(kelvin)])
         return Candidate(theta, rho, (peak, width))
 
     def searched(self) -> list[Candidate]:
@@ -331,8 +332,7 @@ def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Mea
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
         return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
     covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
-    area, coloured = sums.survey.bank.shape.equivalent_duration, sums.survey.templates.coloured
-    fitted = FittedFlares.of(theta[None], covariance[None], area, np.array([snr]), coloured=coloured)
+    fitted = FittedFlares.of(theta[None], covariance[None], sums.survey, np.array([snr]))
     return fitted, *_intervals(rows, best, j, snr, covariance, energy)
 
 

@@ -114,9 +114,9 @@ class SummedStare:
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
         """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
-        total, templates = self.survey.covariance[frames].copy(), self.survey.templates
+        total = self.survey.covariance[frames].copy()
         for flare, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None, None] * templates.noise[templates.nearest(float(np.exp(flare[KELVIN])))]
+            total[inside] += mean[:, None, None] * self.survey.photon_noise(flare[KELVIN])
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # Star and flare light jitter together; the star's jitter is already in the covariance.
@@ -301,17 +301,14 @@ class FittedFlares:
     snr: Float
 
     @classmethod
-    def of(cls, theta: Float, covariance: Float, area: float, snr: Float, *, coloured: bool) -> Self:
-        """Return the values and errors of parameters, (n, 4), with covariances (n, 4, 4).
-
-        `area` is the equivalent duration of the shape; flares have a temperature if they are `coloured`.
-        """
+    def of(cls, theta: Float, covariance: Float, survey: Survey, snr: Float) -> Self:
+        """Return the values and errors of parameters, (n, 4), with covariances (n, 4, 4)."""
         sd = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
         gradient = np.array([1.0, 0.0, 1.0, 0.0])
         sd_duration = np.sqrt(np.maximum(np.einsum("i,nij,j->n", gradient, covariance, gradient), 0.0))
         amplitude, width, kelvin = np.exp(theta[:, [AMPLITUDE, WIDTH, KELVIN]]).T
-        kelvin = kelvin if coloured else np.full(len(theta), np.nan)
-        duration = amplitude * width * area
+        kelvin = kelvin if survey.templates.coloured else np.full(len(theta), np.nan)
+        duration = amplitude * width * survey.bank.shape.equivalent_duration
         return cls(
             theta[:, PEAK], sd[:, PEAK], amplitude, amplitude * sd[:, AMPLITUDE], width, width * sd[:, WIDTH],
             kelvin, kelvin * sd[:, KELVIN], duration, duration * sd_duration, snr,

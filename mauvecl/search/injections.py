@@ -371,8 +371,8 @@ class CriticalAmplitudes:
                     continue
                 sums = noise[:, frames].T + amplitude * rise + np.sqrt(amplitude) * glow
                 size, width = values[direction, template] / b[direction, template], site.widths_s[template]
-                peak_s, log_k = site.peaks_s[template], survey.log_k(int(direction))
-                start = np.array([[np.log(size), peak_s, np.log(width), log_k]])
+                kelvin = survey.templates.temperatures_k[survey.templates.chosen[direction]]
+                start = np.array([[np.log(size), site.peaks_s[template], np.log(width), np.log(kelvin)]])
                 comparison = self._comparison(site, self.amplitudes[d, s], _fitted(survey, sums, start))
                 for name, values in comparison.items():
                     estimates[name][d, s] = values[0]
@@ -396,9 +396,8 @@ def _fitted(survey: Survey, sums: Single, start: Float) -> FittedFlares:
     block = SummedStare(survey, sums.astype(np.float64)).block(start, per_group=per_group)
     best = block.fit(start)
     snr = np.sqrt(max(block.without(best, 0).chi2 - best.chi2, 0.0))
-    area, coloured = survey.bank.shape.equivalent_duration, survey.templates.coloured
     covariance = block.covariance(best.theta)[:, :, 0].transpose(0, 2, 1)
-    return FittedFlares.of(best.theta, covariance, area, np.array([snr]), coloured=coloured)
+    return FittedFlares.of(best.theta, covariance, survey, np.array([snr]))
 
 
 def _multiple(values: Single, step: float) -> Single:

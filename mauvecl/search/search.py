@@ -364,21 +364,6 @@ class Survey:
     stare: Stare
     bank: Bank
     templates: Templates  # from which bank and components are made
-    temperature_k: float  # of flares, where their sums do not depend on it
-
-    @cached_property
-    def mean_sums(self) -> MeanSums:
-        """Mean sums of a flare of unit amplitude over log temperature."""
-        log_k, values = np.log(self.templates.temperatures_k), self.templates.directions
-        sums = MeanSums(values, np.zeros((0, values.shape[1])), log_k)
-        return sums if self.templates.coloured else replace(sums, hot=np.full_like(values, sums.spline(self.log_k(0))))
-
-    def log_k(self, direction: int) -> float:
-        """Return the logarithm of the temperature for a direction of the bank."""
-        kelvin, templates = self.temperature_k, self.templates
-        if templates.coloured:
-            kelvin = templates.temperatures_k[templates.chosen[direction]]
-        return float(np.log(np.clip(kelvin, templates.temperatures_k[0], templates.temperatures_k[-1])))
 
     @cached_property
     def coefficients(self) -> Float:
@@ -389,6 +374,20 @@ class Survey:
     def response(self) -> Float:
         """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
         return np.asarray(self.components.component_means[len(STEADY)])
+
+    @cached_property
+    def mean_sums(self) -> MeanSums:
+        """Mean sums of a flare of unit amplitude over log temperature; of the first component if they tell none."""
+        log_k, values = np.log(self.templates.temperatures_k), self.templates.directions
+        if not self.templates.coloured:
+            values = np.tile(self.response, (log_k.size, 1))
+        return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
+
+    def photon_noise(self, log_k: float) -> Float:
+        """Return the covariance of a frame's sums that a flare of unit amplitude adds, (n_sum, n_sum)."""
+        if self.templates.coloured:
+            return np.asarray(self.templates.noise[self.templates.nearest(float(np.exp(log_k)))])
+        return np.asarray(self.components.sum_cumulants(2)[1][len(STEADY)])
 
     @property
     def unit_snr(self) -> float:

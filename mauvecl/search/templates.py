@@ -213,7 +213,7 @@ class Templates:
     @property
     def coloured(self) -> bool:
         """True if the sums of a flare depend on its temperature by more than a factor."""
-        return len(self.directions.T) > 1
+        return len(self.temperatures_k) > 1 and self.directions.shape[1] > 1
 
     @property
     def loss(self) -> Float:

@@ -54,9 +54,9 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     angles = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
     least = ", ".join(f"{name} {value:g} deg" for name, value in angles.items() if value is not None)
     words: dict[str, Callable[[], str]] = {
-        "instrument": lambda: _instrument(study, swept, along_orbit="orbit" in uses and study.plan.along_orbit),
+        "instrument": lambda: _instrument(study, swept, uses),
         "sky": lambda: "sky as swept" if "sky" in swept else study.sky.describe(),
-        "flare": lambda: _flare(study, swept),
+        "flare": lambda: _flare(study, swept, uses),
         "orbit": lambda: f"orbit of {orbit.name if orbit else 'embedded elements'}; least angles: {least or 'none'}",
         "unknowns": lambda: _unknowns(study, uses),
         "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
@@ -72,21 +72,25 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
     return [*(clause() for part, clause in words.items() if part in parts), *ignored]
 
 
-def _instrument(study: Study, swept: set[str], *, along_orbit: bool) -> str:
+def _instrument(study: Study, swept: set[str], uses: Collection[str]) -> str:
     o = study.observation
     text = f"instrument {o.instrument}"
     if o.changes:
         text += f" with another {', '.join(o.changes)}"
     if "detector_temperature" in swept:
         return f"{text}, detector temperature as swept"
-    if along_orbit and o.temperature_c is None:
+    if "orbit" in uses and study.plan.along_orbit and o.temperature_c is None:
         return f"{text}, detector temperature along the orbit"
+    if "orbit" not in uses and "stare" in uses and study.stare.along_orbit:
+        return f"{text}, detector temperature of the stare along the orbit"
     return f"{text}, detector at {study.observation.load_instrument().temperature_c:g} deg C"
 
 
-def _flare(study: Study, swept: set[str]) -> str:
+def _flare(study: Study, swept: set[str], uses: Collection[str]) -> str:
     f, replaces = study.flare, "replacing photosphere"
     temperature = "of swept temperature" if "flare_temperature" in swept else f"of {f.light().describe()}"
+    if "stare" in uses and any(event.temperature_k is not None for event in study.events):
+        temperature += " or as events state"
     if f.geometry == "replaces" and f.photosphere_temperature_k is not None:
         replaces += f" of {f.photosphere_temperature_k:g} K"
     geometry = "added to the star" if f.geometry == "added" else replaces
@@ -118,9 +122,12 @@ def _unknowns(study: Study, uses: Collection[Use]) -> str:
     treatments = {"drawn": {"processes", "stare"}, "marginalised": {"nuisances", "stare"}}
     usual = " and ".join(treatment for treatment, of in treatments.items() if of & {*uses})
     clauses = [f"the usual unknowns {usual}"] if study.nuisances.usual else []
-    clauses += [f"drawn: {', '.join(drawn)}"] if (drawn := words["processes"] + words["stare"]) else []
+    known = [name for name in words["stare"] if name in KNOWN_CHANGES]
+    drawn = words["processes"] + [change for change in words["stare"] if change not in known]
+    clauses += [f"drawn: {', '.join(drawn)}"] if drawn else []
     clauses += [f"marginalised: {', '.join(words['nuisances'])}"] if words["nuisances"] else []
-    return "; ".join(clauses + words["values"]) or "everything known but the noise"
+    text = "; ".join(clauses + words["values"]) or "everything known but the noise"
+    return f"{text}; known changes of the stare: {', '.join(known)}" if known else text
 
 
 def star_label(star: Star, x: Expectation) -> str:

@@ -49,7 +49,7 @@ class StareQuestion(Section):
     orbit_gap_s: Annotated[float, Unit("s"), Range(0)] = setting(
         0.0, "Gap at the end of every orbit", flag="--orbit-gap"
     )
-    along_orbit: bool = setting(False, "Whether detector temperature and sky follow the orbit of the section orbit")
+    along_orbit: bool = setting(False, "Whether gaps and detector temperature follow the orbit of the section orbit")
     thermal: Curve | None = setting(
         None,
         "Known change of the detector temperature, deg C",

@@ -193,6 +193,11 @@ def test_fits_take_the_factor_on_light_as_it_is_drawn(engine: Engine) -> None:
     assert "star" not in stated
     assert stated["light"] == pytest.approx((-0.025, 0.04), rel=1e-3)
     assert others == [{"light": (0.0, np.inf)}, None]
+    # A bright flare in a frame has the error of its loss, 0 to 5 %, of which an interval excludes as much at both ends.
+    one_frame = "nuisances.usual=true", "observation.exposure_s=5", "flare.amplitudes=[20]"
+    bright = measure(drawn_study(*one_frame, magnitude=6.0, fits=1), engine).flares[0].perfect
+    widths = (bright.high - bright.low)[:, 0, -1] / bright.estimates[0, -1]
+    np.testing.assert_allclose(widths / 0.05 * 0.975, [0.6827, 0.95], rtol=0.005)
 
 
 def test_hottest_flares_are_measured(engine: Engine) -> None:

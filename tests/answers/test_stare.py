@@ -76,6 +76,7 @@ def test_fits_file_has_the_columns_of_lightkurve(found):
         assert "ORIGIN" not in hdus[0].header
         assert table.header["MJDREFI"] == 61041
         assert (table.header["TIMESYS"], table.header["TREFPOS"]) == ("UTC", "TOPOCENTER")
+        np.testing.assert_allclose([86_400 * table.header[name] for name in ("EXPOSURE", "TSTOP")], [250, 300])
         assert hdus[0].header["CCD-TEMP"] == 21.0
         assert table.columns.names[:6] == ["TIME", "CADENCENO", "QUALITY", "FLUX", "FLUX_ERR", "MEAN"]
         assert table.columns["TIME"].unit == "d"
@@ -108,6 +109,24 @@ def test_search_finds_only_the_injected_flares(stares):
     ratio = found["energy_bolometric"] / put_in["energy_bolometric"]
     assert 0.9 < ratio[0] < 1.1
     assert answer.table["found"][0] == len(found)
+
+
+def test_one_sum_finds_flares_of_the_temperature_of_the_study(stares):
+    """Find a flare within five standard errors; with a bank that is too narrow it is found and not measured."""
+    asked = paper('star=[{library="M3V", magnitude=8, distance_pc=5}]', "stare.duration_s=2000", "search.sums=1",
+                  "flare.temperature_k=14000", "events=[{peak_s=700, half_width_s=60, amplitude=0.2}]")  # fmt: skip
+    answer, narrow = stare(asked, stares), stare(asked.with_settings(["search.half_widths_s=[5, 10, 20]"]), stares)
+    (row,), put_in = answer.found, answer.events[0]
+    assert np.isnan([row["temperature"].value, row["temperature_low"].value]).all()
+    assert row["amplitude_error"] < 0.005
+    for name in ("amplitude", "equivalent_duration"):
+        assert abs(row[name] - put_in[name]) < 5 * row[f"{name}_error"]
+    per_s = put_in["energy_bolometric"] / put_in["equivalent_duration"]
+    for end in ("", "_low", "_high"):
+        ratio = row[f"energy_bolometric{end}"] / row[f"equivalent_duration{end}"] / per_s
+        assert float(ratio) == pytest.approx(1.0, rel=2e-3)
+    assert narrow.headline.endswith(f"raises no false alarms; {len(narrow.found)} alarms are not measured.")
+    assert {*narrow.found["event"]} == {-1}
 
 
 def test_sweep_over_magnitude_and_temperature_is_answered(stares):
@@ -148,6 +167,8 @@ def test_unknowns_of_a_stare_are_drawn_if_requested(stares, found):
 def test_table_counts_the_saturated_frames(stares):
     bright = stare(SHORT.with_settings(["star.0.magnitude=2.2", "flare.amplitudes=[3]"]), stares)
     assert 0 < bright.table["saturated_frames"][0] == bright.stares[0].staring.quality.sum() < 50
+    assert "everything known but the noise; known changes of the stare: thermal; seed" in bright.assumed
+    assert bright.headline == "The stare has 1 flare in 50 frames of G2V V = 2.2, which is not searched for."
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ from scenes import assert_covered, flare, quiescent
 from scenes import source as star
 
 import mauvecl
-from mauvecl import Cooling, Engine, FlareModel, Nuisances, Stare, fit, fit_cooling, measure_along
+from mauvecl import Cooling, Engine, FlareModel, Nuisances, Stare, Study, fit, fit_cooling, measure_along
 
 MAUVE = mauvecl.Instrument.load("mauvesim")
 FALLING, STEADY = Cooling(14_000.0, 7000.0, 80.0), Cooling(9000.0, 9000.0, 1.0)
@@ -130,6 +130,14 @@ def test_joint_fit_recovers_shape_and_cooling_without_noise() -> None:
     np.testing.assert_allclose(found.estimates[0, :6], TRUTH, rtol=1e-3)
     assert found.chi2[0] < 0.01
     assert found.dof < stare.n_frames * 12
+    # Neighbours follow the throughput, and fluences are those of the flare without losses.
+    near = replace(quiet(), neighbour_electrons=0.3 * quiet().source_electrons)
+    lit = frames + stare.light[:, None] * near.neighbour_dn
+    beside = fit_cooling(lit, near, model(), stare=stare, levels=(), **START)
+    np.testing.assert_allclose(beside.estimates[0, :6], TRUTH, rtol=1e-3)
+    steady = Stare.of(300.0, gaps=CHANGING["gaps"])
+    same = fit_cooling(recorded(FALLING, steady), quiet(), model(), stare=steady, levels=(), **START)
+    np.testing.assert_allclose(found.estimates[0, 6:], same.estimates[0, 6:], rtol=1e-3)
     # The same light without what is known of the conditions is another flare.
     assert fit_cooling(frames, quiet(), model(), levels=(), **START).p_value[0] < 1e-6
     frames = recorded(STEADY, Stare.of(300.0))
@@ -159,6 +167,22 @@ def test_intervals_of_a_bright_flare_of_another_shape_follow_its_standard_errors
         assert np.abs(np.log(ratios[:, found.column(name)])).max() < 0.25, (name, ratios[:, found.column(name)])
 
 
+def test_intervals_of_an_open_cooling_contain_their_estimates() -> None:
+    """Fit 6 faint flares, whose final temperatures range from the least one of the model to that of the peak."""
+    x, rng = quiet(), np.random.default_rng(0)
+    mean = x.recorded_dn + 0.2 * (recorded(Cooling(12_000.0, 5000.0, 150.0), Stare.of(300.0)) - x.recorded_dn)
+    variance = x.variance_dn2 + x.gain_dn_per_electron * (mean - x.recorded_dn)
+    ends = []
+    for _ in range(6):
+        raw = mean + np.sqrt(variance) * rng.standard_normal(mean.shape)
+        found = fit_cooling(raw, x, model(), **START)
+        within = np.array([found.low[1, 0], found.low[0, 0], found.estimates[0], found.high[0, 0], found.high[1, 0]])
+        assert (within[1:] >= within[:-1] * (1 - 1e-3)).all(), within
+        ends.append(found.estimates[0, 4])
+        assert np.exp(model().log_k[0]) * (1 - 1e-9) <= ends[-1] <= found.estimates[0, 3]
+    assert min(ends) < 3010.0
+
+
 @pytest.mark.long
 def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
     found = fit_cooling(recorded(STEADY, Stare.of(150.0)), quiet(), model(), levels=(0.95,), **START)
@@ -177,6 +201,33 @@ def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
     along = measure_along(spoiled, quiet(), model(), snr_per_bin=15.0, skipped_nm=[gap])
     np.testing.assert_allclose(along.found.estimates[:, 0], 9000.0, rtol=2e-3)
     assert abs(fit_cooling(spoiled, quiet(), model(), cooling=False, levels=(), **START).estimates[0, 3] - 9000) > 500
+
+
+def test_pointing_drifts_and_jitters_are_unknown_levels_of_light() -> None:
+    """A drift of 10 % costs a joint fit as much as such a jitter, and a bin as much as such an offset."""
+    drifts = Study().with_settings(["stare.pointing={rate_per_h=10, duration_s=30, depth=0.1}"]).stare.pointing
+    drifting, plain = Stare.of(150.0, pointing=drifts), Stare.of(150.0)
+    frames = recorded(STEADY, plain)
+
+    def joint(stare: Stare, **more: Any) -> Any:
+        return fit_cooling(frames, quiet(), model(), cooling=False, levels=(), stare=stare, **START, **more)
+
+    found, jitter = joint(drifting), joint(replace(plain, light_jitter=0.1))
+    np.testing.assert_allclose(found.errors, jitter.errors, rtol=1e-9)
+    free = Nuisances.of(quiet(), {"dark": np.inf})
+    assert joint(drifting, nuisances=free).dof == found.dof - 1
+
+    def binned(**changes: Any) -> Any:
+        stare = Stare.of(150.0, **changes)
+        return measure_along(frames, quiet(), model(), stare=stare, snr_per_bin=60.0, levels=(0.5,))
+
+    along, offset, known = binned(pointing=drifts), binned(offsets={"light": 0.1}), binned()
+    np.testing.assert_allclose(along.found.errors, offset.found.errors, rtol=1e-9)
+    assert (along.found.errors[:, 1] > 2 * known.found.errors[:, 1]).all()
+    # Jitters average over the frames of a bin.
+    one, other = binned(jitters={"light": 0.1}), binned(offsets={"light": 0.1 / np.sqrt(known.count[-1])})
+    np.testing.assert_allclose(one.found.errors[-1], other.found.errors[-1], rtol=1e-9)
+    assert known.count[-1] > 1
 
 
 @pytest.mark.parametrize(("unknown", "count"), [

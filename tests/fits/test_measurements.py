@@ -71,14 +71,22 @@ def test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies(row: tuple[float, ..
     place = m.names.index("jump")
     got = [scale * one.errors[k] for one in (known, unknown) for k, scale in ((0, 1 / 9500), (place, 1.0))]
     np.testing.assert_allclose(got, errors, rtol=0.01, atol=5e-5)
-    plain = model(distance_pc=5.0)
-    found = fit(x.recorded_dn + m.counts(9500.0, amplitudes), x, plain)
+    plain = model(distance_pc=5.0, radius_rsun=0.4)
+    lit = x.recorded_dn + m.counts(9500.0, amplitudes)
+    found = fit(lit, x, plain)
+    assert [found.dof - fit(lit, x, plain, free(x)).dof, found.dof] == [2, lit.size - 2]
     best, truth = dict(zip(found.names, found.estimates[0], strict=True)), m.values(9500.0, amplitudes)
     assert best["temperature"] == pytest.approx(kelvin, rel=0.01)
     assert found.chi2[0] == pytest.approx(chi2, rel=0.01, abs=1e-6)
     assert best["flux 200-320 nm"] / truth["flux 200-320 nm"] == pytest.approx(ultraviolet, rel=0.01)
     product = best["area"] * best["temperature"] ** 4 / (truth["area"] * 9500.0**4)
     assert product == pytest.approx(area, rel=0.01)
+    # The projected area of a sphere, and the light of all of it.
+    luminosity = 4 * best["area"] * 5.670374419e-5 * best["temperature"] ** 4
+    assert best["luminosity bolometric"] == pytest.approx(luminosity, rel=1e-6)
+    assert best["filling factor"] == pytest.approx(best["area"] / (np.pi * (0.4 * 6.957e10) ** 2), rel=1e-9)
+    longer = plain.stacked(3).values(9500.0, [0.5])
+    assert longer["energy bolometric"] == pytest.approx(150.0 * longer["luminosity bolometric"], rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,12 @@
 """Frames, gaps, unknowns and flares of a study's stare: light and stated energies are those of the flares' spectra."""
 
+import io
 from typing import Any
 
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
 from marks import long_but
@@ -54,6 +56,7 @@ def test_light_of_the_frames_is_that_of_the_flares_and_gaps_have_none() -> None:
          "cooling": {"end_k": 10_000.0, "fold_s": 100.0}},
     ]  # fmt: skip
     answer = drawn(events, stare={"gaps": [[450.0, 650.0]]})
+    assert "flares of 10000 K or as events state, added" in answer.assumed
     table = answer.light_curve()
     assert len(table) == 400 - 40
     assert not ((table["time"].value > 450) & (table["time"].value < 650)).any()
@@ -63,6 +66,20 @@ def test_light_of_the_frames_is_that_of_the_flares_and_gaps_have_none() -> None:
     for name in COLUMNS:
         cool, hot = (light_of(1.0, k)[name] - light_of()[name] for k in (10_000.0, 15_000.0))
         np.testing.assert_allclose(excess(table, name), (one + three) * cool + two * hot, rtol=1e-6, atol=1e-6 * cool)
+
+
+def test_snr_of_a_flare_is_that_of_the_known_conditions() -> None:
+    """Take three quarters of all light away, and warm the detector by 5 deg C."""
+    event = {"peak_s": 1000.0, "half_width_s": 60.0, "amplitude": 0.2}
+    answer = drawn([event], stare={name: {"points": [[0, level], [2000, level]]} for name, level in
+                                   (("throughput", -0.75), ("thermal", 5.0))})  # fmt: skip
+    staring, rise = answer.stares[0].staring, 0.2 * course(answer.light_curve(), event)
+    x = staring.quiet
+    dark = x.dark_dn * np.exp(5.0 * x.conditions["dark_slope_per_c"])
+    light = x.gain_dn_per_electron * 0.25 * (x.source_electrons + x.sky_electrons)
+    variance = x.gain_dn_per_electron * light + x.dark_step_dn * dark + x.read_noise_dn**2 + 1 / 12
+    flare = 0.25 * x.gain_dn_per_electron * staring.flare_electrons[0]
+    assert answer.events["snr"][0] == pytest.approx(np.sqrt(np.sum(rise**2) * np.sum(flare**2 / variance)), rel=1e-9)
 
 
 def test_cooling_flare_has_the_light_of_its_temperatures() -> None:
@@ -185,6 +202,20 @@ def test_curves_are_averaged_over_frames(curve):
     np.testing.assert_allclose(curve.mean_over(start, 5.0), exact, atol=1e-12)
 
 
+def test_orbits_and_priors_of_exposures_are_those_of_frames():
+    """A normal prior is an offset of its relative standard deviation about its mean, in quadrature with the stare's."""
+    asked = paper("stare.search=false", "stare.duration_s=250", "stare.orbit_s=100", "stare.orbit_gap_s=30",
+                  "stare.gaps=[[0, 10]]", "stare.offsets.temperature=0.4",
+                  "processes.light_loss={normal=[0.4, 0.03], between=[0.1, 0.7]}",
+                  "processes.detector_temperature={normal=[20, 0.3], between=[15, 25]}")  # fmt: skip
+    found = stare(asked).stares[0].staring.stare
+    np.testing.assert_allclose(found.gtis, [[10, 70], [100, 170], [200, 250]])
+    np.testing.assert_allclose(found.light, 0.6 / (1 - MAUVE.light_loss))
+    np.testing.assert_allclose(found.temperature_c, 20.0)
+    sds = {unknown.name: unknown.sd for unknown in found.unknowns}
+    assert sds == pytest.approx({"light offset": 0.05, "temperature offset": 0.5})
+
+
 def test_known_conditions_and_unknowns_are_separate():
     stare = Stare.of(
         Study().stare.orbit_s, thermal=0.5, temperature_c=13.0, variability=points((0.0, 0.0), (6000.0, 0.06)),
@@ -251,6 +282,12 @@ def test_temperature_follows_the_orbit(night: Stare) -> None:
 
 
 def test_source_of_the_orbit_is_stated() -> None:
-    assert any("assumptions" in line for line in stare(asked()).messages)
+    answer = stare(asked())
+    assert any("assumptions" in line for line in answer.messages)
+    assert "detector temperature of the stare along the orbit" in answer.assumed
+    with fits.open(io.BytesIO(answer.documents["light-curve-1.fits"]())) as hdus:
+        assert hdus[1].header["MJDREFI"] + hdus[1].header["MJDREFF"] == Time(START).mjd
+        place = [hdus[0].header[name] for name in ("RA_OBJ", "DEC_OBJ")]
+        assert place == pytest.approx([53.2327, -9.4583], abs=1e-3)
     assert sum("mean Sun-synchronous" in line for line in stare(asked("2027-01-10")).messages) == 1
     assert not any("orbit" in line for line in stare(paper("stare.search=false")).messages)
