@@ -82,6 +82,13 @@ def test_every_star_of_a_sweep_is_stored_in_32_bits_with_its_components(tmp_path
     mean = group["flare-1-source"][:] + group["flare-1-sky"][:] + 10 * (group["bias_dn"][:] + group["dark_dn"][:])
     np.testing.assert_allclose(mean, 10 * flare.mean_raw_dn, rtol=1e-12)
     np.testing.assert_allclose(group["quiescent-noise"][:], np.sqrt(quiet.variance_dn2), rtol=1e-12)
+    # A single frame has a tenth of the light and of the variance.
+    single = asked.with_changes({"bulk": {"frames": [3]}, "run": {"realisations": 1}}, None)
+    bulk.realise(single, tmp_path / "single.zarr", engine)
+    frame = zarr.open_group(tmp_path / "single.zarr", mode="r")["star-1"]
+    for name, share in (("source", 0.1), ("sky", 0.1), ("noise", np.sqrt(0.1))):
+        whole = group[f"flare-1-{name}"][:]
+        np.testing.assert_allclose(frame[f"flare-1-{name}"][:], share * whole, rtol=1e-12)
 
 
 @pytest.mark.long
