@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -409,13 +408,13 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
     from mauvecl.answers.signal import place_of
 
     first, row = answer.study.sweep.axes[0].quantity, []
-    bands = sorted({star.band for star in answer.study.star})
-    magnitude = re.compile(rf" ({'|'.join(map(re.escape, bands))}) = [^ ]+")
+    # The axis names the band, unless stars have different ones.
+    bands = {star.band for star in answer.study.star}
+    band = f" {min(bands)}" if len(bands) == 1 else ""
     for wavelength in answer.shown_nm:
         lines: dict[str, list[Any]] = {}
         for star in answer.stars:
-            # The axis names the band, unless stars have different ones.
-            name = magnitude.sub(r" \1" * (len(bands) > 1), star.label) if first == "magnitude" else star.label
+            name = star.label.replace(f"{band} = {star.at[first]:g}", "") if first == "magnitude" else star.label
             name_of_line = full_label(name, {k: v for k, v in star.at.items() if k != first})
             element = star.result.element[place_of(star.result.expectation, wavelength, "element")]
             ends = (max(element[q], 1e-3) for q in ("q2.5", "q97.5"))
