@@ -24,7 +24,7 @@ from mauvecl.host.stars.source import Source, check_covers, listed_star
 from mauvecl.host.stars.spectrum import SPAN_NM, continued
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, number, table_of
-from mauvecl.schema.errors import InputError, Message, missing_package
+from mauvecl.schema.errors import InputError, Message, counted, missing_package
 from mauvecl.schema.fields import Duration, Exposure, SkyBrightness, Unit
 
 if TYPE_CHECKING:
@@ -483,7 +483,7 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
     if x.signal == "paper" and x.sky_electrons.any():
         yield Message("S/N counts the zodiacal light as signal, as the MauveSim paper does.", "paper signal")
     if x.exposure_s > exposure * (1 + 1e-9):
-        frames = f"{x.n_frames} frame{'s' if x.n_frames > 1 else ''} of {x.frame_s:g} s"
+        frames = f"{counted(x.n_frames, 'frame')} of {x.frame_s:g} s"
         text = f"The exposure of {exposure:g} s is rounded up to {x.exposure_s:g} s, {frames}."
         yield Message(text, "rounded up")
     below = special.ndtr(-(x.mean_raw_dn + 0.5) / np.sqrt(x.unsaturated_variance_dn2 / x.n_frames)) > REPORTED_CLIPPING

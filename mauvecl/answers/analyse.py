@@ -25,7 +25,7 @@ from mauvecl.observations.frames import Frames, Reason, barycentric
 from mauvecl.observations.spectra import EventSpectrum, event_colour
 from mauvecl.observations.visits import flux_per_dn
 from mauvecl.schema.columns import Column, View, formatted, interval, interval_columns, number, percent
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, counted
 from mauvecl.schema.fields import DAY_S
 from mauvecl.study.cases import Case, Use, cases
 from mauvecl.study.star import Star
@@ -464,8 +464,8 @@ class AnalyseAnswer(Answer):
         """The number of detected flares, with the expected false alarms."""
         verdicts = [row.verdict for row in self.rows]
         number, undetected = verdicts.count("detected"), len(verdicts) - verdicts.count("detected")
-        flares = f"{number} flare{' is' if number == 1 else 's are'}" if number else "No flare is"
-        more = f", and {undetected} more event{'' if undetected == 1 else 's'} listed" if undetected else ""
+        flares = counted(number, "flare", "is") if number else "No flare is"
+        more = f", and {counted(undetected, 'more event')} listed" if undetected else ""
         # Dips raise the threshold, and simulated light curves do not show the rates of many alarms in each.
         analysis = self.analysis
         reached = max(alarms.rate(analysis.threshold) for alarms in (analysis.modelled, analysis.measured))
@@ -480,7 +480,7 @@ class AnalyseAnswer(Answer):
         analysis = self.analysis
         where = f"in {analysis.days:.3g} star-days of {analysis.frames.name}"
         rate, frequent = (
-            f"at most {rate:.3g} false alarm{'' if rate == 1 else 's'} per star-day"
+            f"at most {counted(rate, 'false alarm', spec='.3g')} per star-day"
             for rate in (analysis.rate, max(analysis.rate, CANDIDATES))
         )
         candidates = f"{analysis.candidates:.2f} ({frequent})"

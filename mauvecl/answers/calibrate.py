@@ -28,7 +28,7 @@ from mauvecl.observations.frame_files import read_frames
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.throughput import ERROR_KNOTS, ThroughputFit, ThroughputModel, fit_throughput
 from mauvecl.schema.columns import Column, number, percent
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, counted
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
@@ -132,8 +132,8 @@ class CalibrateAnswer(Answer):
     #: One row per value of the instrument.
     values_table = TableOf(
         "calibrate", COLUMNS, "values", key="rows", about=("dark.reference_c", "transfer.dark_unit", "study"),
-        title=lambda answer: f"{answer.nominal.name} fitted to {len(answer.stars)} observation"
-        f"{'s' if len(answer.stars) > 1 else ''} of standard stars; dark current at {answer.dark.reference_c:.1f} C",
+        title=lambda answer: f"{answer.nominal.name} fitted to {counted(len(answer.stars), 'observation')} of "
+        f"standard stars; dark current at {answer.dark.reference_c:.1f} C",
     )  # fmt: skip
     #: One row per pixel: fitted and nominal throughput.
     throughput_table = TableOf(
@@ -190,10 +190,9 @@ class CalibrateAnswer(Answer):
     @property
     def headline(self) -> str:
         """The error of the throughput."""
-        n = len(self.observations)
         return (
-            f"The throughput of {self.nominal.name} is fitted to {n} observation{'s' if n > 1 else ''}, with a "
-            f"standard error of {100 * float(np.median(self.throughput.error)):.2g} % in the median pixel."
+            f"The throughput of {self.nominal.name} is fitted to {counted(len(self.observations), 'observation')}, "
+            f"with a standard error of {100 * float(np.median(self.throughput.error)):.2g} % in the median pixel."
         )
 
     @property

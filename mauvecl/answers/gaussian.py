@@ -23,6 +23,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.host.arrays import Float
 from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.columns import Column, number, table_of
+from mauvecl.schema.errors import counted
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -167,8 +168,8 @@ class GaussianAnswer(Answer):
         many = f"{'as many' if worst == 1.0 else f'up to {worst:.3g} times as many'} as promised"
         return (
             f"The root-of-N formula is {f'off by at most {snr:.2g}' if snr else 'right'} in S/N, and its false alarms "
-            f"are {'too rare to be counted' if np.isnan(worst) else many}, in {len(cells)} "
-            f"case{'' if len(cells) == 1 else 's'}."
+            f"are {'too rare to be counted' if np.isnan(worst) else many}, in "
+            f"{counted(len(cells), 'case')}."
         )
 
     @property

@@ -19,7 +19,7 @@ from mauvecl.noise.reference import components
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
-from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.errors import InputError, Message, counted
 from mauvecl.schema.fields import DAY_S, FirstRealisation, Wavelength
 from mauvecl.study.cases import Case, cases, collect_messages, star_column, star_label
 from mauvecl.study.study import Study
@@ -92,7 +92,7 @@ class ExposureAnswer(Answer):
         first, least = self.exposures[0], first_of(len(self.exposures), "stars")
         return (
             f"{first.star} reaches an S/N of {first.wanted:g} per {first.per} at {first.wavelength_nm:g} nm in "
-            f"{first.exposure_s:g} s, {first.frames} frame{'' if first.frames == 1 else 's'}{least}."
+            f"{first.exposure_s:g} s, {counted(first.frames, 'frame')}{least}."
         )
 
 

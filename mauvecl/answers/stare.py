@@ -31,7 +31,7 @@ from mauvecl.host.exposure.background import parse_position, parse_time
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, checkpointed
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error
-from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.errors import InputError, Message, counted
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search import false_alarms
 from mauvecl.search.alarms import Alarm, alarms
@@ -315,15 +315,14 @@ class StareAnswer(Answer):
         stare = self.stares[0]
         frames, flares = stare.staring.stare.n_frames, len(stare.flares)
         least = first_of(len(self.stares), "stares")
-        drawn = f"flare{'' if flares == 1 else 's'} in {frames} frame{'' if frames == 1 else 's'} of {stare.title}"
+        drawn = f"{counted(flares, 'flare')} in {counted(frames, 'frame')} of {stare.title}"
         if np.isnan(stare.threshold):
-            are = "is" if flares == 1 else "are"
-            return f"The stare has {flares} {drawn}, which {are} not searched for{least}."
+            return f"The stare has {drawn}, which {'is' if flares == 1 else 'are'} not searched for{least}."
         events = [flare.event for flare in stare.found]
         number_found, false, unknown = len({*events} - {0, -1}), events.count(0), events.count(-1)
-        alarms = f"{false or 'no'} false alarm{'' if false == 1 else 's'}"
-        rest = f"; {unknown} alarm{' is' if unknown == 1 else 's are'} not measured" if unknown else ""
-        return f"The search finds {number_found} of {flares} {drawn} and raises {alarms}{least}{rest}."
+        alarms = counted(false, "false alarm") if false else "no false alarms"
+        rest = f"; {counted(unknown, 'alarm', 'is')} not measured" if unknown else ""
+        return f"The search finds {number_found} of {drawn} and raises {alarms}{least}{rest}."
 
     @property
     def views(self) -> list[View]:
@@ -413,9 +412,9 @@ def stare(
                 f"average, with up to {100 * drifts.depth:g} % of the light lost. The search marginalises over the "
                 "level of each frame."
             )
-        saturated = np.count_nonzero(star.staring.quality)
+        saturated = int(np.count_nonzero(star.staring.quality))
         if saturated:
-            frames_of = f"{saturated} frame{'' if saturated == 1 else 's'} of the stare at {star.title}"
+            frames_of = f"{counted(saturated, 'frame')} of the stare at {star.title}"
             text = f"SATURATED: {frames_of}, marked by a quality of 1."
             messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)

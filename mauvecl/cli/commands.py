@@ -24,7 +24,7 @@ from mauvecl.answers.verbs import DRAWS, FEWER, OBSERVATION, VERBS, Verb
 from mauvecl.cli import console, flags
 from mauvecl.cli.console import Meter, show, show_view, with_flags
 from mauvecl.schema.columns import Column, View
-from mauvecl.schema.errors import InputError, of_kind
+from mauvecl.schema.errors import InputError, counted, of_kind
 from mauvecl.schema.fields import FirstRealisation
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class Session(flags.Options):
         def saved() -> str:
             if not checkpoint.kept:
                 return "nothing was written, and nothing is half written"
-            parts = f"{checkpoint.kept} part{'s' if checkpoint.kept > 1 else ''} of the work kept"
+            parts = f"{counted(checkpoint.kept, 'part')} of the work kept"
             return f"{parts} in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
 
         checkpoint = Checkpoint(self.folder, self.verb, self.study, resume=self.resume, restart=self.restart, held=True)

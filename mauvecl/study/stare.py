@@ -13,7 +13,7 @@ from mauvecl.flares.settings import HALF_WIDTHS_S, SHAPE_NAMES, WINDOW_S, Coolin
 from mauvecl.noise.disturbances import Normal, PointingDrifts, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, Changing, Course, NuisanceName
 from mauvecl.schema import fields
-from mauvecl.schema.errors import InputError, Message, shortened
+from mauvecl.schema.errors import InputError, Message, counted, shortened
 from mauvecl.schema.fields import DAY_S, Flag, Help, Range, Unit
 from mauvecl.schema.section import Section, check_one, read_ranges, setting
 from mauvecl.study.observation import Spread, sd_of
@@ -211,7 +211,7 @@ class SearchChoice(Section):
     @property
     def rate_text(self) -> str:
         """The false alarms as text, such as "1 false alarm per star-month"."""
-        return f"{self.false_alarms:g} false alarm{'' if self.false_alarms == 1 else 's'} per star-{self.per}"
+        return f"{counted(self.false_alarms, 'false alarm', spec='g')} per star-{self.per}"
 
     def white_bank(self, frame_s: float) -> Bank:
         """Return the template bank of the closed form: one sum per frame and no cycle."""
