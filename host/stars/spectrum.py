@@ -15,7 +15,7 @@ import astropy.units as u
 import numpy as np
 from astropy.constants import c, h
 
-from mauvecl.host.arrays import Bool, Float, array_cache, true_runs
+from mauvecl.host.arrays import PER_MAD, Bool, Float, array_cache, true_runs
 from mauvecl.host.stars.library import known_band, spectrum_table
 from mauvecl.host.tables.files import Numbers
 from mauvecl.schema.errors import InputError
@@ -425,7 +425,7 @@ def _join(title: str, first: tuple[Float, Float], second: tuple[Float, Float], b
 def point_noise(flux_flam: Float) -> Float:
     """Return the standard deviation of each point from the scatter around it, shape (n,).
 
-    The median of |2 F_i - F_(i-2) - F_(i+2)| is 1.4826^-1 sqrt(6) of a point's error (Stoehr et al. 2008, ASP
+    The median of |2 F_i - F_(i-2) - F_(i+2)| is sqrt(6) / PER_MAD of a point's error (Stoehr et al. 2008, ASP
     Conf. Ser. 394, 505). Adjacent points are not used, since their errors are correlated.
     """
     from scipy.ndimage import median_filter
@@ -434,4 +434,4 @@ def point_noise(flux_flam: Float) -> Float:
         return np.zeros_like(flux_flam)
     second = np.abs(2 * flux_flam[2:-2] - flux_flam[:-4] - flux_flam[4:])
     scatter = median_filter(np.pad(second, 2, mode="edge"), size=WINDOW, mode="nearest")
-    return np.asarray(1.482602 / np.sqrt(6.0) * scatter)
+    return np.asarray(PER_MAD / np.sqrt(6.0) * scatter)

@@ -196,12 +196,12 @@ class SnrResult(Drawable, ContentEquality):
         The histogram counts whole DN, of which the S/N is a function, in bins of at most 1/64 of a standard deviation.
         """
         x, table = self.expectation, self.observers[: self.scene.n_pixel]
-        width, sky = 2.0 ** table["bin_shift"].astype(float), x.subtracted_dn
+        width, offset, sky = 2.0 ** table["bin_shift"].astype(float), table["net_offset"].astype(float), x.subtracted_dn
 
         def snr(row: int, bin_number: NDArray[np.number]) -> Float:
             # A bin contains the whole DN from its lower edge up to the next.
             dn = width[row] * bin_number - 0.5
-            net = dn + table["net_offset"].astype(float)[row]
+            net = dn + offset[row]
             noise2 = np.maximum(net, 0.0) * table["gain"][row] + table["variance"][row]
             return np.asarray(np.divide(net - sky[row], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
 

@@ -12,6 +12,7 @@ from bokeh.palettes import interp_palette
 from mauvecl.answers.plan import COLUMNS
 from mauvecl.charts import chart, light_curves, spectra
 from mauvecl.charts.chart import Chart, ChartData, Custom, OwnMarker, PlotAxis, Targets
+from mauvecl.host.arrays import PER_MAD
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
@@ -87,8 +88,8 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
         image = sums / counts
         image = image - np.nanmedian(image, axis=1, keepdims=True)
         steps = np.diff(image, axis=1)
-        # Differences of neighbouring columns hold noise alone; 1.4826 makes a median absolute deviation a normal one's.
-        image = image / (1.4826 / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True))
+        # Differences of neighbouring columns hold noise alone.
+        image = image / (PER_MAD / np.sqrt(2.0) * np.nanmedian(np.abs(steps), axis=1, keepdims=True))
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
     length = float(frames.time_s[-1] + frames.cadence_s - frames.time_s[0]) / 60.0
     series: dict[str, Any] = {"dynamic": (image[None], [0.0], [nm[0]], [length], [max(nm[-1] - nm[0], 1.0)])}
