@@ -490,7 +490,7 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
     if below.any():
         yield (
             f"{source.name}: frames of {int(below.sum())} of {below.size} pixels fall below 0 DN by noise and are "
-            "recorded as 0, which means, noise and S/N leave out: the bias of the instrument is too small."
+            "recorded as 0. The stated means, noise and S/N ignore this; the bias of the instrument is too small."
         )
     if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
         yield (

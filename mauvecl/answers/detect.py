@@ -28,7 +28,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
-from mauvecl.schema.errors import InputError, Message
+from mauvecl.schema.errors import InputError, Message, counted
 from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
 from mauvecl.study.observation import NuisanceChoice
 from mauvecl.study.study import PAPER_STARS, Study
@@ -310,7 +310,7 @@ def _campaign(case: Case) -> list[str]:
         return f"{before} with the overlap of its stacks {interval.value:.3g} {ends}{after}"
 
     lines, tests = list[str](), many.tests
-    frames, count = (f"{n} {word}{'s'[: n != 1]}" for n, word in ((question.frames, "frame"), (tests, "test")))
+    frames, count = counted(question.frames, "frame"), counted(tests, "test")
     lines.append(
         f"A campaign of {frames} makes {count}: at {run.fap:g} per test {tests * run.fap:.3g} "
         f"false alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
@@ -326,10 +326,9 @@ def _campaign(case: Case) -> list[str]:
     if question.alarms is not None:
         if not question.alarms < tests:
             raise InputError.of("campaign.alarms", question.alarms, f"fewer than the {tests} tests")
-        alarms = "false alarm" if question.alarms == 1 else "false alarms"
         lines.append(
-            f"For {question.alarms:g} {alarms} expected in the campaign each of its {count} may have "
-            f"{question.alarms / tests:.4g} for any dependence between them: `fap={question.alarms / tests:.4g}`."
+            f"For {counted(question.alarms, 'false alarm', spec='g')} expected in the campaign each of its {count} may "
+            f"have {question.alarms / tests:.4g} for any dependence between them: `fap={question.alarms / tests:.4g}`."
         )
     return lines
 

@@ -191,7 +191,7 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
     for statistic in (name for name in run.statistics if lowered[name]):
         messages.append(Message(
             f"WRONG SIGN: {marginalised}{statistic} falls with the flare in {lowered[statistic]} of {number_of_cells} "
-            "cells, and only higher values are alarms: its detection probability says nothing of the flare there.",
+            "cells, and only higher values are alarms: its detection probability says nothing about the flare there.",
             "wrong sign",
         ))  # fmt: skip
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])

@@ -125,10 +125,11 @@ class Hypotheses:
         sentences, treatment = [], "marginalised over unknowns, " if self.nuisances else ""
         for name, k in product(self.statistics, range(len(self.flares))):
             if falls := self.fall(name, k):
+                snr = matched_snr(self.setting, self.flares[k])
                 sentences.append(Message(
                     f"WRONG SIGN: {treatment}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
-                    f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing of "
-                    f"the flare, which matched has at {matched_snr(self.setting, self.flares[k]):.3g}.", "wrong sign",
+                    f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
+                    f"about the flare, whose matched S/N is {snr:.3g}.", "wrong sign",
                 ))  # fmt: skip
         return tuple(sentences)
 
