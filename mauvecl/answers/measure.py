@@ -259,6 +259,17 @@ def matched_filter(
     return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
 
 
+def _quantiles(estimates: Float, shares: float | list[float]) -> Float:
+    """Return quantiles of estimates, (n, n_derived), along their first axis; NaN where no fit has the quantity.
+
+    A fit in which one blackbody is best has no second temperature, and is left out.
+    """
+    quantiles = np.full((*np.shape(shares), estimates.shape[1]), np.nan)
+    has = np.isfinite(estimates).any(axis=0)
+    quantiles[..., has] = np.nanquantile(estimates[:, has], shares, axis=0)
+    return quantiles
+
+
 @dataclass(frozen=True, eq=False)
 class MeasuredFlare(ExpectedMeasurement):
     """Model fitted to simulated exposures of a flare."""
@@ -296,13 +307,12 @@ class MeasuredFlare(ExpectedMeasurement):
     @property
     def bias_selected(self) -> Float:
         """Median of the estimates of detected flares less the truth, shape (n_derived,); NaN if none is detected."""
-        estimates = self.found.estimates[self.selected]
-        return (np.median(estimates, axis=0) if len(estimates) else np.nan) - self.truth
+        return _quantiles(self.found.estimates[self.selected], 0.5) - self.truth
 
     @property
     def scatter(self) -> Float:
         """Half of the width of the central 68.27 % of the estimates, shape (n_derived,); NaN for a single estimate."""
-        low, high = np.quantile(self.found.estimates, [0.15865, 0.84135], axis=0)
+        low, high = _quantiles(self.found.estimates, [0.15865, 0.84135])
         return np.asarray((high - low) / 2 if len(self.found.estimates) > 1 else np.full_like(low, np.nan))
 
     @cached_property
@@ -368,8 +378,8 @@ COLUMNS = (
     Column("low_95", lambda row: row.perfect.low[1, 0], "", "lower end of the 95 % interval of that fit", "95 % from",
            number(".4g"), detail=True),
     Column("high_95", lambda row: row.perfect.high[1, 0], "", "its upper end", "to", number(".4g"), detail=True),
-    Column("median", lambda row: np.median(row.found.estimates, axis=0), "", "median of the estimates"),
-    Column("bias", lambda row: np.median(row.found.estimates, axis=0) - row.truth, "",
+    Column("median", lambda row: _quantiles(row.found.estimates, 0.5), "", "median of the estimates"),
+    Column("bias", lambda row: _quantiles(row.found.estimates, 0.5) - row.truth, "",
            "median of the estimates less the truth", "bias", number(".4g"), detail=True),
     Column("scatter", "", "", "half of the central 68.27 % of the estimates",
            "scatter", number(".4g"), detail=True),

@@ -103,6 +103,22 @@ def test_flares_are_measured_along_a_stare(engine: Engine) -> None:
     assert any(name.startswith("line_") for name in two.tables["temperatures"].colnames)
 
 
+def test_second_temperature_is_that_of_the_fits_that_have_one(engine: Engine) -> None:
+    """Fit two blackbodies to a flare of one, which some exposures show."""
+    settings = (
+        "measure.fits=20",
+        "flare.amplitudes=[0.3]",
+        "nuisances={usual=false}",
+        'measure.models=["two-temperatures"]',
+    )
+    (flare,) = measure(study_of(*settings), engine).flares
+    kelvin = flare.found.estimates[:, list(flare.found.names).index("second temperature")]
+    assert 0 < np.isnan(kelvin).sum() < 19
+    (row,) = (row for row in flare.rows() if row["quantity"] == "second temperature")
+    assert row["median"] == pytest.approx(np.median(kelvin[~np.isnan(kelvin)]))
+    assert row["scatter"] > 0
+
+
 @pytest.mark.long
 def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine) -> None:
     """Check that the hotter blackbody is always the second, and that pictures have a column per model."""
