@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 #: Standard deviation of a normal distribution in units of its median absolute deviation, 1 / ndtri(0.75).
-PER_MAD = 1.4826022185056018
+PER_MAD = 1.482602218505602
 #: Arrays by name, as workers send and checkpoints keep them.
 Arrays = dict[str, NDArray[Any]]
 

@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import scipy
 
-from mauvecl.host.arrays import PER_MAD, Float
+from mauvecl.host.arrays import Float
 from mauvecl.schema.errors import InputError
 
 Item = TypeVar("Item")
@@ -317,7 +317,7 @@ class BinnedLightCurve:
         """Robust standard deviation of a value, from differences of neighbours."""
         steps = np.diff(self.values)[np.diff(self.time_s) < 1.5 * self.step_s]
         steps = steps if steps.size else np.diff(self.values)
-        spread = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0)
+        spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
         return spread if spread > 0 else float(np.std(self.values))
 
     @property
