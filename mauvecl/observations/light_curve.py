@@ -47,8 +47,8 @@ DEPARTURES = (0.0, 0.03, 0.2)
 #: Shortest period of rotation (assumed: 0.2 d), and the rise of the criterion for a faster process of which
 #: the frames show fewer periods or time scales than a number (both assumed).
 FASTEST_ROTATION_S, SEEN_ONCE, REPEATED = 17_280.0, 20.0, 10.0
-#: Share of the frames in events that may change in the last alternation.
-SETTLED = 0.002
+#: Share of the frames in events that may change in the last alternation, and when single frames are left out (assumed).
+SETTLED, RAN_AWAY = 0.002, 0.02
 
 
 def fit_quiet_light(
@@ -60,6 +60,12 @@ def fit_quiet_light(
     compared by the Bayesian information criterion, with the flares among the parameters. For arguments see `alternate`.
     """
     fitted, in_events = alternate(survey, guessed, before, steps)
+    if before is not None and float((in_events ^ guessed).mean()) > RAN_AWAY:
+        # Nearly the same frames had other events: which of them explain the light better?
+        previous = replace(survey, processes=before.processes, flux_process=before.flux_process)
+        costs = [criterion(s, light_of_events(s, e), e) for s, e in ((previous, guessed), (fitted, in_events))]
+        if costs[0] < costs[1]:
+            return previous, guessed
     if not _seen_once(fitted):
         return fitted, in_events
     noise = tuple(Process((), process.excess) for process in fitted.processes)
