@@ -269,7 +269,8 @@ def test_files_that_once_failed_have_an_answer() -> None:
     assert np.isfinite([event.fitted_s, *event.low_s, *event.high_s]).all()
 
 
-@pytest.mark.parametrize("decay", long_but([10, 20], 10))
+@pytest.mark.long
+@pytest.mark.parametrize("decay", [10, 20])
 def test_light_that_settles_after_a_gap_is_no_detected_flare(decay: int) -> None:
     """As Kepler's light after its safe mode of July 2009; a flare of the same light whose peak is seen is detected."""
     number = np.arange(700)

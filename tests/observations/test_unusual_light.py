@@ -297,7 +297,7 @@ def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
     assert np.abs(level - truth)[near].max() < 6 * NOISE
 
 
-@pytest.mark.parametrize("what", ["long flare", "dip of half a day", "fast trend"])
+@pytest.mark.parametrize("what", long_but(["long flare", "dip of half a day", "fast trend"], "fast trend"))
 def test_changes_that_do_not_last_are_no_steps(what: str) -> None:
     """Observe twenty days with a flare that takes a day to decay, a dip of half a day, or a change within two days."""
     time = np.arange(1000) * FRAME_S
