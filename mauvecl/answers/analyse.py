@@ -464,7 +464,7 @@ class AnalyseAnswer(Answer):
         """The number of detected flares, with the expected false alarms."""
         verdicts = [row.verdict for row in self.rows]
         number, undetected = verdicts.count("detected"), len(verdicts) - verdicts.count("detected")
-        flares = counted(number, "flare", "is") if number else "No flare is"
+        flares = f"{counted(number, 'flare')} {'is' if number == 1 else 'are'}" if number else "No flare is"
         more = f", and {counted(undetected, 'more event')} listed" if undetected else ""
         # Dips raise the threshold, and simulated light curves do not show the rates of many alarms in each.
         analysis = self.analysis

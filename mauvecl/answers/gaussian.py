@@ -168,8 +168,7 @@ class GaussianAnswer(Answer):
         many = f"{'as many' if worst == 1.0 else f'up to {worst:.3g} times as many'} as promised"
         return (
             f"The root-of-N formula is {f'off by at most {snr:.2g}' if snr else 'right'} in S/N, and its false alarms "
-            f"are {'too rare to be counted' if np.isnan(worst) else many}, in "
-            f"{counted(len(cells), 'case')}."
+            f"are {'too rare to be counted' if np.isnan(worst) else many}, in {counted(len(cells), 'case')}."
         )
 
     @property

@@ -321,7 +321,7 @@ class StareAnswer(Answer):
         events = [flare.event for flare in stare.found]
         number_found, false, unknown = len({*events} - {0, -1}), events.count(0), events.count(-1)
         alarms = counted(false, "false alarm") if false else "no false alarms"
-        rest = f"; {counted(unknown, 'alarm', 'is')} not measured" if unknown else ""
+        rest = f"; {counted(unknown, 'alarm')} {'is' if unknown == 1 else 'are'} not measured" if unknown else ""
         return f"The search finds {number_found} of {drawn} and raises {alarms}{least}{rest}."
 
     @property

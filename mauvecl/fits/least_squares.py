@@ -96,7 +96,7 @@ def interval_end(
         # Steps across a kink, where the peak changes frames, would not become shorter.
         damping *= SHORTER if np.sum(change * last_change) < 0.0 else 1.0
         length, last_change = float(np.linalg.norm(change)) / unit, change
-        share = min(1.0, LONGEST / max(length, LONGEST)) * damping
+        share = LONGEST / max(length, LONGEST) * damping
         there[free] += share * step
         if share * length < CONVERGED:
             there[free[held]] += (1.0 - share) * step[held]

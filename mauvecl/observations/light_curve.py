@@ -63,8 +63,9 @@ def fit_quiet_light(
     if before is not None and float((in_events ^ guessed).mean()) > RAN_AWAY:
         # Nearly the same frames had other events: which of them explain the light better?
         previous = replace(survey, processes=before.processes, flux_process=before.flux_process)
-        costs = [criterion(s, light_of_events(s, e), e) for s, e in ((previous, guessed), (fitted, in_events))]
-        if costs[0] < costs[1]:
+        states = (previous, guessed), (fitted, in_events)
+        cost, refitted = (criterion(state, light_of_events(state, events), events) for state, events in states)
+        if cost < refitted:
             return previous, guessed
     if not _seen_once(fitted):
         return fitted, in_events

@@ -64,14 +64,9 @@ def printable(text: str, most: int) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
-#: Verbs of one thing and of several.
-VERBS = {"is": "are", "has": "have"}
-
-
-def counted(number: float, noun: str, verb: str = "", *, spec: str = "") -> str:
-    """Return a number with its noun, and with "is" or "has", as in "1 frame is" and "3 frames are"."""
-    words = (f"{number:{spec}}", noun, verb) if number == 1 else (f"{number:{spec}}", f"{noun}s", VERBS.get(verb, ""))
-    return " ".join(filter(None, words))
+def counted(number: float, noun: str, *, spec: str = "") -> str:
+    """Return a number with its noun, as in "1 frame" and "3 frames"."""
+    return f"{number:{spec}} {noun}{'' if number == 1 else 's'}"
 
 
 class InputError(ValueError):

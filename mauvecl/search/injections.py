@@ -285,7 +285,7 @@ class CriticalAmplitudes:
     @cached_property
     def photons(self) -> Float:
         """Root of the covariance that a flare of unit amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
-        values, vectors = np.linalg.eigh(self.survey.components.sum_cumulants(2)[1][len(STEADY)])
+        values, vectors = np.linalg.eigh(self.survey.response_noise)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
     @cached_property
@@ -370,8 +370,8 @@ class CriticalAmplitudes:
                 if values[direction, template] < self.threshold:
                     continue
                 sums = noise[:, frames].T + amplitude * rise + np.sqrt(amplitude) * glow
-                size, width = values[direction, template] / b[direction, template], site.widths_s[template]
                 kelvin = survey.templates.temperatures_k[survey.templates.chosen[direction]]
+                size, width = values[direction, template] / b[direction, template], site.widths_s[template]
                 start = np.array([[np.log(size), site.peaks_s[template], np.log(width), np.log(kelvin)]])
                 comparison = self._comparison(site, self.amplitudes[d, s], _fitted(survey, sums, start))
                 for name, values in comparison.items():

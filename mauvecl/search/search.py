@@ -383,11 +383,16 @@ class Survey:
             values = np.tile(self.response, (log_k.size, 1))
         return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
 
+    @cached_property
+    def response_noise(self) -> Float:
+        """Covariance that the first flare component adds to a frame's sums at unit amplitude, (n_sum, n_sum)."""
+        return np.asarray(self.components.sum_cumulants(2)[1][len(STEADY)])
+
     def photon_noise(self, log_k: float) -> Float:
         """Return the covariance of a frame's sums that a flare of unit amplitude adds, (n_sum, n_sum)."""
         if self.templates.coloured:
             return np.asarray(self.templates.noise[self.templates.nearest(float(np.exp(log_k)))])
-        return np.asarray(self.components.sum_cumulants(2)[1][len(STEADY)])
+        return self.response_noise
 
     @property
     def unit_snr(self) -> float:
