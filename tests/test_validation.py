@@ -16,6 +16,8 @@ from typing import Any, Union, get_args, get_origin
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import Column, MaskedColumn
+from astropy.utils.masked import Masked
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel
 from refusals import refused, says_what_is_accepted
@@ -175,7 +177,15 @@ def test_quantities_are_plain_numbers(path: str, name: str) -> None:
     for other in (unit, *EQUIVALENT.get(unit, ())):
         equivalent = u.spectral() if unit == "nm" else u.temperature()
         given = (np.asarray(value) * u.Unit(unit)).to(u.Unit(other), equivalent)
-        np.testing.assert_allclose(np.asarray(check(given), float), np.asarray(plain, float), rtol=1e-9, atol=1e-9)
+        for quantity in (given, Column(given.value, unit=given.unit)) if given.shape else (given,):
+            taken = np.asarray(check(quantity), float)
+            np.testing.assert_allclose(taken, np.asarray(plain, float), rtol=1e-9, atol=1e-9)
+        if holds_arrays(hint):
+            for masked in (
+                Masked(given, mask=[True, False]),
+                MaskedColumn(given.value, unit=other, mask=[True, False]),
+            ):
+                np.testing.assert_allclose(np.asarray(check(masked), float), [np.nan, plain[1]], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

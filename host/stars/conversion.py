@@ -20,7 +20,7 @@ from mauvecl.host.arrays import Float
 from mauvecl.host.stars.columns import Role, as_typed, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
 from mauvecl.host.stars.spectrum import FLUX_UNIT, check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
-from mauvecl.host.tables.table import Values, marks_in, without_indefinite
+from mauvecl.host.tables.table import Values, ends_of, marks_in, without_indefinite
 from mauvecl.host.tables.units import Medium, is_stated, unit_and_medium, unit_of, vacuum_wavelengths
 from mauvecl.schema.errors import InputError
 
@@ -279,7 +279,7 @@ def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any 
     wavelengths = axis(waves)
     if is_assumed:
         check_assumed_unit(wavelengths.value, str(wavelengths.unit))
-    marks, remarks = marks_in(fluxes, "flux", "fluxes")
+    marks, remarks = marks_in(Values.of("flux", fluxes), ends_of(fluxes), "flux", "fluxes")
     messages += remarks
     segments = []
     for values, flux in table.segments:

@@ -349,7 +349,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     def from_arrays(
         cls,
         wavelength_nm: Annotated[ArrayLike, Unit("nm")],
-        flux_flam: ArrayLike,
+        flux_flam: Annotated[ArrayLike, Unit("erg / (s cm2 AA)")],
         *,
         name: str = "flare",
         continue_at_k: fields.Temperature | None = None,

@@ -208,18 +208,18 @@ class Source(Drawable, ContentEquality):
 
         try:
             nm, values = (
-                array if isinstance(array, u.Quantity) else np.asarray(array) * (getattr(array, "unit", None) or unit)
+                array if isinstance(array, u.Quantity) else np.asarray(array) * unit
                 for array, unit in ((wavelength, u.nm), (flux, FLUX_UNIT))
             )
             nm = nm.to(u.nm, u.spectral())
             values = values.to(FLUX_UNIT, u.spectral_density(nm))
         except (u.UnitConversionError, TypeError, ValueError) as error:
             raise InputError(f"spectrum {name} needs a wavelength and a flux density: {error}", key="flux") from error
-        axis, density = np.ma.filled(nm.value, np.nan), np.ma.filled(values.value, np.nan)
+        axis, density = np.asarray(nm.value, float), np.asarray(values.value, float)
         if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
             # Rising frequencies or energies are falling wavelengths.
             axis, density = axis[::-1], density[::-1]
-        return cls._of_points(ReadSpectrum(np.asarray(axis, float), np.asarray(density, float), name, origin), extend)
+        return cls._of_points(ReadSpectrum(axis, density, name, origin), extend)
 
     @classmethod
     def from_synphot(cls, spectrum: Any, *, name: str = "synphot spectrum") -> Self:

@@ -61,28 +61,6 @@ def without_indefinite(values: Float) -> Float:
     return np.where(bad, np.nan, values) if bad.any() else values
 
 
-def marks_in(values: Float, one: str, several: str) -> tuple[list[float], list[str]]:
-    """Return values that mark missing ones, such as -99 and 9999, and remarks on `one` or `several` of them.
-
-    A mark consists of nines. Either it occurs once and is a thousand times larger than all other values, or it occurs
-    more often and is three times larger, or three times as far below zero.
-    """
-    marks: list[float] = []
-    remarks: list[str] = []
-    finite = np.isfinite(values)
-    for mark in {float(end(values, initial=0.0, where=finite)) for end in (np.min, np.max)}:
-        if not re.fullmatch(r"-?9{2,}(?:\.9+)?", f"{mark:.7g}"):
-            continue
-        unmarked = values[finite & (np.abs(values) != abs(mark))]
-        n = np.count_nonzero(values == mark)
-        beyond = np.max(-unmarked if mark < 0 and n > 1 else np.abs(unmarked), initial=0.0)
-        if unmarked.size and abs(mark) > (3 if n > 1 else 1000) * beyond:
-            marks += [mark, -mark]
-            words = "marks a missing value and is" if n == 1 else "mark missing values and are"
-            remarks.append(f"{n} {one if n == 1 else several} of {mark:.7g} {words} left undefined")
-    return marks, remarks
-
-
 @dataclass(frozen=True, eq=False)
 class Values:
     """Values with a row for each frame, or one for each pixel."""
@@ -239,6 +217,37 @@ def is_known(text: str) -> bool:
         return unit_in(text) is not None
     except (ValueError, TypeError):
         return False
+
+
+def ends_of(values: Float) -> tuple[float, float]:
+    """Return the lowest and the highest of finite values and zero."""
+    finite = np.isfinite(values)
+    return float(np.min(values, initial=0.0, where=finite)), float(np.max(values, initial=0.0, where=finite))
+
+
+def marks_in(light: Values, ends: tuple[float, float], one: str, several: str) -> tuple[list[float], list[str]]:
+    """Return values that mark missing ones, such as -99 and 9999, and remarks on `one` or `several` of them.
+
+    A mark consists of nines. Either it occurs once and is a thousand times larger than all other values, or it occurs
+    more often and is three times larger, or three times as far below zero. Light, whose ends `ends_of` returns,
+    is read only if one of these may be a mark.
+    """
+    marks: list[float] = []
+    remarks: list[str] = []
+    for mark in {*ends}:
+        if not re.fullmatch(r"-?9{2,}(?:\.9+)?", f"{mark:.7g}"):
+            continue
+        n, n_unmarked, low, high = 0, 0, 0.0, 0.0
+        for values in map(light.rows, light.pieces):
+            unmarked = values[np.isfinite(values) & (np.abs(values) != abs(mark))]
+            n, n_unmarked = n + int(np.count_nonzero(values == mark)), n_unmarked + unmarked.size
+            low, high = float(unmarked.min(initial=low)), float(unmarked.max(initial=high))
+        beyond = -low if mark < 0 and n > 1 else max(-low, high)
+        if n_unmarked and abs(mark) > (3 if n > 1 else 1000) * beyond:
+            marks += [mark, -mark]
+            words = "marks a missing value and is" if n == 1 else "mark missing values and are"
+            remarks.append(f"{n} {one if n == 1 else several} of {mark:.7g} {words} left undefined")
+    return marks, remarks
 
 
 class TableFile(ABC):

@@ -24,7 +24,6 @@ from mauvecl.host.tables.table import (
     TableFile,
     Values,
     convert,
-    marks_in,
     unit_in,
     without_indefinite,
 )
@@ -427,8 +426,7 @@ def _read_light(
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     sd = None if sd is None else without_indefinite(sd)
-    marks, notes = marks_in(light, "value", "values")
-    light = np.where(np.isin(light, marks), np.nan, light) if marks else light
+    notes: list[str] = []
     unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
     if "quality" not in quantities and unused:
         notes = [*notes, f"no flags are used; a mapping with quality names one of {', '.join(unused)}"]

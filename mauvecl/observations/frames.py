@@ -18,7 +18,7 @@ from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.tables.units import SCALES, mission_of, offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import DAY_S, Moment, Unit
+from mauvecl.schema.fields import DAY_S, AnyUnit, Moment, Unit, is_quantity, without_unit
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -127,6 +127,16 @@ class Reason(IntFlag):
         return np.array(words, np.str_)[place]
 
 
+def _in_one_unit(flux: ArrayLike, error: ArrayLike | None, unit: str, name: str) -> tuple[Any, Any, str]:
+    """Return fluxes and errors as plain numbers in `unit`, or else in that of the fluxes, and this unit."""
+    unit = unit or str(getattr(flux, "unit", None) or "")
+    try:
+        light, spread = (without_unit(values, unit) if is_quantity(values) else values for values in (flux, error))
+    except ValueError as fault:
+        raise InputError(f"{name} needs fluxes and errors in units that convert: {fault}", key="flux") from fault
+    return light, spread, unit
+
+
 def _cadence_of(name: str, time: Float, light: Float) -> float:
     """Return the median step of times; raise InputError for wrong shapes and sizes, and for frames too near or far."""
     n, refused = time.size, partial(InputError.of, where=name)
@@ -179,8 +189,8 @@ class Frames:
     def of(
         cls,
         time_s: Annotated[ArrayLike, Unit("s")],
-        flux: ArrayLike,
-        error: ArrayLike | None = None,
+        flux: Annotated[ArrayLike, AnyUnit()],
+        error: Annotated[ArrayLike, AnyUnit()] | None = None,
         *,
         exposure_s: Annotated[ArrayLike, Unit("s")] | None = None,
         quality: ArrayLike | None = None,
@@ -194,6 +204,7 @@ class Frames:
         time_s : array_like, shape (n_frame,)
             Middle of each frame.
         flux, error : array_like, shape (n_frame,) or (n_frame, n_pixel)
+            Plain numbers, or Quantities and columns in units that convert to each other.
         exposure_s : array_like, optional
             One exposure time, or one for each frame; by default the median time between frames.
         quality : array_like, shape (n_frame,), optional
@@ -201,6 +212,7 @@ class Frames:
         **how
             Other attributes.
         """
+        flux, error, how["unit"] = _in_one_unit(flux, error, how.get("unit", ""), name)
         time, light = np.asarray(time_s, np.float64), np.asarray(flux, np.float64)
         cadence, refused = _cadence_of(name, time, light), partial(InputError.of, where=name)
         n, order = time.size, np.argsort(time, kind="stable")

@@ -18,7 +18,7 @@ from mauvecl.host.tables.files import check_folder, limit_bytes, parsing
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import match_name
 from mauvecl.host.tables.opening import read_table
-from mauvecl.host.tables.table import MemoryTable, TableFile, Values, without_indefinite
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values, ends_of, marks_in, without_indefinite
 from mauvecl.observations.frames import MAX_FRAMES, live_pixels
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError, missing_package
@@ -271,7 +271,10 @@ def weighted_sums(
         expected = f"finite numbers of shape (n_weight, {n_pixel})"
         raise InputError.of("weights", factors.shape, expected, where=flux.label)
     flux = _without_flagged_pixels(flux, quality)
-    statistics, finite = _statistics(flux, error, quality)
+    statistics, finite, ends = _statistics(flux, error, quality)
+    flux, notes = _without_marks(flux, ends)
+    if notes:
+        statistics, finite, _ = _statistics(flux, error, quality)
     live, remarks = live_pixels(finite, n, flux.label)
     columns = factors[:, live].T
     sums = np.concatenate([flux.rows(piece)[:, live] @ columns for piece in flux.pieces])
@@ -279,7 +282,7 @@ def weighted_sums(
     errors: Any = [None] * len(factors)
     if error is not None:
         errors = np.concatenate([np.sqrt(error.rows(piece)[:, live] ** 2 @ columns**2) for piece in error.pieces]).T
-    return [(light, sd, flags, remarks) for light, sd in zip(sums.T, errors, strict=True)], statistics
+    return [(light, sd, flags, notes + remarks) for light, sd in zip(sums.T, errors, strict=True)], statistics
 
 
 def _without_flagged_pixels(flux: Values, quality: Values | None) -> Values:
@@ -295,6 +298,17 @@ def _without_flagged_pixels(flux: Values, quality: Values | None) -> Values:
     return replace(flux, read=read)
 
 
+def _without_marks(flux: Values, ends: tuple[float, float]) -> tuple[Values, tuple[str, ...]]:
+    """Return light that is NaN where a number such as -999 marks a missing value, and remarks; see `marks_in`."""
+    marks, notes = marks_in(flux, ends, "value", "values")
+
+    def read(piece: slice) -> Float:
+        values = flux.rows(piece)
+        return np.where(np.isin(values, marks), np.nan, values)
+
+    return replace(flux, read=read) if marks else flux, tuple(f"{flux.label}: {text}" for text in notes)
+
+
 def _flags_of_frames(quality: Values | None) -> Float | None:
     """Return one flag for each frame in which every pixel has one; None without flags of pixels."""
     if quality is None or len(quality.shape) == 1:
@@ -305,14 +319,15 @@ def _flags_of_frames(quality: Values | None) -> Float | None:
 
 def _statistics(
     flux: Values, error: Values | None, quality: Values | None
-) -> tuple[PixelStatistics, NDArray[np.int64]]:
-    """Return statistics of frames without a fault, and how often each pixel is finite in any frame."""
+) -> tuple[PixelStatistics, NDArray[np.int64], tuple[float, float]]:
+    """Return statistics of frames without a fault, how often each pixel is finite in any frame, and the ends."""
     n_pixel = flux.shape[1]
     finite, count, pairs = np.zeros((3, n_pixel), np.int64)
     total, squares, squared_errors = np.zeros((3, n_pixel))
-    before = np.full((1, n_pixel), np.nan)
+    before, ends = np.full((1, n_pixel), np.nan), (0.0, 0.0)
     for piece in flux.pieces:
         values = flux.rows(piece)
+        ends = ends_of(np.array([*ends, *ends_of(values)]))
         finite += np.isfinite(values).sum(axis=0)
         if quality is not None:
             values[(quality.rows(piece).reshape(len(values), -1) != 0).all(axis=1)] = np.nan
@@ -328,7 +343,8 @@ def _statistics(
             squared_errors += (error.rows(piece) ** 2).sum(axis=0, where=fine)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean, scatter = total / count, np.sqrt(squares / pairs / 2.0)
-        return PixelStatistics(count, mean, scatter, None if error is None else np.sqrt(squared_errors / count)), finite
+        rms = None if error is None else np.sqrt(squared_errors / count)
+    return PixelStatistics(count, mean, scatter, rms), finite, ends
 
 
 def read_light(flux: Values, error: Values | None, quality: Values | None) -> Light:
@@ -337,7 +353,8 @@ def read_light(flux: Values, error: Values | None, quality: Values | None) -> Li
     limit = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     if len(flux.shape) == 1 or n_bytes <= limit:
         light = _without_flagged_pixels(flux, quality).numbers()
-        return light, None if error is None else error.numbers(), _flags_of_frames(quality), ()
+        whole, notes = _without_marks(replace(flux, read=light.__getitem__), ends_of(light))
+        return whole.numbers(), None if error is None else error.numbers(), _flags_of_frames(quality), notes
     remark = (
         f"{flux.label} has {n_bytes / 2**20:.0f} MiB of spectra, more than {limit >> 20} MiB: they were summed over "
         "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit"

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import is_quantity, is_truth, or_error, whole_number, without_unit
+from mauvecl.schema.fields import as_quantity, is_quantity, is_truth, or_error, whole_number, without_unit
 
 #: Place of an error inside an alternative of a union.
 ALTERNATIVE = "|"
@@ -107,7 +107,7 @@ def _items(value: Any, size: int | None = None) -> Any:
     is_single = (
         isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0
     )
-    items = () if is_single else tuple(value)
+    items = () if is_single else tuple(as_quantity(value) if is_quantity(value) else value)
     if is_single or size not in (None, len(items)):
         raise PydanticCustomError("expected", f"Input should be a sequence{'' if size is None else f' of {size}'}")
     return items

@@ -25,12 +25,21 @@ if TYPE_CHECKING:
 
 
 def is_quantity(value: Any) -> bool:
-    """Return whether a value is an astropy Quantity."""
-    return hasattr(value, "to_value") and hasattr(value, "unit")
+    """Return whether a value is an astropy Quantity, or a column of a table that has a unit."""
+    return getattr(value, "unit", None) is not None and (hasattr(value, "to_value") or hasattr(value, "quantity"))
+
+
+def as_quantity(value: Any) -> Any:
+    """Return a column that has a unit as a Quantity, and a Quantity unchanged; masked values are undefined (NaN)."""
+    import astropy.units as u
+
+    if getattr(value, "mask", None) is not None:
+        value = value.astype(float).filled(math.nan)
+    return u.Quantity(value, subok=True)
 
 
 def without_unit(value: Any, unit: str) -> Any:
-    """Return a Quantity as plain numbers: a float, or an array of its shape.
+    """Return a Quantity, or a column that has a unit, as plain numbers: a float, or an array of its shape.
 
     Raises ValueError if its unit has no equivalent in `unit`. Wavelengths may be frequencies or energies, and
     temperatures may be on any scale.
@@ -45,7 +54,7 @@ def without_unit(value: Any, unit: str) -> Any:
     elif target.is_equivalent(u.K) or target == u.deg_C:
         equivalencies = u.temperature()
     try:
-        converted = value.to_value(target, equivalencies)
+        converted = as_quantity(value).to_value(target, equivalencies)
     except u.UnitsError as error:
         raise ValueError(str(error)) from error
     return converted if getattr(converted, "ndim", 0) else float(converted)
@@ -216,13 +225,13 @@ def whole_number(value: Any) -> int:
 
 
 class AnyUnit:
-    """A number or an array whose Quantities keep their unit, since the function itself converts them."""
+    """A number or an array that keeps its unit as a Quantity, since the function itself converts it."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import core_schema
 
         def keep(value: Any, validate: Any) -> Any:
-            return value if is_quantity(value) else validate(value)
+            return as_quantity(value) if is_quantity(value) else validate(value)
 
         return core_schema.no_info_wrap_validator_function(keep, handler(source))
 

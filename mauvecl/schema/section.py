@@ -144,7 +144,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, datetime.date):
         return value.isoformat()
     if fields.is_quantity(value):
-        return list(map(plain, value)) if getattr(value, "ndim", 0) else value
+        return list(map(plain, fields.as_quantity(value))) if getattr(value, "ndim", 0) else value
     if hasattr(value, "tolist"):
         return value.tolist()
     if hasattr(value, "utc") and hasattr(value, "isot"):

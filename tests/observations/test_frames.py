@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.nddata import InverseVariance, StdDevUncertainty
-from astropy.table import Table
+from astropy.table import Column, Table
 from astropy.time import Time
 from astropy.timeseries import BinnedTimeSeries, TimeSeries
 from layouts import documented_files
@@ -22,6 +22,14 @@ from mauvecl.observations import frames as observed
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
 FLUX = 1000 + RNG.normal(0, 5, 100)
+
+
+def test_fluxes_and_errors_may_have_units_of_their_own() -> None:
+    flux, error = FLUX * u.electron / u.s, np.full(100, 300.0) * u.electron / u.min
+    for light, spread in ((flux, error), (Column(flux.value, unit=flux.unit), Column(error.value, unit=error.unit))):
+        frames = Frames.of(TIME / 60 * u.min, light, spread)
+        assert frames.unit == "electron / s"
+        np.testing.assert_allclose((frames.time_s, frames.flux, frames.error), (TIME, FLUX, np.full(100, 5.0)))
 
 
 def test_frames_are_sorted_and_numbered_over_gaps_and_slow_changes_of_the_times() -> None:
