@@ -323,9 +323,15 @@ class CalibrateAnswer(Answer):
         dark, every_bias = np.full(moved.pixels, level.mean()), np.full(moved.pixels, bias.mean())
         dark[read], every_bias[read] = level, bias
         by_pixel: dict[str, Any] = {"pixel": np.arange(moved.pixels), "dark": dark}
-        for name, unit in (("response", 1), ("gain", 1), ("read_noise_dn", u.DN)):
+        for name in ("response", "gain", "read_noise_dn"):
             if (column := getattr(self.nominal.pixel_map, name, None)) is not None:
-                by_pixel[name] = column * unit
+                by_pixel[name] = column
+        if "read_noise_dn" in by_pixel:
+            # The fit determines the mean variance of the pixels that are read.
+            rms_dn = np.sqrt(np.mean(by_pixel["read_noise_dn"][read] ** 2))
+            by_pixel["read_noise_dn"] = (
+                by_pixel["read_noise_dn"] * u.DN * self.changes.get("read_noise_dn", rms_dn) / rms_dn
+            )
         if np.ptp(bias) > 0:
             by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}

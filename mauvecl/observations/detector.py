@@ -171,11 +171,13 @@ def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
 def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit, nominal: Instrument) -> Float:
     """Measure the variance of frames from differences of consecutive ones, where light and dark may jitter.
 
-    The rows of the result, shape (5, n_value), are the variance, light and dark of each usable pixel of each
-    observation (of dark frames, at each temperature), the degrees of freedom of the variance, and the relative gain of
-    the pixel by the nominal map.
+    The rows of the result, shape (6, n_value), are the variance, light and dark of each usable pixel of each
+    observation (of dark frames, at each temperature), the degrees of freedom of the variance, and, by the nominal map,
+    the gain of the pixel and the variance of its read noise over the mean.
     """
     measured, gains = [], nominal.per_pixel("gain", 1.0)
+    read_variances = nominal.per_pixel("read_noise_dn", nominal.read_noise_dn) ** 2 + ROUNDING
+    shares = read_variances / read_variances.mean()
     for frames in observations:
         breaks = np.flatnonzero(np.abs(np.diff(frames.temperature_c)) > SAME_TEMPERATURE_C) + 1
         for rows in np.split(np.arange(frames.n_frames), breaks if frames.star is None else []):
@@ -191,7 +193,7 @@ def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit,
             # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann
             # 1941).
             dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
-            measured.append([variance, light, counts, dof, gains[usable]])
+            measured.append([variance, light, counts, dof, gains[usable], shares[usable]])
     return np.concatenate(measured, axis=1)
 
 
@@ -201,9 +203,9 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     Values that the data do not determine stay nominal. The standard error of the dark of a mean frame, `dark_error_dn`,
     adds to that of the read noise.
     """
-    variance, light, dark, dof, gains = measured
-    fits = {"DN": _fit(gains * light, dark, variance, dof),
-            "electrons": _fit(gains * (light + dark), np.zeros_like(dark), variance, dof)}  # fmt: skip
+    variance, light, dark, dof, gains, shares = measured
+    fits = {"DN": _fit(shares, gains * light, dark, variance, dof),
+            "electrons": _fit(shares, gains * (light + dark), np.zeros_like(dark), variance, dof)}  # fmt: skip
     better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
     assumed: tuple[str, ...] = ("unit of the dark counts",)
     if abs(better) > MIN_CHI2_DIFFERENCE:
@@ -222,9 +224,9 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
                           variance.size - 2, light, variance, model, assumed)  # fmt: skip
 
 
-def _fit(column: Float, fixed: Float, variance: Float, dof: Float) -> tuple[Float, Float, float, Float]:
-    """Fit variance = fixed + read + gain * column; return the values, covariance, chi-squared and the model."""
-    design = np.column_stack([np.ones_like(column), column])
+def _fit(share: Float, column: Float, fixed: Float, variance: Float, dof: Float) -> tuple[Float, Float, float, Float]:
+    """Fit variance = fixed + read * share + gain * column; return values, covariance, chi-squared and the model."""
+    design = np.column_stack([share, column])
     model = np.maximum(variance, 1.0)
     fitted, covariance = np.zeros(2), np.eye(2)
     for _ in range(ITERATIONS):

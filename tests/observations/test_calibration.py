@@ -146,10 +146,10 @@ def test_one_star_determines_throughput_alone() -> None:
 
 
 def test_maps_of_the_nominal_pixels_count_once() -> None:
-    """The fitted instrument has the light of the true one at any gain of its pixels, and their dark current."""
+    """The fitted instrument has the light, dark current and noise of the true one at any gain of its pixels."""
     slope = np.linspace(-0.1, 0.1, NOMINAL.pixels)
-    maps = mauvecl.PixelMap(gain=1 + slope, dark=1.2 - slope)
-    true, rng = NOMINAL.with_(pixel_map=maps), np.random.default_rng(6)
+    maps = mauvecl.PixelMap(gain=1 + slope, dark=1.2 - slope, read_noise_dn=10 + 50 * slope)
+    true, rng = NOMINAL.with_(pixel_map=replace(maps, read_noise_dn=30 + 150 * slope)), np.random.default_rng(6)
     study = study_of((("A0V", 5.0),), dark=False).with_instrument({"pixel_map": maps})
     found = calibrate(study, frames=(frames_of(true, star("A0V", 5.0), [21.0], 40, rng),))
     right, fitted = (expected(star("A0V", 5.0), one) for one in (true, found.instrument))
@@ -158,6 +158,9 @@ def test_maps_of_the_nominal_pixels_count_once() -> None:
     assert value_of(found, "dark current").nominal == pytest.approx(value_of(found, "dark current").value)
     gain = value_of(found, "gain")
     assert abs(gain.value - true.gain_dn_per_electron) < FAR * gain.error
+    error = value_of(found, "read noise").error
+    assert error < 3
+    assert (abs(fitted.read_noise_dn - right.read_noise_dn) < 1.3 * FAR * error).all()
 
 
 @pytest.mark.long
