@@ -419,7 +419,7 @@ STATISTIC_COLUMN = Column("statistic", description="detection statistic", headin
 
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], QUANTITIES[answer.study.limit.of].unit
-    unknown = _unknown_columns(digits) if answer.study.unknowns.draws else ()
+    unknown = _unknown_columns(of) if answer.study.unknowns.draws else ()
     return (
         *answer.flare_columns,
         share_column("quiet.target_share"),
@@ -437,15 +437,16 @@ def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     )  # fmt: skip
 
 
-def _unknown_columns(digits: str) -> tuple[Column, ...]:
+def _unknown_columns(of: str) -> tuple[Column, ...]:
     """Return the columns of limits over draws of what is unknown of the instrument."""
+    digits, unit = DIGITS[of], QUANTITIES[of].unit
 
     def largest(row: Limit) -> tuple[str, float]:
         name, share = next(iter(cast("UnknownEffect", row.unknown).shares.items()))
         return ("" if np.isnan(share) else name), share
 
     return (
-        *interval_columns("unknown_{}", lambda row: row.unknown.range, "", "the central 95 % of the limits",
+        *interval_columns("unknown_{}", lambda row: row.unknown.range, unit, "the central 95 % of the limits",
                           "95 % of limits", lambda low, high: f"{low:{digits}} to {high:{digits}}"),
         Column("matters_most", lambda row: largest(row)[0],
                description="unknown that explains most of the limits' variance; empty if too few draws tell"),
@@ -460,7 +461,8 @@ def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
         Column(name, itemgetter(k), description=f"drawn {label}").of(lambda row: row.unknown.draws.values.T)
         for k, (name, label) in enumerate(zip(draws.names, draws.labels, strict=True))
     )
-    return (*answer.flare_columns, *values, Column(answer.study.limit.of, "unknown.limits", "", "closed-form limit"))
+    of = answer.study.limit.of
+    return (*answer.flare_columns, *values, Column(of, "unknown.limits", QUANTITIES[of].unit, "closed-form limit"))
 
 
 @dataclass(eq=False)
@@ -520,7 +522,7 @@ class LimitAnswer(Answer):
         if draws:
             heading = "matters most, share of the variance"
             column = Column("shares", lambda row: forms.describe_shares(row.unknown.shares), heading=heading)
-            shown = (*self.placed(self.flare_columns), *_unknown_columns(DIGITS[of])[:2], column)
+            shown = (*self.placed(self.flare_columns), *_unknown_columns(of)[:2], column)
             unknown = "what is unknown of the instrument: the limits of each, and what explains their scatter"
             views.append(View(f"Averaged over {draws} draws of {unknown}", shown, table_of(shown, self.limits)))
         return [*views, *super().views]

@@ -4,6 +4,7 @@ from functools import cache
 from itertools import permutations
 from typing import Any
 
+import astropy.units as u
 import numpy as np
 import pytest
 from scenes import study_of_g2v
@@ -71,7 +72,9 @@ def test_limit_over_unknowns_has_the_power_on_average(averaged: Any, engine: Eng
     values = dict(zip(unknown.draws.names, unknown.draws.values.T, strict=True))
     assert np.corrcoef(values["qe_scale"], unknown.limits)[0, 1] > 0.6
     assert averaged.table["matters_most"][0] == next(iter(unknown.shares)) == "qe_scale"
-    assert averaged.table["unknown_low"][0] < averaged.table["unknown_high"][0]
+    limits = [averaged.table[name] for name in ("unknown_low", "unknown_high", "magnitude")]
+    assert limits[0][0] < limits[1][0]
+    assert {column.unit for column in (*limits, averaged.draws["magnitude"])} == {u.mag}
     np.testing.assert_array_equal(averaged.draws["qe_scale"], values["qe_scale"])
 
 
