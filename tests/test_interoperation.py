@@ -8,7 +8,7 @@ import pytest
 from astropy.table import Table
 from scenes import star
 
-from mauvecl import Blackbody, Source, Study
+from mauvecl import Blackbody, Frames, Source, Study
 from mauvecl.host.stars import flare as flare_tables
 
 
@@ -95,6 +95,8 @@ def test_altaipony_table_is_read(tmp_path: Path) -> None:
 
 def test_data_frame_and_fits_table_are_read(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas")
+    seconds, light = pandas.Series(np.arange(20.0)), pandas.Series([None] + 19 * [7], dtype="Int64")
+    np.testing.assert_array_equal(Frames.of(seconds, light).flux, [np.nan] + 19 * [7.0])
     frame = pandas.DataFrame({"Amplitude": [0.1, 0.2], "Start": [1.0, 2.0]})
     np.testing.assert_array_equal(flare_tables.flares_of(frame)["amplitude"], [0.1, 0.2])
     Table({"amp": [0.3]}).write(tmp_path / "f.fits")

@@ -95,7 +95,7 @@ def _array(value: Any) -> Any:
         return without_unit(value, "")
     _require(_kind(value) in tuple("iufb"))
     # Masked values are undefined; NumPy would take what lies below the mask.
-    return value.astype(float).filled(float("nan")) if getattr(value, "mask", None) is not None else value
+    return value.astype(float).filled(float("nan")) if hasattr(value, "filled") else value
 
 
 def _real_array(value: Any) -> Any:

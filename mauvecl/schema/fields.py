@@ -33,7 +33,7 @@ def as_quantity(value: Any) -> Any:
     """Return a column that has a unit as a Quantity, and a Quantity unchanged; masked values are undefined (NaN)."""
     import astropy.units as u
 
-    if getattr(value, "mask", None) is not None:
+    if hasattr(value, "filled"):
         value = value.astype(float).filled(math.nan)
     return u.Quantity(value, subok=True)
 
