@@ -234,6 +234,13 @@ def test_studies_take_quantities(quantity: str) -> None:
             mauvecl.Study().paper().at(quantity, wrong)
 
 
+def test_priors_take_temperatures_on_any_scale() -> None:
+    prior = mauvecl.Normal(20 * u.deg_C, 1.0, 283.15 * u.K, 30 * u.deg_C)
+    assert (prior.mean, prior.low, prior.high) == pytest.approx((20.0, 10.0, 30.0))
+    with refused("high"):
+        mauvecl.Uniform(20 * u.deg_C, 3 * u.kg)
+
+
 def records(record: type[BaseModel] = BaseModel) -> Iterator[type[BaseModel]]:
     """Yield all records of mauvecl, but for those with a constructor of their own, which is a public function."""
     for one in record.__subclasses__():

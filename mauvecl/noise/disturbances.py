@@ -214,7 +214,7 @@ def _in_celsius(value: Any) -> Any:
     return without_unit(value, "deg_C") if is_temperature else value
 
 
-PriorValue = Annotated[float, BeforeValidator(_in_celsius), Range()]
+PriorValue = Annotated[float, Range(), BeforeValidator(_in_celsius)]
 
 
 @validated

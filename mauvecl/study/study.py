@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache, reduce
+from itertools import chain
 from operator import getitem
 from pathlib import Path
 from types import NoneType, UnionType
@@ -459,9 +460,9 @@ class Keyword(NamedTuple):
         return get_args(self.kind)[0] if self.many else self.kind
 
     def value(self, value: Any) -> Any:
-        """Convert a value to that of the key, unless it has parts of its own, as in Python."""
-        items = value if self.many else [value]
-        if self.flag.read is None or not all(isinstance(item, str | int | float | Path) for item in items):
+        """Convert a value of the kind that the command line takes to that of the key; return others unchanged."""
+        kinds = {str: (str,), Path: (str, Path)}.get(self.item_kind, (str, int, float))
+        if self.flag.read is None or not all(isinstance(item, kinds) for item in (value if self.many else [value])):
             return value
         return self.flag.read(value, self.name)
 
@@ -535,6 +536,8 @@ def _nuisances(spreads: Any, nuisances: NuisanceChoice) -> dict[str, Any]:
     """Return the keys of nuisances that are set by texts such as dark=0.1 or, for a file, stray.txt=free."""
     expected = f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free"
     if not isinstance(spreads, Mapping):
+        if not all(isinstance(text, str) for text in spreads):
+            raise InputError.of("nuisance", spreads, expected)
         spreads = dict(read_assignment(text, "nuisance", expected) for text in spreads)
     of_files = {
         Path(name).stem: {"file": Path(name), "sd": sd} for name, sd in spreads.items() if name not in NUISANCES
@@ -551,6 +554,9 @@ def _stars(
         name for name, keyword in keywords.items() if keyword.path.startswith("star.") and values[name] is not None
     ]
     names, magnitudes = values["star"], values["magnitude"]
+    for name in ("star", "magnitude"):
+        if isinstance(values[name], Mapping):
+            raise InputError.of(name, values[name], "a value or a list, since `Study.build` takes stars with keys")
     changes = {
         keywords[name].path.removeprefix("star."): values[name]
         for name in described
@@ -579,8 +585,12 @@ def _stars(
 
 def _named_stars(texts: Sequence[str]) -> list[dict[str, Any]]:
     """Return the data of stars from names of the library with commas between them, and names of files."""
+    for text in texts:
+        if not isinstance(text, str | Path):
+            raise InputError.of("star", text, "the name of a star or of a file")
     # A name of an existing file is a file; other names are searched for in the library.
-    names = [name for text in texts for name in ([text] if is_there(text) else map(str.strip, text.split(",")))]
+    parts = ([text] if is_there(text) else map(str.strip, text.split(",")) for text in map(str, texts))
+    names = [*chain.from_iterable(parts)]
     stars: list[dict[str, Any]] = []
     for name in names:
         # "K2.5V" and "power law -1.5" look like file names but are stars.

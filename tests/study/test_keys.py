@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any, get_args
 
@@ -86,6 +87,16 @@ def test_keys_sweeps_and_maps_have_the_range(name: str) -> None:
 def test_python_arguments_have_the_range(name: str) -> None:
     assert all(refuses(lambda: CALLS[name](value)) for value in outside(name))  # noqa: B023
     assert not any(refuses(lambda: CALLS[name](value)) for value in ends(name))  # noqa: B023
+
+
+def test_keywords_of_another_kind_are_refused_or_taken() -> None:
+    """No keyword of a study fails with anything but a refusal on one line."""
+    names = {flag.parameter for _, field in fields() for flag in metadata(field, "Flag", every=True)}
+    for name, value in product(names, (7, 0.5, object(), [object()], [None], {"a": 1}, Path("x"), np.ones(2))):
+        try:
+            Study.of(**({"star": "G2V"} | {name: value}))
+        except InputError as error:
+            assert "\n" not in str(error), (name, value)  # noqa: PT017
 
 
 def test_keys_of_one_kind_share_a_range() -> None:
