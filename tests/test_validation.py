@@ -234,6 +234,10 @@ def test_studies_take_quantities(quantity: str) -> None:
             mauvecl.Study().paper().at(quantity, wrong)
 
 
+def test_columns_of_amplitudes_keep_their_unit() -> None:
+    assert mauvecl.Study.of(star="G2V", amplitude=Column([10.0, 20.0], unit="percent")).flare.amplitudes == (0.1, 0.2)
+
+
 def test_priors_take_temperatures_on_any_scale() -> None:
     prior = mauvecl.Normal(20 * u.deg_C, 1.0, 283.15 * u.K, 30 * u.deg_C)
     assert (prior.mean, prior.low, prior.high) == pytest.approx((20.0, 10.0, 30.0))
