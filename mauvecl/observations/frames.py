@@ -161,6 +161,9 @@ def _cadence_of(name: str, time: Float, light: Float) -> float:
     return cadence
 
 
+Degrees = Annotated[float, Unit("deg")]
+
+
 @validated
 @dataclass(frozen=True, eq=False)
 class Frames:
@@ -179,7 +182,7 @@ class Frames:
     reference_mjd: float | None = None  #: Modified Julian date of time zero; None if the times have no date
     scale: str = ""  #: of the dates, such as "utc" or "tdb"; empty if unknown
     position: str = ""  #: where the times hold, in words of FITS TREFPOS, as "TOPOCENTER"; empty if unknown
-    direction_deg: tuple[float, float] | None = None  #: right ascension and declination (ICRS) of barycentric times
+    direction_deg: tuple[Degrees, Degrees] | None = None  #: right ascension and declination (ICRS) of barycentric times
     name: str = "frames"  #: of the star or the file
     instrument: str = ""  #: empty if unknown
     net: bool = False  #: whether bias and dark current are known to be subtracted, as by `mauvecl realise`
@@ -194,6 +197,8 @@ class Frames:
         *,
         exposure_s: Annotated[ArrayLike, Unit("s")] | None = None,
         quality: ArrayLike | None = None,
+        wavelength_nm: Annotated[ArrayLike, Unit("nm")] | None = None,
+        temperature_c: Annotated[ArrayLike, Unit("deg_C")] | None = None,
         name: str = "frames",
         **how: Any,
     ) -> Self:
@@ -208,6 +213,10 @@ class Frames:
         exposure_s : array_like, optional
             One exposure time, or one for each frame; by default the median time between frames.
         quality : array_like, shape (n_frame,), optional
+        wavelength_nm : array_like, shape (n_pixel,), optional
+            Middle of each pixel of spectra, in any order.
+        temperature_c : array_like, shape (n_frame,), optional
+            Temperature of the detector.
         name : str
         **how
             Other attributes.
@@ -223,7 +232,7 @@ class Frames:
         exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise refused("exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-        by_frame: dict[str, Any] = {"error": error, "temperature_c": how.pop("temperature_c", None),
+        by_frame: dict[str, Any] = {"error": error, "temperature_c": temperature_c,
                                     "quality": np.zeros(n) if quality is None else quality}  # fmt: skip
         for key, column in by_frame.items():
             if column is not None:
@@ -231,10 +240,10 @@ class Frames:
                 if values.shape != (shape := light.shape if key == "error" else (n,)):
                     raise refused(key.removesuffix("_c"), values.shape, f"the shape {shape}")
                 by_frame[key] = values[order]
-        frames = cls(time[order], exposure[order], light[order], name=name, **by_frame, **how)
+        nm = None if wavelength_nm is None else np.asarray(wavelength_nm, np.float64)
+        frames = cls(time[order], exposure[order], light[order], wavelength_nm=nm, name=name, **by_frame, **how)
         if (np.diff(time) < 0).any():
             frames = frames.with_remarks((f"the times of {name} are not ascending; its frames were sorted by time",))
-        nm = frames.wavelength_nm
         if (None if nm is None else nm.shape) != (None if light.ndim == 1 else light.shape[1:]):
             expected = "one wavelength for each pixel of spectra, none for a light curve"
             raise refused("wavelength", None if nm is None else nm.shape, expected)

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import astropy.units as u
 import erfa
@@ -24,12 +25,15 @@ TIME = np.arange(100) * 20.0
 FLUX = 1000 + RNG.normal(0, 5, 100)
 
 
-def test_fluxes_and_errors_may_have_units_of_their_own() -> None:
+def test_arrays_may_have_units_of_their_own() -> None:
     flux, error = FLUX * u.electron / u.s, np.full(100, 300.0) * u.electron / u.min
     for light, spread in ((flux, error), (Column(flux.value, unit=flux.unit), Column(error.value, unit=error.unit))):
         frames = Frames.of(TIME / 60 * u.min, light, spread)
         assert frames.unit == "electron / s"
         np.testing.assert_allclose((frames.time_s, frames.flux, frames.error), (TIME, FLUX, np.full(100, 5.0)))
+    how: dict[str, Any] = {"wavelength_nm": [300.0, 400.0], "temperature_c": np.full(100, 280.0) * u.K}
+    placed = Frames.of(TIME, np.ones((100, 2)), direction_deg=(10.0 * u.deg, 600 * u.arcmin), **how)
+    assert (placed.temperature_c[0], *placed.direction_deg) == pytest.approx((6.85, 10.0, 10.0))
 
 
 def test_frames_are_sorted_and_numbered_over_gaps_and_slow_changes_of_the_times() -> None:
