@@ -1,9 +1,13 @@
-"""Python in a separate process, with another environment."""
+"""Python in a separate process, with another environment, and work in a thread."""
 
 import os
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
+from typing import Any
 
 
 def python(
@@ -34,3 +38,17 @@ def python(
 def printed(text: str) -> dict[str, str]:
     """Return the lines that a process has printed, by their first words."""
     return dict(line.split(" ", 1) for line in text.splitlines())
+
+
+def in_background(work: Callable[[], Any]) -> Future[Any]:
+    """Do work in a daemon thread: one that waits for ever fails a test instead of holding it."""
+    found: Future[Any] = Future()
+
+    def end() -> None:
+        try:
+            found.set_result(work())
+        except BaseException as error:
+            found.set_exception(error)
+
+    threading.Thread(target=end, daemon=True).start()
+    return found

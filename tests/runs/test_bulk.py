@@ -1,4 +1,4 @@
-"""Stores of raw spectra: content, verification, and recovery."""
+"""Stores of raw spectra: content, verification, recovery, and what other people do to them."""
 
 import itertools
 import json
@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,14 @@ from mauvecl.observations import frame_files
 from mauvecl.runs import store as stored
 
 
+@pytest.fixture(autouse=True, scope="module")
+def small_chunks() -> Iterator[None]:
+    """Set chunks of some 64 rows, so that a small store has several."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stored, "CHUNK_BYTES", 64 * 197 * 2)
+        yield
+
+
 @pytest.fixture(scope="module")
 def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     path = tmp_path_factory.mktemp("painted") / "frames.zarr"
@@ -49,46 +57,35 @@ def path(tmp_path: Path, original: Path) -> Path:
     return Path(shutil.copytree(original, tmp_path / "frames.zarr"))
 
 
-def test_rows_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
-    asked = study()
-    made = bulk.realise(asked, tmp_path / "frames.zarr", engine)
-    assert len(list(made.chunks())) > 4
-    quiet, flare = expectations(asked)
-    for name, x in (("star-1/quiescent", quiet), ("star-1/flare-1", flare)):
-        found = bulk.read(tmp_path / "frames.zarr", name)
-        assert (found.dims, found.dtype, found.attrs["units"]) == (("realisation", "pixel"), np.uint16, "DN")
-        np.testing.assert_array_equal(found.values, engine.realise(x, count=300, seed=11))
-        np.testing.assert_array_equal(found[17:20].values, engine.realise(x, start=17, count=3, seed=11))
-        np.testing.assert_array_equal(found.wavelength, x.wavelength_nm)
-    root = zarr.open_group(tmp_path / "frames.zarr", mode="r")
-    np.testing.assert_array_equal(root["star-1/gain_dn_per_electron"][:], quiet.gain_dn_per_electron)
+def test_rows_of_every_star_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
+    """Sweep the exposure: a frame has 16 bits, and the sum of ten has 32; components add up to the mean."""
+    path = tmp_path / "s.zarr"
+    asked = study(sweep={"axes": [{"quantity": "exposure", "values": [5.0, 50.0]}]}, bulk={"components": True})
+    made = bulk.realise(asked, path, engine)
+    assert [scene.path for scene in made.scenes] == [f"star-{k}/{n}" for k in (1, 2) for n in ("quiescent", "flare-1")]
+    assert len(list(made.chunks())) > 8
+    root = zarr.open_group(path, mode="r")
     assert Study.build(tomllib.loads(root.attrs["study"]), "store") == asked
     assert "not a flight calibration" in root.attrs["throughput"]
-
-
-def test_every_star_of_a_sweep_is_stored_in_32_bits_with_its_components(tmp_path: Path, engine: Engine) -> None:
-    sweep = {"axes": [{"quantity": "magnitude", "values": [7.4, 8.0]}]}
-    asked = study(40, observation={"exposure_s": 50.0}, bulk={"components": True}, sweep=sweep)
-    made = bulk.realise(asked, tmp_path / "s.zarr", engine)
-    assert [scene.path for scene in made.scenes] == [f"star-{k}/{n}" for k in (1, 2) for n in ("quiescent", "flare-1")]
-    second, _ = expectations(asked.at("magnitude", 8.0))
-    found = bulk.read(tmp_path / "s.zarr", "star-2/quiescent")
-    np.testing.assert_array_equal(found.values, engine.realise(second, count=40, seed=11))
-    quiet, flare = expectations(asked)
-    found = bulk.read(tmp_path / "s.zarr", "star-1/flare-1")
-    assert found.dtype == np.int32
-    np.testing.assert_array_equal(found.values, engine.realise(flare, count=40, seed=11))
-    group = zarr.open_group(tmp_path / "s.zarr", mode="r")["star-1"]
-    mean = group["flare-1-source"][:] + group["flare-1-sky"][:] + 10 * (group["bias_dn"][:] + group["dark_dn"][:])
-    np.testing.assert_allclose(mean, 10 * flare.mean_raw_dn, rtol=1e-12)
-    np.testing.assert_allclose(group["quiescent-noise"][:], np.sqrt(quiet.variance_dn2), rtol=1e-12)
+    for star, exposure, kind in (("star-1", 5.0, np.uint16), ("star-2", 50.0, np.int32)):
+        quiet, flare = expectations(asked.at("exposure", exposure))
+        for name, x in (("quiescent", quiet), ("flare-1", flare)):
+            found = bulk.read(path, f"{star}/{name}")
+            assert (found.dims, found.dtype, found.attrs["units"]) == (("realisation", "pixel"), kind, "DN")
+            np.testing.assert_array_equal(found.values, engine.realise(x, count=300, seed=11))
+            np.testing.assert_array_equal(found[17:20].values, engine.realise(x, start=17, count=3, seed=11))
+            np.testing.assert_array_equal(found.wavelength, x.wavelength_nm)
+        group, n = root[star], quiet.n_frames
+        np.testing.assert_array_equal(group["gain_dn_per_electron"][:], quiet.gain_dn_per_electron)
+        mean = group["flare-1-source"][:] + group["flare-1-sky"][:] + n * (group["bias_dn"][:] + group["dark_dn"][:])
+        np.testing.assert_allclose(mean, n * flare.mean_raw_dn, rtol=1e-12)
+        np.testing.assert_allclose(group["quiescent-noise"][:], np.sqrt(quiet.variance_dn2), rtol=1e-12)
     # A single frame has a tenth of the light and of the variance.
-    single = asked.with_changes({"bulk": {"frames": [3]}, "run": {"realisations": 1}}, None)
+    single = study(1, observation={"exposure_s": 50.0}, bulk={"components": True, "frames": [3]})
     bulk.realise(single, tmp_path / "single.zarr", engine)
     frame = zarr.open_group(tmp_path / "single.zarr", mode="r")["star-1"]
     for name, share in (("source", 0.1), ("sky", 0.1), ("noise", np.sqrt(0.1))):
-        whole = group[f"flare-1-{name}"][:]
-        np.testing.assert_allclose(frame[f"flare-1-{name}"][:], share * whole, rtol=1e-12)
+        np.testing.assert_allclose(frame[f"flare-1-{name}"][:], share * group[f"flare-1-{name}"][:], rtol=1e-12)
 
 
 @pytest.mark.long
@@ -153,16 +150,6 @@ def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, path: Path, e
     assert {f.state for f in bulk.verify(path, engine, redraw=True, rows=(60, 70))} == {"differs"}
     bulk.verify(path, engine, redraw=True, repair=True)
     assert bulk.verify(path, engine, redraw=True) == []
-
-
-def test_foreign_files_are_named_and_kept_and_another_study_raises(path: Path, engine: Engine) -> None:
-    with refused("store", "run.seed", "star.0.magnitude"):
-        bulk.realise(study(run={"seed": 3}).at("magnitude", 7.0), path, engine)
-    assert bulk.verify(path) == []
-    (path / "star-1/quiescent/c/99").mkdir()
-    (path / "star-1/quiescent/c/99/0").write_bytes(b"?")
-    (fault,) = bulk.verify(path, engine, repair=True)
-    assert (fault.key, fault.state, fault.mended) == ("star-1/quiescent/c/99/0", "not of this store", False)
 
 
 @pytest.mark.long
@@ -241,7 +228,7 @@ def test_no_chunk_is_being_written_when_a_stopped_run_has_ended(tmp_path: Path, 
     assert (seen.call_args.args[0], tree(path)) == (2000, painted)
 
 
-def test_fits_export_contains_the_rows_and_any_study(tmp_path: Path, engine: Engine) -> None:
+def test_exports_contain_the_rows_and_any_study(tmp_path: Path, engine: Engine) -> None:
     star = tmp_path / f'{"long/" * 30}ein "Stern" \\ λ Vir 🌟.txt'
     star.parent.mkdir(parents=True)
     star.write_text("".join(f"{nm} 1e-12\n" for nm in range(150, 1200, 5)))
@@ -262,23 +249,17 @@ def test_fits_export_contains_the_rows_and_any_study(tmp_path: Path, engine: Eng
         lines = "\n".join(hdus["STUDY"].data["LINE"])
         assert lines.isascii()
         assert Study.build(tomllib.loads(lines), "fits") == made.study
+    run("export", "s.zarr", "s.h5", "--array", "star-1/flare-1", "--rows", "10:30", folder=tmp_path)
+    with h5py.File(tmp_path / "s.h5") as file:
+        data = file["star-1/flare-1"]
+        assert [d.label for d in data.dims] == ["realisation", "pixel"]
+        np.testing.assert_array_equal(data[:], bulk.read(tmp_path / "s.zarr", "star-1/flare-1")[10:30].values)
+        assert (file.attrs["first_row"], data.attrs["units"], "star-1/quiescent" in file) == (10, "DN", False)
     if shutil.which("fitsverify"):
         reported = subprocess.run(["fitsverify", path], capture_output=True, text=True, check=True).stdout
         assert "0 warning(s) and 0 error(s)" in reported, reported
 
 
-def test_hdf5_export_contains_the_frames(tmp_path: Path, engine: Engine) -> None:
-    asked = study(50, observation={"exposure_s": 10.0}, bulk={"frames": "all"})
-    bulk.realise(asked, tmp_path / "s.zarr", engine)
-    run("export", "s.zarr", "s.h5", "--array", "star-1/flare-1", "--rows", "5:9", folder=tmp_path)
-    with h5py.File(tmp_path / "s.h5") as file:
-        data = file["star-1/flare-1"]
-        assert [d.label for d in data.dims] == ["realisation", "frame", "pixel"]
-        np.testing.assert_array_equal(data[:], bulk.read(tmp_path / "s.zarr", "star-1/flare-1")[5:9].values)
-        assert (file.attrs["first_row"], data.attrs["units"], "star-1/quiescent" in file) == (5, "DN", False)
-
-
-@pytest.mark.long
 def test_commands_of_stores_work(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(study(100).toml())
 
@@ -298,13 +279,16 @@ def test_commands_of_stores_work(tmp_path: Path) -> None:
     said("verify", "f.zarr", "--redraw", "--rows", "0:10")
     said("export", "f.zarr", "f.h5", "--rows", "0:10")
     written = exported.read_bytes()
-    assert "--replace" in said("export", "f.zarr", "f.h5", "--rows", "0:5", code=2)
+    for more, why in (("f.h5 --rows 0:5", "--replace"), ("f.h5 --rows 10:600", "0:100"), ("s.txt", "hdf5")):
+        assert why in said("export", "f.zarr", *more.split(), code=2)
     assert exported.read_bytes() == written
     said("export", "f.zarr", "f.h5", "--rows", "0:5", "--replace")
     assert exported.read_bytes() != written
     said("realise", "study.toml", "--output", "f.fits", "--quiet")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.fits", "f.h5", "f.zarr", "study.toml"]
     chunk.unlink()
+    assert "star-1/quiescent/c/0/0" in said("export", "f.zarr", "g.fits", code=2)
+    assert not (tmp_path / "g.fits").exists()
     refusal = said("realise", "study.toml", "--output", "f.zarr", code=2)
     assert all(word in refusal for word in ("3", "4", "--resume"))
     said("realise", "study.toml", "--output", "f.zarr", "--resume")
@@ -319,10 +303,16 @@ SINGLE: dict[str, Any] = {"observation": {"exposure_s": 15.0}, "bulk": {"frames"
 
 @pytest.mark.parametrize("ending", ["zarr", "fits", "h5"])
 @pytest.mark.parametrize("which", ["stacked", "single"])
-def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine, ending: str, which: str) -> None:
+def test_stores_are_read_back_with_their_metadata(
+    tmp_path: Path, engine: Engine, ending: str, which: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Read whole, and reduce in pieces of seven frames, which divide realisations of two frames."""
     asked = study(40, **(STACKED if which == "stacked" else SINGLE))
-    path = _written(tmp_path, asked, engine, ending)
-    frames = read_frames(f"{path}[star-1/flare-1]")
+    bulk.realise(asked, tmp_path / "frames.zarr", engine)
+    if ending != "zarr":
+        run("export", "frames.zarr", f"frames.{ending}", folder=tmp_path)
+    path = f"{tmp_path}/frames.{ending}[star-1/flare-1]"
+    frames = read_frames(path)
     _, x = expectations(asked)
     raw = bulk.read(tmp_path / "frames.zarr", "star-1/flare-1").values.reshape(-1, x.wavelength_nm.size)
     n = 2 if which == "stacked" else 1
@@ -336,35 +326,165 @@ def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine
     # The mean of the squared errors is the variance of the model: 40 rows of 197 pixels know it to a percent.
     np.testing.assert_allclose((frames.error**2).mean(), (x.variance_dn2 / x.n_frames * n).mean(), rtol=0.03)
     assert not frames.quality.any()
-
-
-@pytest.mark.parametrize("ending", ["zarr", "fits", "h5"])
-def test_stores_are_reduced_in_pieces(tmp_path: Path, engine: Engine, ending: str, monkeypatch: Any) -> None:
-    path = f"{_written(tmp_path, study(40, **SINGLE), engine, ending)}[star-1/flare-1]"
-    light, error = read_frames(path).white_light
-    # Seven frames at once, which divide realisations of two frames.
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 7 * 8 * 197)
     (curve,) = frame_files.reduce_frames(path).light_curves
-    np.testing.assert_allclose(curve.flux, light, rtol=1e-12)
-    np.testing.assert_allclose(curve.error, error, rtol=1e-12)
+    np.testing.assert_allclose([curve.flux, curve.error], frames.white_light, rtol=1e-12)
 
 
-def _written(folder: Path, asked: Study, engine: Engine, ending: str) -> Path:
-    bulk.realise(asked, folder / "frames.zarr", engine)
-    if ending == "zarr":
-        return folder / "frames.zarr"
-    run("export", "frames.zarr", f"frames.{ending}", folder=folder)
-    return folder / f"frames.{ending}"
+#: Stores under attack: wrong studies, other people's files, two processes, absurd sizes.
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    bulk.realise(study(), tmp_path / "frames.zarr", PAINTER)
+    return tmp_path / "frames.zarr"
 
 
-def test_bad_exports_are_refused(tmp_path: Path) -> None:
-    bulk.realise(study(20), tmp_path / "s.zarr", PAINTER)
+@pytest.fixture
+def other(tmp_path: Path) -> Path:
+    bulk.realise(study(run={"seed": 31}), tmp_path / "other.zarr", PAINTER)
+    return tmp_path / "other.zarr"
 
-    def exported(*words: str) -> str:
-        return run("export", "s.zarr", *words, folder=tmp_path, code=2).stderr
 
-    assert "0:20" in exported("s.fits", "--rows", "10:60")
-    assert "hdf5" in exported("s.txt")
-    (tmp_path / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
-    assert "star-1/quiescent/c/0/0" in exported("s.fits")
-    assert not (tmp_path / "s.fits").exists()
+def relabelled(place: Path, change: Callable[[str], str]) -> None:
+    content = json.loads(place.read_text())
+    content["attributes"]["study"] = change(content["attributes"]["study"])
+    place.write_text(json.dumps(content, indent=2))
+
+
+#: Functions of a store that need it alone.
+WRITES: tuple[Callable[[Path], object], ...] = (
+    lambda path: bulk.realise(study(), path, PAINTER),
+    lambda path: bulk.realise(study(), path, PAINTER, restart=True),
+    bulk.verify,
+    bulk.forget,
+)
+COPIES = ["zarr.json", "star-1/quiescent/zarr.json", "star-1/flare-1/zarr.json"]
+FOREIGN = ["mine.txt", "star-1/mine.txt", "star-1/quiescent/c/mine", "star-1/quiescent/c/99/0"]
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_changed_byte_of_a_study_is_found(made: Path, copy: str) -> None:
+    """Change any byte: the store keeps its study, and repair restores the file."""
+    before = tree(made)
+    text = study().toml()
+    # A sample of the bytes, and the seed's.
+    for place in [*range(3, len(text), len(text) // 6), text.index("seed = 11") + 7]:
+        other = "3" if text[place] != "3" else "4"
+        relabelled(made / copy, lambda text, place=place, other=other: text[:place] + other + text[place + 1 :])
+        assert [fault.key for fault in bulk.verify(made)] == [copy]
+        (made / copy).write_bytes(before[copy])
+    relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
+    assert [(f.key, f.mended) for f in bulk.verify(made, PAINTER, repair=True)] == [(copy, True)]
+    assert tree(made) == before
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_contradicting_studies_raise(made: Path, other: Path, copy: str) -> None:
+    """Give two studies with valid digests; nothing is read or written, since either could be the drawn one."""
+    shutil.copy(other / copy, made / copy)
+    before = tree(made)
+    for ask in (*WRITES, bulk.read, partial(bulk.verify, engine=PAINTER, repair=True, redraw=True)):
+        with refused("store", "'zarr.json'"):
+            ask(made)
+    assert tree(made) == before
+
+
+def test_repair_needs_the_study_that_was_drawn(made: Path, other: Path) -> None:
+    """Replace every copy of the study by one without its digest, and by one whose chunks have other digests."""
+    before = tree(made)
+    for copy in COPIES:
+        relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
+    with refused("store"):
+        bulk.verify(made, PAINTER, repair=True)
+    for copy in COPIES:
+        shutil.copy(other / copy, made / copy)
+    flip(made / CHUNK)
+    with refused("redraw"):
+        bulk.verify(made, PAINTER, repair=True)
+    flip(made / CHUNK)
+    chunks, now = ({name: one for name, one in found.items() if "json" not in name} for found in (before, tree(made)))
+    assert now == chunks
+
+
+def test_locked_store_is_neither_read_nor_removed(made: Path) -> None:
+    (made.parent / "study.toml").write_text(study().toml())
+    before = tree(made)
+    with locked(made):
+        done = run("realise", "study.toml", "--restart", "--output", made, folder=made.parent, code=2)
+        assert f"{str(made)!r} is being written by another process" in done.stderr
+        for ask in WRITES:
+            with refused("lock", str(made)):
+                ask(made)
+    assert tree(made) == before
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+@pytest.mark.parametrize("place", long_but(FOREIGN, "star-1/quiescent/c/99/0"))
+def test_foreign_files_are_not_removed(made: Path, place: str, kind: str) -> None:
+    elsewhere = made.parent / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "keep").write_text("me")
+    (made / place).parent.mkdir(exist_ok=True)
+    (made / place).write_text("keep me") if kind == "file" else (made / place).symlink_to(elsewhere)
+    before = tree(made)
+    (fault,) = bulk.verify(made, PAINTER, repair=True)
+    assert (fault.key, fault.state, fault.mended) == (place, "not of this store", False)
+    for remove in (lambda: bulk.realise(study(), made, PAINTER, restart=True), lambda: bulk.forget(made)):
+        with refused("store", str(place)):
+            remove()
+    assert tree(made) == before
+    assert (elsewhere / "keep").read_text() == "me"
+
+
+def test_kill_during_removal_is_recovered(made: Path, other: Path, tmp_path: Path) -> None:
+    """Kill at any file; the rest is a store, and a second restart draws the new study."""
+    for step in (0, 3, 9, 14):
+        path = tmp_path / f"{step}.zarr"
+        shutil.copytree(made, path)
+        again = partial(bulk.realise, study(run={"seed": 31}), path, PAINTER)
+        assert killed_at(step, partial(again, restart=True), (Path, "unlink"))
+        with refused("store", "run.seed"):
+            again()
+        again(restart=True)
+        assert tree(path) == tree(other)
+    with refused("store", "run.seed", "star.0.magnitude"):
+        bulk.realise(study().at("magnitude", 7.0), path, PAINTER)
+    assert tree(path) == tree(other)
+    bulk.forget(path)
+    assert not path.exists()
+
+
+def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim 6e15 rows with one chunk; each question is answered in about a second."""
+    path, asked = tmp_path / "vast.zarr", study(6 * 10**15)
+    # Written by hand, as an attacker would.
+    vast = stored.Store(path, asked)
+    for name, content in vast.description().items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(content)
+    first = next(vast.chunks())
+    vast.write(first, bulk.draw(asked, first.scene, PAINTER, 0, first.stop))
+    for repair in (False, True):
+        with refused("rows", "100000"):
+            bulk.verify(path, PAINTER, repair=repair)
+    with refused("rows", "100000"):
+        bulk.verify(path, rows=(0, 10**12))
+    assert [f.key for f in bulk.verify(path, rows=(0, first.stop))] == ["star-1/flare-1/c/0/0"]
+    run("export", path, "few.h5", "--array", "star-1/quiescent", "--rows", "3:5", folder=tmp_path)
+    assert "one file may hold 4 GiB" in run("export", path, "all.h5", folder=tmp_path, code=2).stderr
+    with refused("run.realisations"):
+        bulk.realise(asked, path, PAINTER)
+    bulk.forget(path)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["f.fits", "f.h5"])
+def test_existing_file_is_not_overwritten(name: str, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(study(20).toml())
+    (tmp_path / name).write_text("mine")
+    words = ("realise", "study.toml", "--output", name)
+    for more in ([], ["--resume"]):
+        assert "--restart" in run(*words, *more, folder=tmp_path, code=2).stderr
+    assert (tmp_path / name).read_text() == "mine"
+    run(*words, "--restart", folder=tmp_path)
+    assert (tmp_path / name).stat().st_size > 2 * 2 * 20 * 197
+    assert sorted(p.name for p in tmp_path.iterdir()) == [name, "study.toml"]

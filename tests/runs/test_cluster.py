@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -22,11 +22,12 @@ import psutil
 import pytest
 from answers import N, detected, same, same_snr, small
 from commands import SMALL_SHARDS, run
+from processes import in_background
 from refusals import failed
 from scenes import flaring_stares, instrument, paper, star
 
 from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, bulk, measure
-from mauvecl.runs import cluster
+from mauvecl.runs import cluster, store
 from mauvecl.runs import pool as pools
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
@@ -40,7 +41,10 @@ def workers() -> Iterator[DaskWorkers]:
     found.close()
 
 
-def test_two_processes_give_the_answers_of_one(workers: Any, engine: Engine, scene: Any, tmp_path: Path) -> None:
+def test_two_processes_give_the_answers_of_one(
+    workers: Any, engine: Engine, scene: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "CHUNK_BYTES", 64 * 197 * 2)
     pool = Pool(workers)
     assert workers.count == 2
     same(detected(pool, scene), detected(engine, scene))
@@ -57,32 +61,30 @@ def test_two_processes_give_the_answers_of_one(workers: Any, engine: Engine, sce
     assert measure(study, Pool(workers)) == measure(study, engine)
 
 
-def kill_after(pool: Pool, shards: int, kill: Callable[[], object]) -> threading.Thread:
-    def work() -> None:
+def kill_after(pool: Pool, shards: int, kill: Callable[[], object]) -> Future[Any]:
+    def work() -> object:
         while pool.standing.shards < shards:
             time.sleep(0.005)
-        kill()
+        return kill()
 
-    killer = threading.Thread(target=work)
-    killer.start()
-    return killer
+    return in_background(work)
 
 
 def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
     """Kill a counting process: another one counts its shard, and the answer has the same bits."""
-    n, pids, killed = 150_000, workers._client.run(os.getpid), list[int]()
+    n, pids = 150_000, workers._client.run(os.getpid)
     pool = Pool(workers)
 
-    def kill_a_busy_one() -> None:
-        busy = [pids[address] for address, tasks in workers._client.processing().items() if tasks]
-        killed.append(busy[0])
+    def kill_a_busy_one() -> int:
+        # Between two shards none is busy.
+        while not (busy := [pids[address] for address, tasks in workers._client.processing().items() if tasks]):
+            time.sleep(0.001)
         os.kill(busy[0], signal.SIGKILL)
+        return busy[0]
 
-    killer = kill_after(pool, 10, kill_a_busy_one)
-    found = detected(pool, scene, n)
-    killer.join()
-    same(found, detected(engine, scene, n))
-    assert killed[0] not in workers._client.run(os.getpid).values()
+    killed = kill_after(pool, 10, kill_a_busy_one)
+    same(detected(pool, scene, n), detected(engine, scene, n))
+    assert killed.result(60) not in workers._client.run(os.getpid).values()
     assert pool.standing.retries >= 1, "the shard in its hands was counted again"
 
 
@@ -137,29 +139,19 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
     workers = DaskWorkers("silent")
     monkeypatch.setattr(DaskWorkers, "count", 2)
     pool = Pool(workers)
-    ended: list[type[BaseException]] = []
-
-    def ask(work: Any) -> None:
-        try:
-            work()
-        except BaseException as error:
-            ended.append(type(error))
-
     detect = partial(detected, pool, scene)
     works = [
         detect,
         lambda: pool.realise(scene[0], start=0, count=3, seed=1),
         lambda: list(pools.map_in_order(pool, lambda work: work(), [detect, detect, detect])),
     ]
-    threads = [threading.Thread(target=ask, args=(work,), daemon=True) for work in works]
-    for thread in threads:
-        thread.start()
+    waiting = [in_background(work) for work in works]
     time.sleep(0.5)
-    assert ended == []
+    assert not any(one.done() for one in waiting)
     pool.stop()
-    for thread in threads:
-        thread.join(5)
-    assert ended == [pools.Stopped] * 3
+    for one in waiting:
+        with pytest.raises(pools.Stopped):
+            one.result(5)
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
@@ -273,20 +265,26 @@ def test_cluster_of_workers_with_other_code_raises(scheduler_file: str, scene: A
     workers.close()
 
 
-def test_shards_whose_workers_have_left_are_sent_to_others(
-    tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("victim", ["worker", "scheduler"])
+def test_end_of_a_process_started_by_hand_is_noticed(
+    victim: str, tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Restrict shards to a worker that ends and is replaced under another address."""
-    monkeypatch.setattr(cluster, "RECOUNT_S", 0.5)
-    with by_hand(tmp_path) as (_, file):
+    """Restrict shards to a worker that ends and is replaced under another address, and report a lost scheduler."""
+    with by_hand(tmp_path) as (scheduler, file):
         workers = DaskWorkers(file)
-        workers._strangers.add("tcp://127.0.0.1:1")
         pool = Pool(workers)
-        (pid,) = workers._client.run(os.getpid).values()
-        kill_after(pool, 5, lambda: os.kill(pid, signal.SIGKILL))
-        found = detected(pool, scene, 150_000)
+        if victim == "worker":
+            monkeypatch.setattr(cluster, "RECOUNT_S", 0.5)
+            workers._strangers.add("tcp://127.0.0.1:1")
+            (pid,) = workers._client.run(os.getpid).values()
+            kill_after(pool, 5, lambda: os.kill(pid, signal.SIGKILL))
+            same(detected(pool, scene, 150_000), detected(engine, scene, 150_000))
+        else:
+            kill_after(pool, 5, scheduler.kill)
+            with failed("lost"):
+                detected(pool, scene, 1_000_000)
+            workers.stop()
         workers.close()
-    same(found, detected(engine, scene, 150_000))
 
 
 class Leaves:
@@ -362,14 +360,3 @@ def test_existing_cluster_is_used(tmp_path: Path) -> None:
     script.terminate()
     script.wait(20)
     assert not file.exists()
-
-
-def test_lost_scheduler_raises(tmp_path: Path, scene: list[Expectation]) -> None:
-    with by_hand(tmp_path) as (scheduler, file):
-        workers = DaskWorkers(file)
-        pool = Pool(workers)
-        kill_after(pool, 5, scheduler.kill)
-        with failed("lost"):
-            detected(pool, scene, 1_000_000)
-        workers.stop()
-        workers.close()

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -20,6 +20,7 @@ import pytest
 from answers import N, detected, same, same_snr, small
 from commands import run
 from marks import long_but
+from processes import in_background
 from refusals import failed, refused
 from scenes import FIRST_STARE, N_STARES, flaring_stares, instrument, star
 from stores import flip, full_after
@@ -84,30 +85,25 @@ def test_shards_of_several_launches_with_all_arguments_join(engine: Engine) -> N
 
 
 @dataclass(frozen=True)
-class Largest:
-    """Reduction to the largest value of each stare."""
+class Reduced:
+    """Reduction to the number of frames above a level, or to the largest value of each stare."""
 
-    adds: ClassVar[bool] = False
+    level: float = np.inf
+    adds: bool = False
 
     def __call__(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
+        if self.adds:
+            return {"frames": np.count_nonzero(values > self.level, axis=(-3, -2))}
         largest = values.max(axis=(-2, -1)).reshape(-1, values.shape[-3]).T
         return {"largest": largest, "number": first + np.arange(len(largest))}
 
 
-@dataclass(frozen=True)
-class Above:
-    """Reduction to the number of frames above a level."""
-
-    level: float
-    adds: ClassVar[bool] = True
-
-    def __call__(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
-        return {"frames": np.count_nonzero(values > self.level, axis=(-3, -2))}
+ABOVE = [Reduced(level, adds=True) for level in (1.0, 2.0, 500.0)]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
-@pytest.mark.parametrize("reduction", [None, Largest(), Above(500.0)])
+@pytest.mark.parametrize("reduction", [None, Reduced(), ABOVE[2]])
 def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
     """Compare two engines of different form, with requests in the form in which they travel, with one call."""
     asked = flaring_stares(method, reduction=reduction)
@@ -182,25 +178,15 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
             assert free.wait(60)
             return engine.count(request, shard, **more)
 
-    pool, ends = working(lambda: Held(engine, set(), [])), list[BaseException]()
-
-    def ask() -> None:
-        try:
-            detected(pool, scene, 8192)
-        except (pools.Stopped, RuntimeError) as end:
-            ends.append(end)
-
-    # Daemon threads: one that waits for ever fails the test instead of holding it.
-    asking, closing = (threading.Thread(target=one, daemon=True) for one in (ask, pool.workers.close))
-    asking.start()
+    pool = working(lambda: Held(engine, set(), []))
+    asking = in_background(lambda: detected(pool, scene, 8192))
     assert begun.wait(60)
-    closing.start()
+    closing = in_background(pool.workers.close)
     time.sleep(0.2)
     free.set()
-    for thread in (asking, closing):
-        thread.join(60)
-        assert not thread.is_alive()
-    assert len(ends) == 1
+    with pytest.raises((pools.Stopped, RuntimeError)):
+        asking.result(60)
+    closing.result(60)
 
 
 AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
@@ -245,7 +231,7 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
         {"stare": Stare.of(30.0, **how, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21, 22))},
         {"stare": Stare.of(30.0, **how, offsets={"star": 0.1}, temperature_c=21.0)},
         {"components": replace(stares.components, weights=2 * stares.components.weights)},
-        {"amplitudes": stares.amplitudes[:1]}, *({"reduction": one} for one in (Largest(), Above(1.0), Above(2.0))),
+        {"amplitudes": stares.amplitudes[:1]}, *({"reduction": one} for one in (Reduced(), *ABOVE)),
     ]  # fmt: skip
     others = [*(asked(**one) for one in asks), *(replace(stares, **one) for one in changes), unlit]
     names = [shards.fingerprint(one) for one in (base, *others)]

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     found = Server(tmp_path_factory.mktemp("serve") / "log.txt")
     yield found
-    found.kill()
-    found.quiet()
+    found.end()
 
 
 @pytest.fixture(scope="session")
@@ -31,9 +30,9 @@ def words(server: Server) -> dict[str, Any]:
 
 
 @pytest.fixture
-def talk(server: Server) -> Server:
-    """Return the server; a test that is a coroutine gets the talk of a new visitor in its place."""
-    return server
+def talk(request: pytest.FixtureRequest) -> Server:
+    """Return the test's server; a test that is a coroutine gets the talk of a new visitor in its place."""
+    return request.getfixturevalue("strict" if "strict" in request.fixturenames else "server")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -16,7 +16,7 @@ import tempfile
 import tomllib
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,15 +31,12 @@ from scripts import tool
 from mauvecl import Instrument, Source, Study
 from tests.web.visits import Server, Talk, column, link
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 ROOT = Path(__file__).parents[2]
 check_commands = tool("check_commands")
 FILE = "uploaded file"
 DATA = Path(__file__).parents[1] / "data" / "web"
 FIELDS = tomllib.loads((DATA / "fields.toml").read_text(encoding="utf-8"))
-#: Expressions of uploads that are refused.
+#: Expressions, for `made`, of the content of uploads that are refused.
 UPLOADS = tomllib.loads((DATA / "uploads.toml").read_text(encoding="utf-8"))
 SHOWN = {tab: {*names.split()} for tab, names in tomllib.loads((DATA / "shown.toml").read_text()).items()}
 
@@ -51,12 +48,9 @@ def valued(data: Any, key: str) -> Any:
     return data
 
 
-def test_fields_are_shown_where_they_matter(words: dict[str, Any]) -> None:
-    assert {tab: {*seen["reads"]} for tab, seen in words["tabs"].items()} == SHOWN
-
-
 async def test_every_field_is_a_key_of_the_study(talk: Talk, words: dict[str, Any]) -> None:
-    """In the downloaded study, in the printed command and in the printed program."""
+    """Fields are shown where they matter, and are in the downloaded study, the printed command and program."""
+    assert {tab: {*seen["reads"]} for tab, seen in words["tabs"].items()} == SHOWN
     uploads = {name for name, one in words["uploads"].items() for name in (name, *one["options"])}
     assert FIELDS.keys() == words["fields"].keys() - uploads - {"as_observed", "change_band"} | {"star", "own_unknown"}
     for name, row in FIELDS.items():
@@ -80,10 +74,10 @@ async def test_every_field_is_a_key_of_the_study(talk: Talk, words: dict[str, An
 @pytest.mark.long
 async def test_hidden_fields_change_nothing_and_others_do(talk: Talk, words: dict[str, Any]) -> None:
     """Hidden fields may even be wrong."""
+    # Each question is asked once: most fields change the same one.
     known: dict[tuple[str, ...], Any] = {}
 
-    async def once(ask: Callable[..., Any], asked: str, tab: str) -> Any:
-        """Ask each question once: most fields change the same one."""
+    async def once(ask: Any, asked: str, tab: str) -> Any:
         if (key := (ask.__name__, asked, tab)) not in known:
             known[key] = await ask(asked, tab)
         return known[key]
@@ -113,7 +107,6 @@ PAIRS = b"200 1\n400 3\n700 1\n"
 
 
 def made(content: str) -> Any:
-    """Return the content of an upload by its expression."""
     return eval(content, globals() | {"bz2": bz2, "lzma": lzma, "struct": struct})
 
 
@@ -237,8 +230,8 @@ def test_printed_commands_give_the_numbers_of_the_page(
         assert check_commands.differences(check_commands.TABS[tab], *asked, tmp_path)
 
 
-def test_bibtex_cites_what_the_citation_file_cites(server: Server) -> None:
-    _, html = server.fetched()
+async def test_bibtex_cites_what_the_citation_file_cites(talk: Talk, server: Server) -> None:
+    _, html = await server.got()
     (text,) = re.findall(r"@software.*?@article.*?\n}", html.replace("&#34;", '"'), re.DOTALL)
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert text.count("{") == text.count("}")

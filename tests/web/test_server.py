@@ -5,6 +5,7 @@ import json
 import re
 import signal
 import socket
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 
 from tests.web.visits import Server, Talk, link
 
+ROOT = Path(__file__).parents[2]
 #: Server with less patience, so that tests need not wait, which fails at one magnitude.
 STRICT = """
 import sys
@@ -71,8 +73,7 @@ def test_ipv6_and_allowed_origins_are_served(tmp_path: Path) -> None:
         (await served.talk(Host="mauve.example.org:443", Origin="https://mauve.example.org")).end()
 
     served.visited(work)
-    served.kill()
-    served.quiet()
+    served.end()
 
 
 async def test_number_of_visitors_is_limited(talk: Talk, server: Server) -> None:
@@ -95,8 +96,9 @@ async def test_number_of_visitors_is_limited(talk: Talk, server: Server) -> None
 
 
 @pytest.mark.long
-def test_connections_are_bounded_and_half_open_or_unused_ones_end(strict: Server) -> None:
+async def test_connections_are_bounded_and_half_open_or_unused_ones_end(talk: Talk, strict: Server) -> None:
     """Connections that never end their headers or body are dropped, and those beyond the limit; a page stays."""
+    kept: list[Any] = []
 
     async def connected(*parts: bytes) -> list[asyncio.StreamReader]:
         some = [(await asyncio.open_connection("127.0.0.1", strict.port), part) for part in parts]
@@ -105,83 +107,61 @@ def test_connections_are_bounded_and_half_open_or_unused_ones_end(strict: Server
         kept.extend(some)
         return [reader for (reader, _), _ in some]
 
-    kept: list[Any] = []
-
-    async def work(talk: Talk) -> None:
-        unused = await strict.talk()
-        begun = f"POST / HTTP/1.1\r\nHost: {strict.host}\r\nContent-Length: 100\r\n\r\nx".encode()
-        for reader in await connected(*(b"", b"GET / HTTP/1.1\r\nHost:", begun) * 15):
-            await asyncio.wait_for(reader.read(), 20)
-        readers = await connected(*[b""] * 80)
-        await asyncio.sleep(0.5)
-        ended = [reader.at_eof() for reader in readers]
-        assert ended == sorted(ended, reverse=True), "the oldest are closed"
-        assert sum(ended) == 80 + 2 - 60, "and no page"
-        assert "star" in str(await talk.exported())
-        assert (await strict.got())[0] == 200
-        # The page receives the reason.
-        assert await unused.ended() == (4000, "not used for a long time")
-
-    strict.visited(work)
+    unused = await strict.talk()
+    begun = f"POST / HTTP/1.1\r\nHost: {strict.host}\r\nContent-Length: 100\r\n\r\nx".encode()
+    for reader in await connected(*(b"", b"GET / HTTP/1.1\r\nHost:", begun) * 15):
+        await asyncio.wait_for(reader.read(), 20)
+    readers = await connected(*[b""] * 80)
+    await asyncio.sleep(0.5)
+    ended = [reader.at_eof() for reader in readers]
+    assert ended == sorted(ended, reverse=True), "the oldest are closed"
+    assert sum(ended) == 80 + 2 - 60, "and no page"
+    assert "star" in str(await talk.exported())
+    assert (await strict.got())[0] == 200
+    # The page receives the reason.
+    assert await unused.ended() == (4000, "not used for a long time")
 
 
-NONSENSE = [
-    "{", "[]", '{"n": 1}', '{"ask": "nothing"}', '{"ask": "answer", "n": "x"}', '{"ask": "answer", "link": 7}',
-    '{"ask": ["answer"]}', '{"ask": "_init__"}', "[" * 100_000, "x" * 100_000, b"bytes of no file",
-]  # fmt: skip
-#: What is asked as the page asks, and for what is not there; and messages that hold only what they ask.
-POINTLESS = [
-    {"ask": "simulate", "kind": "everything"},
-    {"ask": "file", "tab": "../../etc", "name": "passwd", "ending": "study", "link": "?star=x"},
-    {"ask": "file", "tab": "noise", "name": "../noise-budget", "ending": "ecsv"},
-    {"ask": "file", "tab": "limit", "name": "limit", "ending": "ecsv"},
-    {"ask": "upload", "field": "folder", "name": "x"},
-    *({"ask": ask} for ask in ("draw", "export", "cancel", "answer", "solve", "pinned", "simulate", "upload", "file")),
-]
+MESSAGES = tomllib.loads((ROOT / "tests" / "data" / "web" / "messages.toml").read_text(encoding="utf-8"))
 
 
 @pytest.mark.long
-def test_invalid_messages_give_no_traceback_and_no_path(strict: Server) -> None:
+async def test_invalid_messages_give_no_traceback_and_no_path(talk: Talk, strict: Server) -> None:
     reported: list[str] = []
-
-    async def work(talk: Talk) -> None:
-        for message in NONSENSE:
-            one = await strict.talk()
-            await one.connection.write_message(message, binary=isinstance(message, bytes))
-            code, reason = await one.ended()
-            assert code == 1003
-            reported.append(reason)
-        for pointless in POINTLESS:
-            await talk.connection.write_message(json.dumps(pointless))
-            # Whoever is still there answers the next message.
-            n = await talk.say("export", link="?star=M3V&magnitude=9")
-            found: dict[str, Any] = {}
-            while found.get("n") != n:
-                message = await asyncio.wait_for(talk.connection.read_message(), 60)
-                assert message is not None, pointless
-                # A requested file arrives as bytes.
-                found = json.loads(message) if isinstance(message, str) else {}
-                reported.append(str(message))
-        outside = "..%2f..%2fetc/passwd", "assets/%00", "assets/../page.py", "assets/server.py", "nothing", "live"
-        for path in (*outside, "figures/light/nothing.json", "figures/light/excess.json?log=xyz"):
-            code, text = await strict.got(path)
-            assert 400 <= code < 500, path
-            reported.append(text)
-        assert (await strict.got("?star=%ff%fe"))[0] == 200
-        reader, writer = await asyncio.open_connection("127.0.0.1", strict.port)
-        writer.write(b"GET / HTTP/9.9\r\nHost: \xff\xfe\r\nContent-Length: -1\r\n\r\n")
-        reported.append((await reader.read(1000)).decode())
-        # A mistake of the page leaves no answer, and the next question has one.
-        wrong = await talk.answer("?magnitude=6.66")
-        assert "answer" not in wrong
-        assert "this is a fault of mauvecl" in (wrong if "refused" in wrong else await talk.next())["refused"]
-        assert "answer" in await talk.answer("?magnitude=6.67")
-
-    strict.visited(work)
+    for message in (*MESSAGES["nonsense"], "[" * 100_000, "x" * 100_000, b"bytes of no file"):
+        one = await strict.talk()
+        await one.connection.write_message(message, binary=isinstance(message, bytes))
+        code, reason = await one.ended()
+        assert code == 1003
+        reported.append(reason)
+    for pointless in MESSAGES["pointless"]:
+        await talk.connection.write_message(json.dumps(pointless))
+        # Whoever is still there answers the next message.
+        n = await talk.say("export", link="?star=M3V&magnitude=9")
+        found: dict[str, Any] = {}
+        while found.get("n") != n:
+            message = await asyncio.wait_for(talk.connection.read_message(), 60)
+            assert message is not None, pointless
+            # A requested file arrives as bytes.
+            found = json.loads(message) if isinstance(message, str) else {}
+            reported.append(str(message))
+    for path in MESSAGES["paths"]:
+        code, text = await strict.got(path)
+        assert 400 <= code < 500, path
+        reported.append(text)
+    assert (await strict.got("?star=%ff%fe"))[0] == 200
+    reader, writer = await asyncio.open_connection("127.0.0.1", strict.port)
+    writer.write(b"GET / HTTP/9.9\r\nHost: \xff\xfe\r\nContent-Length: -1\r\n\r\n")
+    reported.append((await reader.read(1000)).decode())
+    # A mistake of the page leaves no answer, and the next question has one.
+    wrong = await talk.answer("?magnitude=6.66")
+    assert "answer" not in wrong
+    assert "this is a fault of mauvecl" in (wrong if "refused" in wrong else await talk.next())["refused"]
+    assert "answer" in await talk.answer("?magnitude=6.67")
     lines = strict.log.read_text().splitlines()
     assert any("not a valid request" in one for one in lines), "there is something to see"
     for text in (*reported, *lines):
-        for word in ("Traceback", "site-packages", str(Path(__file__).parents[2]), 'File "/', "odd\n"):
+        for word in ("Traceback", "site-packages", str(ROOT), 'File "/', "odd\n"):
             assert word not in text
     assert all(len(line) < 1500 for line in lines)
 
@@ -279,7 +259,7 @@ async def test_answers_continue_while_others_compute_upload_and_leave(talk: Talk
 def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
     """Of 256 MiB of uploads the oldest are dropped; those of visitors who have left make room."""
     served = Server(tmp_path / "log.txt")
-    documented = (Path(__file__).parents[2] / "docs" / "page.md").read_text()
+    documented = (ROOT / "docs" / "page.md").read_text()
     assert documented.count("256 MiB of") == 2
 
     async def has_file(talk: Talk) -> bool:
@@ -306,8 +286,7 @@ def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
             assert memory[1] - memory[0] < 60
 
     served.visited(work)
-    served.kill()
-    served.quiet()
+    served.end()
 
 
 @pytest.mark.long

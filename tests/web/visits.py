@@ -62,8 +62,9 @@ class Server:
         self.process.kill()
         self.process.wait(20)
 
-    def quiet(self) -> None:
+    def end(self) -> None:
         """Check that the server has reported no fault: a visitor who leaves in mid-sentence is none."""
+        self.kill()
         reported = self.log.read_text()
         for word in ("mauvecl.web", "Traceback", "Warning", "ERROR"):
             assert word not in reported, reported
@@ -109,23 +110,17 @@ class Server:
         raise AssertionError("let in")
 
     async def got(self, path: str = "", **headers: str) -> tuple[int, str]:
-        """Return status and text of a page."""
         request = HTTPRequest(self.address + path, headers=headers, request_timeout=60)
         answer = await AsyncHTTPClient().fetch(request, raise_error=False)
         return answer.code, (answer.body or b"").decode(errors="replace")
 
-    def fetched(self, path: str = "", **headers: str) -> tuple[int, str]:
-        """Return status and text of a page, outside of a talk."""
-        return asyncio.run(self.got(path, **headers))
-
     def words(self) -> dict[str, Any]:
-        _, html = self.fetched()
+        _, html = asyncio.run(self.got())
         (text,) = re.findall(r'<script[^>]*type="application/json"[^>]*>(.*?)</script>', html, re.DOTALL)
         return dict(json.loads(text))
 
 
 def link(**entered: str) -> str:
-    """Return a link of texts by field."""
     return "?" + urlencode(entered)
 
 
@@ -191,7 +186,6 @@ class Talk:
         return reported["file"], await asyncio.wait_for(self.connection.read_message(), 60)
 
     async def table(self, link: str, tab: str, name: str) -> Table:
-        """Return a downloaded table."""
         _, content = await self.file(link=link, tab=tab, name=name, ending="ecsv")
         assert b"mauvecl-page" not in content, "nothing names a folder of the server"
         return Table.read(content.decode(), format="ascii.ecsv")
@@ -255,7 +249,6 @@ class Window:
         return "\n".join(self.locator("#card :is(.message, .words)").all_inner_texts())
 
     def says(self, words: str) -> None:
-        """Wait until the answer holds these words."""
         self.until(lambda: words in self.shown())
 
     def field(self, label: str) -> Locator:
@@ -317,7 +310,6 @@ class Window:
         self.locator(name if name.startswith("#") else f"[data-upload={name}]").set_input_files(given)
 
     def answerless(self) -> None:
-        """Check that the page shows no answer, button or picture."""
         self.get_by_text("No answer.", exact=True).wait_for()
         buttons = [self.button("Simulate"), self.button("Pin"), *self.locator("[data-file]").all()]
         assert all(one.is_disabled() for one in buttons)
