@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import VERBS, small
+from marks import long_but
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study
@@ -46,7 +47,7 @@ def asked(verb: str, unknown: dict[str, Any]) -> Study:
 @cache
 def engine_of(verb: str) -> Any:
     kind = ENGINES.get(verb, Engine)
-    return None if kind is None else kind()
+    return kind and kind()
 
 
 def answer(verb: str, unknown: dict[str, Any]) -> Any:
@@ -72,7 +73,7 @@ def differ(one: Any, other: Any, *, messages: bool) -> bool:
 
 #: Verbs that draw from a study or read one light curve; `calibrate` reads frames of several stars.
 ASKED = [verb for verb in VERBS if verb != "calibrate"]
-FAST = ("exposure", "visible", "simulate", "plan")
+EACH = pytest.mark.parametrize("verb", long_but(ASKED, "exposure", "visible", "simulate", "plan"))
 
 
 def test_every_unknown_of_a_study_is_tested() -> None:
@@ -85,9 +86,7 @@ def test_every_unknown_of_a_study_is_tested() -> None:
 
 
 @pytest.mark.parametrize("name", UNKNOWNS)
-@pytest.mark.parametrize(
-    "verb", [verb if verb in FAST else pytest.param(verb, marks=pytest.mark.long) for verb in ASKED]
-)
+@EACH
 def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
     unknown, base = UNKNOWNS[name], plain(verb)
     if name == "nuisances.usual" and verb in WITHOUT_USUAL:
@@ -99,21 +98,16 @@ def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
         assert any(name.startswith(key) for key in unused.rstrip(".").split(", "))
         return
     try:
-        found, reason = answer(verb, unknown), None
+        differs, refusal = differ(answer(verb, unknown), base, messages=verb == "plan"), ""
     except InputError as error:
-        found, reason = None, error
-    if reason is not None:
-        assert name.split(".")[1] in f"{reason.key} {reason}", reason
-    else:
-        assert differ(found, base, messages=verb == "plan"), f"{name} changes nothing that {verb} answers"
+        differs, refusal = False, f"{error.key} {error}"
+    assert differs or name.split(".")[1] in refusal, refusal or f"{name} changes nothing that {verb} answers"
 
 
 NEAR = "name,separation,magnitude,spectral_type\nB,10,6.5,F5V\nC,48,1,A0V\n"
 
 
-@pytest.mark.parametrize(
-    "verb", [verb if verb in FAST else pytest.param(verb, marks=pytest.mark.long) for verb in ASKED]
-)
+@EACH
 def test_neighbours_change_every_verb(verb: str, tmp_path: Path) -> None:
     """Answers change and list the neighbours; a verb that observes no star names them as not used."""
     (tmp_path / "near.csv").write_text(NEAR)

@@ -118,18 +118,6 @@ def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
         assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()
 
 
-@pytest.mark.long
-def test_report_has_every_table_remark_and_picture() -> None:
-    time, rng = np.arange(300) * 60.0, np.random.default_rng(1)
-    light = rng.normal(100.0, 1.0, 300) + np.where(time > 9000, 30 * np.exp((9000 - time) / 600), 0.0)
-    answer = mauvecl.analyse(Study().paper(), frames=mauvecl.Frames.of(time, light, np.ones(300), name="<A & B>"))
-    (page,) = (make().decode() for make in answer.documents.values())
-    assert "<A & B>" not in page
-    assert "&lt;A &amp; B&gt;: 300 frames" in page
-    assert all(view.title.split(";")[0] in page.replace("&lt;A &amp; B&gt;", "<A & B>") for view in answer.views)
-    assert page.count("<img") == len(answer.pictures)
-
-
 def labelled(figure: Any, label: str) -> list[np.ndarray]:
     """Return the values of the lines with a label along y."""
     return [np.asarray(line.get_ydata()) for axis in figure.axes for line in axis.lines if line.get_label() == label]
@@ -177,12 +165,21 @@ def test_maps_and_sweeps_are_drawn_as_their_tables_have_them(engine: Engine) -> 
         assert line.get_xydata() == pytest.approx(np.column_stack([[7, 9], wanted]))
 
 
-def test_level_of_observed_frames_is_not_drawn_in_long_gaps() -> None:
+def test_report_has_every_table_remark_and_picture_and_no_level_is_drawn_in_long_gaps() -> None:
     """Two days are missing, where the level has no line and its range no width, and single frames, where it has."""
     time, rng = np.arange(200) * 120.0, np.random.default_rng(1)
     time = np.delete(np.where(time < 12_000, time, time + 172_800.0), [50, 51])
-    frames = mauvecl.Frames.of(time, rng.normal(100.0, 1.0, time.size), np.ones(time.size), name="star")
-    figure = mauvecl.analyse(Study().paper(), frames=frames).pictures["light-curve"]()
+    flare = np.where((time > 6000) & (time < 12_000), 30 * np.exp(10 - time / 600), 0)
+    light = rng.normal(100.0, 1.0, time.size) + flare
+    frames = mauvecl.Frames.of(time, light, np.ones(time.size), name="<A & B>")
+    answer = mauvecl.analyse(Study().paper(), frames=frames)
+    (page,) = (make().decode() for make in answer.documents.values())
+    assert "<A & B>" not in page
+    assert "&lt;A &amp; B&gt;: 198 frames" in page
+    assert len(answer.events) == 1
+    assert all(view.title.split(";")[0] in page.replace("&lt;A &amp; B&gt;", "<A & B>") for view in answer.views)
+    assert page.count("<img") == len(answer.pictures)
+    figure = answer.pictures["light-curve"]()
     (level,) = labelled(figure, "quiescent level")
     assert np.flatnonzero(np.isnan(level)).tolist() == [98, 99]
     (area,) = (part for part in figure.axes[0].collections if part.get_label() == "95 % of the level")
