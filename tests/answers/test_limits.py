@@ -42,9 +42,6 @@ def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float
         # The curve of the closed form, nearest to the limit, is the power.
         values, theory = np.array(sorted(pickle.loads(pickle.dumps(limit)).curve)).T
         assert np.interp(limit.closed_form, values, theory) == pytest.approx(power, abs=0.01)
-    found = {limit.statistic: limit.value.value for limit in result.limits}
-    assert max(found.values()) == found["matched"]
-    assert found["chi2"] < found["chi2_element"]
 
 
 def test_limit_inverts_detect(engine: Engine) -> None:

@@ -68,12 +68,6 @@ def test_star_or_flare_that_saturates_is_reported(engine: Engine, tmp_path: Path
         assert any("flare" in text or number < 2 for text in found), (number, found)
 
 
-def test_many_messages_are_summarised(engine: Engine) -> None:
-    """Summarise the saturating flares of 64 cells: a common message, a dozen single ones, and one for the rest."""
-    study = hot_star(3.3, 300.0, **map_of([12.0 + 0.1 * n for n in range(32)], [5.0, 10.0]))
-    assert len(of_kind(detection_map(study, engine).messages, "saturated")) == 14
-
-
 # Far from the expectation no limit settles, which is refused: one prior near it.
 @pytest.mark.parametrize(
     ("verb", "name"),

@@ -25,8 +25,6 @@ from matplotlib.text import Text
 import mauvecl
 from mauvecl import Engine, Study, detect
 
-#: Width of one column of a journal, inches.
-COLUMN = 3.5
 #: Questions by the names of the tests that ask them.
 QUESTIONS: dict[str, dict[str, Any]] = tomllib.loads(
     (Path(__file__).parents[1] / "data" / "pictures.toml").read_text(encoding="utf-8")
@@ -85,7 +83,7 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
             for before, after in pairwise(boxes):
                 assert before[low + 2] <= after[low] + 0.5, (name, "ticks overlap")
         if place == 0 and QUESTIONS["texts"][case].get("column"):
-            assert figure.get_figwidth() <= COLUMN, name
+            assert figure.get_figwidth() <= 3.5, name  # inches, one column of a journal
         words = " ".join(text.get_text() for text in texts).replace("\N{NO-BREAK SPACE}", " ")
         if exposures and not case.startswith(("limit of", "measure", "stare")) and name != "exposure":
             assert any(f"{value} s" in words or "exposure (s)" in words for value in exposures), (name, words)

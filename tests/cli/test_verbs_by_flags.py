@@ -265,6 +265,7 @@ def test_assumptions_follow_the_study(setting: str, stated: str) -> None:
 def test_commands_say_what_applies(name: str, tmp_path: Path) -> None:
     row = {"says": [], "silent": [], "files": {}, "code": 0, "columns": 200} | SAID[name]
     for file, text in row["files"].items():
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text(text)
     done = run(*shlex.split(row["run"]), "--no-pictures", folder=tmp_path, code=row["code"], columns=row["columns"])
     said = done.stdout + done.stderr
