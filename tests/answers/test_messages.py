@@ -1,6 +1,5 @@
 """What answers say: saturation, priors beside the expectation, flares that lower a statistic, stars without light."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +9,14 @@ from answers import expectations, of_kind, small
 from commands import ended
 from marks import long_but
 from scenes import paper
+from tables import toml
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study, detect, limit, simulate
 from mauvecl import map as detection_map
 
 G2V = {"star": [{"library": "G2V", "magnitude": 7.4}]}
-TABLES: dict[str, dict[str, Any]] = tomllib.loads(
-    (Path(__file__).parents[1] / "data" / "studies" / "messages.toml").read_text(encoding="utf-8")
-)
-SATURATED, PRIORS, OF_PRIORS, KINDS = (TABLES[name] for name in ("saturated", "priors", "of_priors", "kinds"))
+SATURATED, PRIORS, OF_PRIORS, KINDS = toml("studies/messages.toml").values()
 
 
 def map_of(amplitudes: list[float], exposures: list[float]) -> dict[str, Any]:

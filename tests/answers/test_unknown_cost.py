@@ -182,19 +182,6 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
     assert failed == 10
 
 
-def test_chance_with_unknowns_is_that_of_their_study() -> None:
-    settings = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.0001, 0.02, 3]"]
-    chances, sentences = [], []
-    for usual in (False, True):
-        answer = detect(study(usual=usual).with_settings(settings))
-        chances.append(f"{100 * answer.table['closed_form_probability'][1]:.1f} %")
-        sentences += of_kind(answer.messages, "chance with unknowns")
-    # An answer with unknowns has them in its table.
-    (sentence,) = sentences
-    assert "flare of 2 %" in sentence
-    assert f"with a chance of {chances[0]}, with the usual unknowns of {chances[1]}" in sentence
-
-
 def test_template_of_the_flare_itself_loses_nothing(engine: Engine) -> None:
     """Draw ten times the scatter that the statistic assumes; another template loses its angle to the flare's."""
     drawn = ["processes.detector_temperature={normal=[21, 0.5], between=[18, 24]}", "flare.amplitudes=[3]"]

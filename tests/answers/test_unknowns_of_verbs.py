@@ -1,6 +1,5 @@
 """Every unknown at every verb: it changes the answer, is refused, or the answer names it as not used."""
 
-import tomllib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,14 +9,14 @@ import numpy as np
 import pytest
 from answers import VERBS, small
 from marks import long_but
+from tables import DATA, toml
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study
 
 ADDITIVE, NUISANCES, LEVELS = ["cosmic_rays"], ["dark", "light", "sky", "tilt"], ["light", "sky", "temperature"]
 STARE_CHANGES = {"jitters": LEVELS} | {course: ["star", *LEVELS] for course in ("offsets", "drifts", "cycles")}
-DATA = Path(__file__).parents[1] / "data"
-TABLES: dict[str, dict[str, Any]] = tomllib.loads((DATA / "studies" / "unknowns.toml").read_text(encoding="utf-8"))
+TABLES = toml("studies/unknowns.toml")
 FEW, PRIORS, NEEDS = (TABLES[name] for name in ("few", "priors", "needs"))
 NEEDS["analyse"]["data"] = {key: DATA / "flares" / name for key, name in NEEDS["analyse"]["data"].items()}
 #: One study section for each unknown.

@@ -4,7 +4,6 @@ import io
 import os
 import subprocess
 import sys
-import tomllib
 import warnings
 from collections.abc import Iterator
 from itertools import pairwise
@@ -21,14 +20,13 @@ import numpy as np
 from marks import long_but
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
+from tables import toml
 
 import mauvecl
 from mauvecl import Engine, Study, detect
 
 #: Questions by the names of the tests that ask them.
-QUESTIONS: dict[str, dict[str, Any]] = tomllib.loads(
-    (Path(__file__).parents[1] / "data" / "pictures.toml").read_text(encoding="utf-8")
-)
+QUESTIONS = toml("pictures.toml")
 FEW, ONE, ONLY = (QUESTIONS["settings"][name] for name in ("few", "one", "only"))
 
 

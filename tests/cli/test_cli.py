@@ -8,11 +8,9 @@ import signal
 import subprocess
 import sys
 import time
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +19,10 @@ from astropy.table import QTable
 from commands import SMALL_SHARDS, ended, run, started
 from processes import python
 from scenes import study_of_g2v
+from tables import DATA, toml
 
 from mauvecl import Engine, Study, simulate
 from mauvecl.cli.console import Meter
-
-DATA = Path(__file__).parents[1] / "data"
 
 
 @pytest.mark.parametrize(("magnitude", "seconds"), [(7.4, 50.0), (-0.3, 10.0), (7.4, 1500.0)])
@@ -301,7 +298,7 @@ def test_interrupt_during_imports_prints_one_line(started: list[str], module: st
 
 
 #: Work done of a total every ten seconds, and what is shown of it: in a file and, of the last, on a terminal.
-PROGRESS: dict[str, dict[str, Any]] = tomllib.loads((DATA / "progress.toml").read_text(encoding="utf-8"))
+PROGRESS = toml("progress.toml")
 
 
 @pytest.mark.parametrize("name", PROGRESS)

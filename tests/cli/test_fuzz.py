@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import resource
 import time
-import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from commands import ended
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from study_keys import fields
+from tables import toml
 
 pytestmark = pytest.mark.long
 
@@ -94,7 +94,7 @@ KEYS = st.one_of(
     st.sampled_from(EVERY), st.sampled_from(["observation.changes.temperature_c", "run.weights.x", ""]), TEXTS
 )
 #: What a generated value is given to: keys of instruments, flags, verbs and variables of the environment.
-GIVEN = tomllib.loads((Path(__file__).parents[1] / "data" / "hostile.toml").read_text(encoding="utf-8"))["generated"]
+GIVEN = toml("hostile.toml")["generated"]
 #: A verb that reads everything and draws nothing.
 ASK = ("exposure", "--snr", "10", "--at", "300", "--no-pictures", "--quiet")
 STAR = (*ASK, "--star", "G2V", "--magnitude", "7.4")

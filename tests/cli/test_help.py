@@ -6,7 +6,6 @@ import re
 import shlex
 import subprocess
 import sys
-import tomllib
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from answers import VERBS as ANSWERS
 from commands import ended, run
+from tables import DATA, toml
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -22,7 +22,7 @@ import mauvecl
 from mauvecl import Source, Study
 from mauvecl.cli import app
 
-FILE = Path(__file__).parent.parent / "data" / "flags.json"
+FILE = DATA / "flags.json"
 TOP: dict[str, Any] = get_command(app.app).commands  # type: ignore[attr-defined]
 #: Every verb, and every verb of `library`.
 VERBS: dict[str, Any] = {
@@ -111,7 +111,7 @@ def completed(typed: str, folder: Path) -> set[str]:
     return set(done.stdout.split("\n")) - {""}
 
 
-COMPLETED = tomllib.loads((FILE.parent / "completed.toml").read_text(encoding="utf-8"))
+COMPLETED = toml("completed.toml")
 
 
 @pytest.mark.parametrize("typed", COMPLETED)

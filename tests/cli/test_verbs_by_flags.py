@@ -7,7 +7,6 @@ import re
 import shlex
 import shutil
 import sys
-import tomllib
 from collections.abc import Callable
 from functools import cache
 from itertools import takewhile
@@ -19,14 +18,12 @@ from astropy.table import Table
 from commands import Done, ended, run
 from golden_inputs import write_inputs
 from marks import long_but
+from tables import toml
 
 from mauvecl import Study, detect
 
 #: Words after each verb, its files besides study and record, and what it states; and what commands say.
-TABLE, SAID = (
-    tomllib.loads((Path(__file__).parents[1] / "data" / name).read_text(encoding="utf-8"))
-    for name in ("verbs.toml", "said.toml")
-)
+TABLE, SAID = toml("verbs.toml"), toml("said.toml")
 SETTINGS = TABLE.pop("settings")
 #: Verbs that draw. Every table of theirs describes its columns and holds its study; of the others one table does.
 DRAWING = {"snr", "detect", "limit", "map", "gaussian", "stare", "inject", "measure"}
