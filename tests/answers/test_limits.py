@@ -9,6 +9,7 @@ import pytest
 from answers import expectations
 from marks import long_but
 from scenes import paper, study_of_g2v
+from tables import toml
 
 import mauvecl
 from mauvecl import Engine, Study, exposure_for, shortest_exposure
@@ -84,10 +85,6 @@ def test_assumptions_move_the_limit_as_predicted(engine: Engine) -> None:
     assert Study.build(lossy.model_dump(), "again") == lossy
 
 
-MAGNITUDE = {"quantity": "magnitude", "start": 6.0, "stop": 10.0, "steps": 5}
-AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "log": True}
-
-
 @pytest.mark.parametrize(("star", "least"), long_but([("M3V", 0.02), ("B2IV", 0.02), ("G2V", 1e-6)], ("M3V", 0.02)))
 def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, least: float, engine: Engine) -> None:
     """The least flares of the G2V star are lost where it saturates; the answer's study gives the same map again."""
@@ -106,23 +103,16 @@ def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, 
         assert chances[0, 0] > 0.9
 
 
-@pytest.mark.parametrize(
-    ("x", "y"),
-    [
-        (MAGNITUDE, AMPLITUDE),
-        (AMPLITUDE, {"quantity": "flare_temperature", "values": [6000.0, 10_000.0, 20_000.0]}),
-        ({"quantity": "exposure", "values": [5.0, 50.0]}, {"quantity": "detector_temperature", "values": [13.0, 21.0]}),
-        ({"quantity": "star", "values": ["G2V", "K5V"]}, {"quantity": "sky", "values": [18.0, 22.0]}),
-    ],
-)
-def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) -> None:
+@pytest.mark.parametrize("axes", toml("studies/maps.toml").values(), ids=toml("studies/maps.toml"))
+def test_each_cell_equals_its_own_detection(engine: Engine, axes: dict[str, Any]) -> None:
     """Compare all bits, which agree because all cells share their draws."""
     run = {"statistics": ("chi2", "matched"), "seed": 9}
-    asked = study_of_g2v(flare={"amplitudes": [0.1]}, run=run, map={"x": x, "y": y}).paper()
+    asked = study_of_g2v(flare={"amplitudes": [0.1]}, run=run, map=axes).paper()
     found = mauvecl.map(asked, engine)
     assert found.probability.shape == (2, len(found.y), len(found.x))
     for j, i in ((0, 0), (len(found.y) - 1, 0), (1, len(found.x) - 1)):
-        quiet, flare = expectations(asked.at(x["quantity"], found.x[i]).at(y["quantity"], found.y[j]))
+        there = asked.at(axes["x"]["quantity"], found.x[i]).at(axes["y"]["quantity"], found.y[j])
+        quiet, flare = expectations(there)
         alone = engine.detect(quiet, [flare], realisations=20_000, seed=9, statistics=found.statistics)
         expected = [alone.detection_probability(1e-2, statistic)[0].value for statistic in found.statistics]
         assert list(found.probability[:, j, i]) == expected

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scenes import assert_covered, paper
 from scipy import stats
+from tables import toml
 
 from mauvecl import Engine, Pool, Study, gaussian, measure
 
@@ -151,21 +152,13 @@ def drawn_study(*settings: str, star: str = "M3V", magnitude: float = 7.0, fits:
     return paper(chosen, f"measure.fits={fits}", "run.seed=42", *settings)
 
 
-#: Stars, magnitudes and settings next to the usual unknowns.
-DRAWN: dict[str, tuple[str, float, list[str]]] = {
-    "M dwarf": ("M3V", 7.0, ["flare.amplitudes=[0.5]"]),
-    "Sun-like": ("G2V", 4.0, ["flare.amplitudes=[0.1]"]),
-    "single frame": ("M3V", 9.0, ["flare.amplitudes=[20]", "observation.exposure_s=5"]),
-    "free light": ("M3V", 8.0, ["flare.amplitudes=[0.5]", "nuisances.light='free'"]),
-    "large losses": ("M3V", 9.0, ["flare.amplitudes=[2]", "flare.spectrum.balmer_jump=2",
-                                  "processes.pointing_loss={uniform=[0, 0.2]}"]),
-}  # fmt: skip
+DRAWN = toml("studies/measured.toml")
 
 
 @pytest.mark.parametrize("case", DRAWN)
 def test_intervals_cover_with_unknowns_drawn(case: str, engine: Engine) -> None:
     """Count 400 fits: 5 or 6 quantities may have a coverage of 93 to 97 %; each fails in 2e-6 of seeds."""
-    star, magnitude, settings = DRAWN[case]
+    settings, star, magnitude = (DRAWN[case][name] for name in ("settings", "star", "magnitude"))
     answer = measure(drawn_study("nuisances.usual=true", *settings, star=star, magnitude=magnitude), engine)
     rows = answer.flares[-1].rows()
     covered = np.rint(400 * np.array(rows["coverage_95"])).astype(int)

@@ -14,19 +14,14 @@ from astropy.table import QTable, Table
 from commands import run
 from scenes import paper
 from scipy import stats
+from tables import toml
 
 from mauvecl import Study, plan, stare, visible
 from mauvecl.search import completeness
 
 #: Injections take ten seconds a target.
 QUICK = {"completeness": "closed form"}
-TARGETS = [
-    {"name": "eps Eri", "mass_msun": 0.82, "age_myr": 500},
-    {"name": "<script>$x^2$", "coordinates": "10.5 -3", "magnitude": 8.0, "spectral_type": "K5V", "distance_pc": 10,
-     "mass_msun": 0.7, "age_myr": 300},
-    {"name": "Denebola"},
-    {"name": "EK Dra", "mass_msun": 1.0, "age_myr": 100},
-]  # fmt: skip
+TARGETS = toml("studies/targets.toml")["targets"]
 TARGET_NAMES = tuple(one["name"] for one in TARGETS)
 
 

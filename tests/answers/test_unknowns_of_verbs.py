@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -103,15 +102,11 @@ def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
     assert differs or name.split(".")[1] in refusal, refusal or f"{name} changes nothing that {verb} answers"
 
 
-NEAR = "name,separation,magnitude,spectral_type\nB,10,6.5,F5V\nC,48,1,A0V\n"
-
-
 @EACH
-def test_neighbours_change_every_verb(verb: str, tmp_path: Path) -> None:
+def test_neighbours_change_every_verb(verb: str) -> None:
     """Answers change and list the neighbours; a verb that observes no star names them as not used."""
-    (tmp_path / "near.csv").write_text(NEAR)
     study = asked(verb, {})
-    near = {"neighbours": tmp_path / "near.csv", "neighbour_share": 0.5}
+    near = {"neighbours": DATA / "studies" / "neighbours.csv", "neighbour_share": 0.5}
     if verb == "plan":
         (target,) = study.plan.targets
         plan = study.plan.model_copy(update={"targets": (target.model_copy(update=near),)})

@@ -1,9 +1,6 @@
 """Pictures through public functions: parts are told, texts are apart, files equal figures, backends are not loaded."""
 
 import io
-import os
-import subprocess
-import sys
 import warnings
 from collections.abc import Iterator
 from itertools import pairwise
@@ -11,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import started
+from processes import python
 from scenes import paper
 
 pytest.importorskip("matplotlib")
@@ -191,7 +190,7 @@ def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:
         assert entry.get_text().startswith(start)
 
 
-COMMAND = ("-m", "mauvecl", "exposure", "--star", "G2V", "-m", "7.4", "--snr", "10", "--at", "300", "--output", "out")
+COMMAND = ("exposure", "--star", "G2V", "-m", "7.4", "--snr", "10", "--at", "300", "--output", "out")
 LOADED = """
 import sys
 from mauvecl import Source
@@ -208,8 +207,6 @@ assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules
 @pytest.mark.parametrize("backend", ["module://no.such.backend", "TkAgg"])
 def test_pictures_load_matplotlib_when_drawn_and_no_backend(backend: str, tmp_path: Path) -> None:
     """Notebooks name backends that are not installed, and others need a display."""
-    for words in (COMMAND, ("-c", LOADED)):
-        environment = os.environ | {"MPLBACKEND": backend}
-        done = subprocess.run([sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
+    started(*COMMAND, folder=tmp_path, MPLBACKEND=backend)
+    python(LOADED, MPLBACKEND=backend)
     assert (tmp_path / "out" / "exposure.png").stat().st_size > 1000

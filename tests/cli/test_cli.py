@@ -219,12 +219,8 @@ def test_output_in_another_process_is_plain_json_alone_or_quiet(tmp_path: Path) 
     assert quiet.stderr == ""
     assert "matched" in quiet.stdout
     assert json.loads(alone.stdout)
-    for wrong, word in (("detect --fap 2", "--fap"), ("detetc", "detetc")):
-        refused = started(*wrong.split(), code=2, **how)
-        assert refused.stdout == ""
-        assert word in refused.stderr
-        assert "\x1b" not in refused.stderr
-        assert len(refused.stderr.strip().splitlines()) == 1
+    refused = started("detect", "--fap", "2", code=2, **how)
+    assert (refused.stdout, "--fap" in refused.stderr, "\x1b" in refused.stderr) == ("", True, False)
 
 
 #: Takes a twentieth of a second and more to load, and tells nobody that a value cannot be.

@@ -10,7 +10,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from answers import VERBS as ANSWERS
 from commands import ended, run
@@ -19,7 +18,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import mauvecl
-from mauvecl import Source, Study
+from mauvecl import Source
 from mauvecl.cli import app
 
 FILE = DATA / "flags.json"
@@ -141,12 +140,6 @@ def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
         assert re.fullmatch(rf"mauvecl: {flag} must be a .*, not 'many'\n", reported), reported
 
 
-def spectrum(folder: Path, name: str) -> str:
-    nm = np.linspace(170.0, 1150.0, 800)
-    np.savetxt(folder / name, np.transpose([nm, 1e-12 * np.exp(-(((nm - 560) / 250) ** 2))]))
-    return name
-
-
 #: The argument of `analyse` is a file of frames.
 OBSERVING = [name for name, one in TOP.items()
              if {"study_file", "star"} <= {p.name for p in one.params} and name != "analyse"]  # fmt: skip
@@ -155,21 +148,12 @@ OBSERVING = [name for name, one in TOP.items()
 @pytest.mark.parametrize("verb", OBSERVING)
 def test_star_is_accepted_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
     """Give every verb a star with a wrong magnitude, which its message names."""
-    for star in ("G2V,M3V", spectrum(tmp_path, "noname")):
+    (tmp_path / "noname").write_text("170 1e-12\n600 1e-12\n1150 1e-12\n")
+    for star in ("G2V,M3V", "noname"):
         code, _, reported = ended(verb, star, "-m", "99", folder=tmp_path)
         assert (code, reported) == (2, "mauvecl: --magnitude must be a number between -30 and 40 mag, not 99\n"), star
     code, _, reported = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
     assert (code, reported) == (2, "mauvecl: 'G2V' and --star are both stars, but only one may be given\n")
-
-
-def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
-    for given in ("G2V", spectrum(tmp_path, "star.txt")):
-        run("exposure", given, "-m", "8", "--snr", "10", "--at", "300", "--no-pictures", folder=tmp_path)
-        (star,) = Study.read(tmp_path / "mauvecl-exposure" / "study.toml").star
-        assert (star.library or (star.file and star.file.name), star.magnitude) == (given, 8.0)
-    # A study is still one, whatever it is called.
-    (tmp_path / "mauvecl-exposure" / "study.toml").rename(tmp_path / "study")
-    assert "star V = 9" in run("exposure", "study", "-m", "9", "--no-pictures", folder=tmp_path).stdout
 
 
 def tables(text: str) -> list[list[str]]:

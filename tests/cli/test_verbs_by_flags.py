@@ -162,7 +162,6 @@ def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @ALL
 def test_answer_is_printed_if_the_disk_is_full(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that no file is incomplete and that an earlier table is unchanged."""
     write_inputs(tmp_path, " ".join(words(verb)))
     out = tmp_path / "out"
     out.mkdir()
@@ -178,7 +177,6 @@ def test_answer_is_printed_if_the_disk_is_full(verb: str, tmp_path: Path, monkey
 
 
 def test_each_file_is_whole_or_missing_if_the_disk_fills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that earlier files are complete and later ones unchanged."""
     asked = (*words("simulate"), "--no-pictures", "--output")
     plain = run(*asked, "whole", folder=tmp_path).stdout
     whole = {p.name: p.read_bytes() for p in (tmp_path / "whole").iterdir()}
@@ -228,7 +226,6 @@ def test_output_folder_is_locked_while_written(tmp_path: Path, monkeypatch: pyte
 
 
 def test_files_of_the_previous_run_are_removed(tmp_path: Path) -> None:
-    """Remove pictures and tables of the previous run, but not the files of the user."""
     out = tmp_path / "out"
     run("simulate", "--star", "G2V", "--star", "K3V", "-m", "7", "-t", "5", "-o", "out", folder=tmp_path)
     assert {"observation-2.ecsv", "observation-2.png", "observation-1.png"} <= {path.name for path in out.iterdir()}
