@@ -1,4 +1,4 @@
-"""The command line as a user meets it: the paper's question, studies, reruns, interruption, and what it loads."""
+"""The command line as a user meets it: simulations, spectra of files, reruns, interruption, and what it loads."""
 
 import json
 import os
