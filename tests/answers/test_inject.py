@@ -1,6 +1,4 @@
-"""Completeness answers: tables, sweeps, resumed runs, intervals, errors and messages."""
-
-import tomllib
+"""Completeness answers: sweeps, unknown changes of the detector, and intervals; golden tables hold their numbers."""
 
 import numpy as np
 import pytest
@@ -8,7 +6,7 @@ from answers import of_kind
 from refusals import refused
 from scipy import stats
 
-from mauvecl import EnergyScale, Event, Source, Study, inject
+from mauvecl import Study, inject
 
 SMALL = {
     "star": [{"library": "G2V", "magnitude": 7.4, "distance_pc": 14.0}],
@@ -21,39 +19,6 @@ SMALL = {
 def study(**changes):
     data = {**SMALL, **{k: {**SMALL.get(k, {}), **v} if isinstance(v, dict) else v for k, v in changes.items()}}
     return Study.build(data, "test")
-
-
-@pytest.fixture(scope="module")
-def found(stares):
-    return inject(study(), stares)
-
-
-@pytest.mark.long
-def test_tables_are_consistent(found):
-    (star,) = found.stars
-    cells = found.completeness
-    assert len(cells) == 15
-    assert (cells["completeness_low"] <= cells["completeness"]).all()
-    assert (cells["completeness"] <= cells["completeness_high"]).all()
-    # More energy is found more often, at every half-width: the draws are common.
-    assert (np.diff(star.injected.completeness, axis=1) >= 0).all()
-    assert str(cells["size"].unit) == "erg"
-    limits = found.table
-    assert (limits["e50"] < limits["e90"]).all()
-    assert (limits["e50_low"] <= limits["e50"]).all()
-    # Size and amplitude are the same flare.
-    scale = EnergyScale.of_star(Source.from_library("G2V").at_magnitude(7.4), 14.0)
-    scale = Event(0.0, 1.0, 1.0, shape=study().search.shape).energy(scale)
-    assert cells["amplitude"] * cells["half_width"].value * scale == pytest.approx(cells["size"].value, rel=1e-12)
-    ratio = star.fitted["energy_ratio"][:, -1]
-    assert ratio == pytest.approx(np.ones(3), abs=0.25)
-    row = found.search[0]
-    assert row["threshold_low"] < row["threshold"] < row["threshold_high"]
-    assert row["in_a_row"] == pytest.approx(4.245e-5, rel=1e-3)
-    assert row["alarmed"] == np.sum(found.stars[0].alarmed) <= 30
-    assert row["alarmed_expected"] == pytest.approx(30 * -np.expm1(-found.stars[0].survey.stare.observed_s / 86_400))
-    assert not of_kind(found.messages, "false alarms")
-    assert Study.build(tomllib.loads(found.study.toml()), "text") == found.study
 
 
 @pytest.mark.long
@@ -103,18 +68,9 @@ def test_temperature_drift_hides_no_flare(stares):
     assert drifting.threshold.value == pytest.approx(plain.threshold.value, abs=0.05)
 
 
-@pytest.mark.long
-def test_cosmic_rays_raise_the_threshold_and_hide_flares(stares):
-    quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e35}
-    still = study(injections=quick, search={"nulls": 5}, stare={"duration_s": 2500.0, "gaps": []})
-    rays = still.with_settings(["processes.cosmic_rays.rate_per_cm2_s=100"])
-    plain, struck = (inject(one, stares) for one in (still, rays))
-    assert struck.stars[0].simulated.value >= plain.stars[0].simulated.value
-    assert (struck.stars[0].injected.critical != plain.stars[0].injected.critical).all()
-
-
-def test_intervals_widen_as_positions_differ(found):
+def test_intervals_widen_as_positions_differ(stares):
     """Draws of one position share its noise: as many trials are independent as explain the scatter of positions."""
+    found = inject(study(), stares)
     one, widened = found.stars[0].injected, 0
     sizes = found.completeness["size"].value.reshape(one.completeness.shape)
     for row, (critical, size) in enumerate(zip(one.critical, sizes, strict=True)):

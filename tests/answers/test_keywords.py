@@ -2,23 +2,20 @@
 
 import re
 import shlex
-import tomllib
 from pathlib import Path
-from typing import Any
 
 import astropy.units as u
 import numpy as np
 import pytest
 from commands import run
 from scenes import paper
+from tables import toml
 
 import mauvecl
 from mauvecl import Engine, FlareModel, Instrument, Source, Study, expect, fit
 
 #: Keywords, and the flags that ask the same.
-ASKED: dict[str, dict[str, Any]] = tomllib.loads(
-    (Path(__file__).parents[1] / "data" / "keywords.toml").read_text(encoding="utf-8")
-)
+ASKED = toml("keywords.toml")
 
 
 @pytest.mark.parametrize("name", ASKED)

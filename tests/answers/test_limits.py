@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from answers import expectations, of_kind
+from answers import expectations
 from marks import long_but
 from scenes import paper, study_of_g2v
+from tables import toml
 
 import mauvecl
 from mauvecl import Engine, Study, exposure_for, shortest_exposure
@@ -28,15 +29,13 @@ FEW = {"statistics": ("matched",), "realisations": 20_000}
 @pytest.mark.long
 @pytest.mark.parametrize("power", [0.5, 0.9])
 def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float) -> None:
-    """Compare with a fresh simulation within three half-widths of its 95 % interval; fails once in 1e4 seeds."""
+    """Compare with the 95 % interval of a fresh simulation, which each of 4 limits leaves in 5 % of seeds."""
     asked = study(limit={"power": power})
     result = mauvecl.limit(asked, engine)
     assert [limit.statistic for limit in result.limits] == list(STATISTICS)
     for limit in result.limits:
         assert limit.value.low <= limit.value.value <= limit.value.high
-        p = limit.check.probability
-        assert p.low - (p.high - p.low) < power < p.high + (p.high - p.low)
-        assert p.low <= power <= p.high
+        assert limit.check.probability.low <= power <= limit.check.probability.high
         assert limit.verdict == "confirms it"
         assert limit.check.seed != asked.run.seed
         # Far from the rails the closed form is right to the skew of the dark.
@@ -44,17 +43,6 @@ def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float
         # The curve of the closed form, nearest to the limit, is the power.
         values, theory = np.array(sorted(pickle.loads(pickle.dumps(limit)).curve)).T
         assert np.interp(limit.closed_form, values, theory) == pytest.approx(power, abs=0.01)
-    found = {limit.statistic: limit.value.value for limit in result.limits}
-    assert max(found.values()) == found["matched"]
-    assert found["chi2"] < found["chi2_element"]
-
-
-def test_few_draws_do_not_tell_unknowns_apart(engine: Engine) -> None:
-    axes = {"x": {"quantity": "magnitude", "values": [7]}, "y": {"quantity": "amplitude", "values": [0.1]}}
-    asked = study(unknowns={"draws": 3}, map=axes, run={"statistics": ("matched",), "realisations": 2000, "fap": 0.1})
-    first = mauvecl.map(asked, engine).views[0].title
-    assert "only more draws tell apart" in first
-    assert "nan" not in first
 
 
 def test_limit_inverts_detect(engine: Engine) -> None:
@@ -75,15 +63,6 @@ def test_limit_inverts_detect(engine: Engine) -> None:
         assert [replace(x, check=check).verdict for x in (limit, shortest)] == verdicts
 
 
-@pytest.mark.parametrize(("verb", "faint", "kind"), [("limit", 25.0, "no limit"), ("exposure", 28.0, "no answer")])
-def test_failure_of_one_star_keeps_the_others(engine: Engine, verb: str, faint: float, kind: str) -> None:
-    asked = study(run=FEW, star=[{"library": "G2V", "magnitude": m} for m in (faint, 7.0)])
-    found: Any = shortest_exposure(asked, engine) if verb == "limit" else exposure_for(asked, 10.0, 300.0)
-    assert found.table["star"].tolist() == ["G2V V = 7"]
-    assert of_kind(found.messages, kind) == list(found.messages[:1])
-    assert f"G2V V = {faint:g}" in found.messages[0]
-
-
 @pytest.mark.long
 def test_shortest_exposures_are_one_frame_or_several_days(engine: Engine) -> None:
     """Search some 1e5 frames by bisection."""
@@ -96,25 +75,14 @@ def test_shortest_exposures_are_one_frame_or_several_days(engine: Engine) -> Non
 
 
 def test_assumptions_move_the_limit_as_predicted(engine: Engine) -> None:
-    """Check the sign of each change, and each end against the limit of a changed instrument."""
+    """Compare an end with the limit of a changed instrument; `test_golden_python.py` has the values of all."""
     asked = study(run=FEW)
-    table = mauvecl.what_matters(asked)
-    assert (np.diff(table["span"]) <= 0).all()
-    rows = {row["assumption"]: row for row in table}
-    for name in ("detector temperature (C)", "light loss", "pointing loss", "read noise (DN)"):
-        assert rows[name]["at_low_end"] > rows[name]["at_high_end"]
-    assert rows["quantum efficiency, scale"]["at_low_end"] < rows["quantum efficiency, scale"]["at_high_end"]
-    # Poisson in electrons has 0.77 of the dark noise.
-    assert rows["dark counts are Poisson in"]["at_high_end"] > rows["dark counts are Poisson in"]["at_low_end"]
+    rows = {row["assumption"]: row for row in mauvecl.what_matters(asked)}
     lossy = asked.with_instrument({"light_loss": 0.44})
     assert lossy.observation.load_instrument().light_loss == 0.44
     (limit,) = mauvecl.limit(lossy, engine).limits
     assert rows["light loss"]["at_high_end"] == pytest.approx(limit.closed_form, abs=1e-3)
     assert Study.build(lossy.model_dump(), "again") == lossy
-
-
-MAGNITUDE = {"quantity": "magnitude", "start": 6.0, "stop": 10.0, "steps": 5}
-AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "log": True}
 
 
 @pytest.mark.parametrize(("star", "least"), long_but([("M3V", 0.02), ("B2IV", 0.02), ("G2V", 1e-6)], ("M3V", 0.02)))
@@ -135,23 +103,16 @@ def test_map_without_magnitudes_has_those_over_which_flares_are_lost(star: str, 
         assert chances[0, 0] > 0.9
 
 
-@pytest.mark.parametrize(
-    ("x", "y"),
-    [
-        (MAGNITUDE, AMPLITUDE),
-        (AMPLITUDE, {"quantity": "flare_temperature", "values": [6000.0, 10_000.0, 20_000.0]}),
-        ({"quantity": "exposure", "values": [5.0, 50.0]}, {"quantity": "detector_temperature", "values": [13.0, 21.0]}),
-        ({"quantity": "star", "values": ["G2V", "K5V"]}, {"quantity": "sky", "values": [18.0, 22.0]}),
-    ],
-)
-def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) -> None:
+@pytest.mark.parametrize("axes", toml("studies/maps.toml").values(), ids=toml("studies/maps.toml"))
+def test_each_cell_equals_its_own_detection(engine: Engine, axes: dict[str, Any]) -> None:
     """Compare all bits, which agree because all cells share their draws."""
     run = {"statistics": ("chi2", "matched"), "seed": 9}
-    asked = study_of_g2v(flare={"amplitudes": [0.1]}, run=run, map={"x": x, "y": y}).paper()
+    asked = study_of_g2v(flare={"amplitudes": [0.1]}, run=run, map=axes).paper()
     found = mauvecl.map(asked, engine)
     assert found.probability.shape == (2, len(found.y), len(found.x))
     for j, i in ((0, 0), (len(found.y) - 1, 0), (1, len(found.x) - 1)):
-        quiet, flare = expectations(asked.at(x["quantity"], found.x[i]).at(y["quantity"], found.y[j]))
+        there = asked.at(axes["x"]["quantity"], found.x[i]).at(axes["y"]["quantity"], found.y[j])
+        quiet, flare = expectations(there)
         alone = engine.detect(quiet, [flare], realisations=20_000, seed=9, statistics=found.statistics)
         expected = [alone.detection_probability(1e-2, statistic)[0].value for statistic in found.statistics]
         assert list(found.probability[:, j, i]) == expected

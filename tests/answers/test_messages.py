@@ -1,6 +1,5 @@
 """What answers say: saturation, priors beside the expectation, flares that lower a statistic, stars without light."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +9,14 @@ from answers import expectations, of_kind, small
 from commands import ended
 from marks import long_but
 from scenes import paper
+from tables import toml
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study, detect, limit, simulate
 from mauvecl import map as detection_map
 
 G2V = {"star": [{"library": "G2V", "magnitude": 7.4}]}
-TABLES: dict[str, dict[str, Any]] = tomllib.loads(
-    (Path(__file__).parents[1] / "data" / "studies" / "messages.toml").read_text(encoding="utf-8")
-)
-SATURATED, PRIORS, OF_PRIORS, KINDS = (TABLES[name] for name in ("saturated", "priors", "of_priors", "kinds"))
+SATURATED, PRIORS, OF_PRIORS, KINDS = toml("studies/messages.toml").values()
 
 
 def map_of(amplitudes: list[float], exposures: list[float]) -> dict[str, Any]:
@@ -66,12 +63,6 @@ def test_star_or_flare_that_saturates_is_reported(engine: Engine, tmp_path: Path
         folder.mkdir()
         found = [text for text in said(verb, study, engine, folder) if "saturate" in text.lower()]
         assert any("flare" in text or number < 2 for text in found), (number, found)
-
-
-def test_many_messages_are_summarised(engine: Engine) -> None:
-    """Summarise the saturating flares of 64 cells: a common message, a dozen single ones, and one for the rest."""
-    study = hot_star(3.3, 300.0, **map_of([12.0 + 0.1 * n for n in range(32)], [5.0, 10.0]))
-    assert len(of_kind(detection_map(study, engine).messages, "saturated")) == 14
 
 
 # Far from the expectation no limit settles, which is refused: one prior near it.

@@ -115,7 +115,6 @@ def test_study_of_version_1_is_read_as_it_was(text: str, instrument: str, tmp_pa
     new = tomllib.loads(study.toml())
     assert new.keys() - tomllib.loads(Study().toml()).keys() == {"nuisances"}, "no section that says nothing"
     assert new["nuisances"] == {"usual": False, "own": {}}
-    assert "orbit" not in new
     (tmp_path / "plan.toml").write_text(OLD + "[plan]\nhours = 10\n")
     with pytest.warns(UserWarning, match="no version"):
         assert Study.read(tmp_path / "plan.toml").plan.completeness == "injections"

@@ -1,22 +1,21 @@
 """Every unknown at every verb: it changes the answer, is refused, or the answer names it as not used."""
 
-import tomllib
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from answers import VERBS, small
+from marks import long_but
+from tables import DATA, toml
 
 import mauvecl
 from mauvecl import Engine, InputError, Stares, Study
 
 ADDITIVE, NUISANCES, LEVELS = ["cosmic_rays"], ["dark", "light", "sky", "tilt"], ["light", "sky", "temperature"]
 STARE_CHANGES = {"jitters": LEVELS} | {course: ["star", *LEVELS] for course in ("offsets", "drifts", "cycles")}
-DATA = Path(__file__).parents[1] / "data"
-TABLES: dict[str, dict[str, Any]] = tomllib.loads((DATA / "studies" / "unknowns.toml").read_text(encoding="utf-8"))
+TABLES = toml("studies/unknowns.toml")
 FEW, PRIORS, NEEDS = (TABLES[name] for name in ("few", "priors", "needs"))
 NEEDS["analyse"]["data"] = {key: DATA / "flares" / name for key, name in NEEDS["analyse"]["data"].items()}
 #: One study section for each unknown.
@@ -46,7 +45,7 @@ def asked(verb: str, unknown: dict[str, Any]) -> Study:
 @cache
 def engine_of(verb: str) -> Any:
     kind = ENGINES.get(verb, Engine)
-    return None if kind is None else kind()
+    return kind and kind()
 
 
 def answer(verb: str, unknown: dict[str, Any]) -> Any:
@@ -72,7 +71,7 @@ def differ(one: Any, other: Any, *, messages: bool) -> bool:
 
 #: Verbs that draw from a study or read one light curve; `calibrate` reads frames of several stars.
 ASKED = [verb for verb in VERBS if verb != "calibrate"]
-FAST = ("exposure", "visible", "simulate", "plan")
+EACH = pytest.mark.parametrize("verb", long_but(ASKED, "exposure", "visible", "simulate", "plan"))
 
 
 def test_every_unknown_of_a_study_is_tested() -> None:
@@ -85,9 +84,7 @@ def test_every_unknown_of_a_study_is_tested() -> None:
 
 
 @pytest.mark.parametrize("name", UNKNOWNS)
-@pytest.mark.parametrize(
-    "verb", [verb if verb in FAST else pytest.param(verb, marks=pytest.mark.long) for verb in ASKED]
-)
+@EACH
 def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
     unknown, base = UNKNOWNS[name], plain(verb)
     if name == "nuisances.usual" and verb in WITHOUT_USUAL:
@@ -99,26 +96,17 @@ def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
         assert any(name.startswith(key) for key in unused.rstrip(".").split(", "))
         return
     try:
-        found, reason = answer(verb, unknown), None
+        differs, refusal = differ(answer(verb, unknown), base, messages=verb == "plan"), ""
     except InputError as error:
-        found, reason = None, error
-    if reason is not None:
-        assert name.split(".")[1] in f"{reason.key} {reason}", reason
-    else:
-        assert differ(found, base, messages=verb == "plan"), f"{name} changes nothing that {verb} answers"
+        differs, refusal = False, f"{error.key} {error}"
+    assert differs or name.split(".")[1] in refusal, refusal or f"{name} changes nothing that {verb} answers"
 
 
-NEAR = "name,separation,magnitude,spectral_type\nB,10,6.5,F5V\nC,48,1,A0V\n"
-
-
-@pytest.mark.parametrize(
-    "verb", [verb if verb in FAST else pytest.param(verb, marks=pytest.mark.long) for verb in ASKED]
-)
-def test_neighbours_change_every_verb(verb: str, tmp_path: Path) -> None:
+@EACH
+def test_neighbours_change_every_verb(verb: str) -> None:
     """Answers change and list the neighbours; a verb that observes no star names them as not used."""
-    (tmp_path / "near.csv").write_text(NEAR)
     study = asked(verb, {})
-    near = {"neighbours": tmp_path / "near.csv", "neighbour_share": 0.5}
+    near = {"neighbours": DATA / "studies" / "neighbours.csv", "neighbour_share": 0.5}
     if verb == "plan":
         (target,) = study.plan.targets
         plan = study.plan.model_copy(update={"targets": (target.model_copy(update=near),)})

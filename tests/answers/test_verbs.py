@@ -2,13 +2,12 @@
 
 import io
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from answers import FEW, QUICK, VERBS
+from answers import FEW, QUICK
 from astropy.table import QTable, Table
 from commands import run
 from marks import long_but
@@ -23,20 +22,6 @@ SLOW = {
     "inject": ["stare.duration_s=3000", "injections.sizes=3", "injections.widths=2", "injections.count=20",
                "injections.positions=2", "search.nulls=0", "injections.fitted=0"],
 }  # fmt: skip
-
-
-def test_command_line_has_every_verb_in_order(tmp_path: Path) -> None:
-    """List every verb once, in four groups, and in each group in the order of the registry."""
-    shown = run("--help", folder=tmp_path).stdout
-    groups = re.findall(r"^(Plan|Simulate|Analyse|Tools)[^\n]*:\n((?:  .*\n)+)", shown, re.MULTILINE)
-    assert [heading for heading, _ in groups] == ["Plan", "Simulate", "Analyse", "Tools"]
-    listed = [[line.split()[0] for line in lines.splitlines()] for _, lines in groups]
-    assert sorted(name for names in listed for name in names if name in VERBS) == sorted(VERBS)
-    for names in listed:
-        own = [name for name in names if name in VERBS]
-        assert own == sorted(own, key=list(VERBS).index)
-    some = ["plan", "stare", "analyse", "serve"]
-    assert [name for names in listed for name in some if name in names] == some
 
 
 @pytest.mark.parametrize("name", long_but(QUICK, *(QUICK.keys() - {"change", "simulate"})))

@@ -1,10 +1,6 @@
 """Pictures through public functions: parts are told, texts are apart, files equal figures, backends are not loaded."""
 
 import io
-import os
-import subprocess
-import sys
-import tomllib
 import warnings
 from collections.abc import Iterator
 from itertools import pairwise
@@ -12,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import started
+from processes import python
 from scenes import paper
 
 pytest.importorskip("matplotlib")
@@ -21,16 +19,13 @@ import numpy as np
 from marks import long_but
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
+from tables import toml
 
 import mauvecl
 from mauvecl import Engine, Study, detect
 
-#: Width of one column of a journal, inches.
-COLUMN = 3.5
 #: Questions by the names of the tests that ask them.
-QUESTIONS: dict[str, dict[str, Any]] = tomllib.loads(
-    (Path(__file__).parents[1] / "data" / "pictures.toml").read_text(encoding="utf-8")
-)
+QUESTIONS = toml("pictures.toml")
 FEW, ONE, ONLY = (QUESTIONS["settings"][name] for name in ("few", "one", "only"))
 
 
@@ -85,7 +80,7 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
             for before, after in pairwise(boxes):
                 assert before[low + 2] <= after[low] + 0.5, (name, "ticks overlap")
         if place == 0 and QUESTIONS["texts"][case].get("column"):
-            assert figure.get_figwidth() <= COLUMN, name
+            assert figure.get_figwidth() <= 3.5, name  # inches, one column of a journal
         words = " ".join(text.get_text() for text in texts).replace("\N{NO-BREAK SPACE}", " ")
         if exposures and not case.startswith(("limit of", "measure", "stare")) and name != "exposure":
             assert any(f"{value} s" in words or "exposure (s)" in words for value in exposures), (name, words)
@@ -116,18 +111,6 @@ def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
         twice = io.BytesIO()
         draw().savefig(twice, format="png", dpi=160)
         assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()
-
-
-@pytest.mark.long
-def test_report_has_every_table_remark_and_picture() -> None:
-    time, rng = np.arange(300) * 60.0, np.random.default_rng(1)
-    light = rng.normal(100.0, 1.0, 300) + np.where(time > 9000, 30 * np.exp((9000 - time) / 600), 0.0)
-    answer = mauvecl.analyse(Study().paper(), frames=mauvecl.Frames.of(time, light, np.ones(300), name="<A & B>"))
-    (page,) = (make().decode() for make in answer.documents.values())
-    assert "<A & B>" not in page
-    assert "&lt;A &amp; B&gt;: 300 frames" in page
-    assert all(view.title.split(";")[0] in page.replace("&lt;A &amp; B&gt;", "<A & B>") for view in answer.views)
-    assert page.count("<img") == len(answer.pictures)
 
 
 def labelled(figure: Any, label: str) -> list[np.ndarray]:
@@ -177,12 +160,21 @@ def test_maps_and_sweeps_are_drawn_as_their_tables_have_them(engine: Engine) -> 
         assert line.get_xydata() == pytest.approx(np.column_stack([[7, 9], wanted]))
 
 
-def test_level_of_observed_frames_is_not_drawn_in_long_gaps() -> None:
+def test_report_has_every_table_remark_and_picture_and_no_level_is_drawn_in_long_gaps() -> None:
     """Two days are missing, where the level has no line and its range no width, and single frames, where it has."""
     time, rng = np.arange(200) * 120.0, np.random.default_rng(1)
     time = np.delete(np.where(time < 12_000, time, time + 172_800.0), [50, 51])
-    frames = mauvecl.Frames.of(time, rng.normal(100.0, 1.0, time.size), np.ones(time.size), name="star")
-    figure = mauvecl.analyse(Study().paper(), frames=frames).pictures["light-curve"]()
+    flare = np.where((time > 6000) & (time < 12_000), 30 * np.exp(10 - time / 600), 0)
+    light = rng.normal(100.0, 1.0, time.size) + flare
+    frames = mauvecl.Frames.of(time, light, np.ones(time.size), name="<A & B>")
+    answer = mauvecl.analyse(Study().paper(), frames=frames)
+    (page,) = (make().decode() for make in answer.documents.values())
+    assert "<A & B>" not in page
+    assert "&lt;A &amp; B&gt;: 198 frames" in page
+    assert len(answer.events) == 1
+    assert all(view.title.split(";")[0] in page.replace("&lt;A &amp; B&gt;", "<A & B>") for view in answer.views)
+    assert page.count("<img") == len(answer.pictures)
+    figure = answer.pictures["light-curve"]()
     (level,) = labelled(figure, "quiescent level")
     assert np.flatnonzero(np.isnan(level)).tolist() == [98, 99]
     (area,) = (part for part in figure.axes[0].collections if part.get_label() == "95 % of the level")
@@ -198,7 +190,7 @@ def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:
         assert entry.get_text().startswith(start)
 
 
-COMMAND = ("-m", "mauvecl", "exposure", "--star", "G2V", "-m", "7.4", "--snr", "10", "--at", "300", "--output", "out")
+COMMAND = ("exposure", "--star", "G2V", "-m", "7.4", "--snr", "10", "--at", "300", "--output", "out")
 LOADED = """
 import sys
 from mauvecl import Source
@@ -215,8 +207,6 @@ assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules
 @pytest.mark.parametrize("backend", ["module://no.such.backend", "TkAgg"])
 def test_pictures_load_matplotlib_when_drawn_and_no_backend(backend: str, tmp_path: Path) -> None:
     """Notebooks name backends that are not installed, and others need a display."""
-    for words in (COMMAND, ("-c", LOADED)):
-        environment = os.environ | {"MPLBACKEND": backend}
-        done = subprocess.run([sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
+    started(*COMMAND, folder=tmp_path, MPLBACKEND=backend)
+    python(LOADED, MPLBACKEND=backend)
     assert (tmp_path / "out" / "exposure.png").stat().st_size > 1000

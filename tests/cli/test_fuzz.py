@@ -15,6 +15,7 @@ from commands import ended
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from study_keys import fields
+from tables import toml
 
 pytestmark = pytest.mark.long
 
@@ -92,20 +93,8 @@ EVERY = [".".join(path) for path, _ in fields() if len(path) < 3] + ["star.0.mag
 KEYS = st.one_of(
     st.sampled_from(EVERY), st.sampled_from(["observation.changes.temperature_c", "run.weights.x", ""]), TEXTS
 )
-INSTRUMENT_KEYS = (
-    "pixels", "adc_bits", "read_noise_dn", "temperature_c", "light_loss", "fibre_efficiency", "pixel_map", "extends",
-    "name", "conversion_uv_per_electron", "frame_s", "sources", "nonsense",
-)  # fmt: skip
-FLAGS = (
-    "--star", "--magnitude", "--band", "--exposure", "--instrument", "--temperature", "--sky", "--target", "--time",
-    "--snr", "--at", "--per", "--realisations", "--nonsense", "--set", "--json",
-)  # fmt: skip
-VERBS = (
-    "verify {0}", "export {0} {0}.fits --rows {0}", "realise --star {0} --frames {0} -n 1", "library add {0}",
-    "serve --port {0}", "map --x {0}", "limit --of {0}", "detect --fap {0} -o {0}", "exposure {0}",
-)  # fmt: skip
-ENVIRONMENT = ("MAUVECL_DATA_DIR", "MAUVECL_CACHE_DIR", "MAUVECL_LARGEST_FILE_MIB", "MAUVECL_LARGEST_CONTENT_MIB",
-               "COLUMNS", "TERM", "NO_COLOR", "PYTHONIOENCODING", "LANG", "TMPDIR")  # fmt: skip
+#: What a generated value is given to: keys of instruments, flags, verbs and variables of the environment.
+GIVEN = toml("hostile.toml")["generated"]
 #: A verb that reads everything and draws nothing.
 ASK = ("exposure", "--snr", "10", "--at", "300", "--no-pictures", "--quiet")
 STAR = (*ASK, "--star", "G2V", "--magnitude", "7.4")
@@ -120,19 +109,21 @@ KINDS: dict[str, tuple[int, tuple[st.SearchStrategy[Any], ...], Callable[..., tu
         ),
     ),
     "instrument": (
-        25, (st.sampled_from(INSTRUMENT_KEYS), VALUES),
+        25, (st.sampled_from(GIVEN["instrument"]), VALUES),
         lambda key, value: (
             (*STAR, "--instrument", "mine.toml"), f"extends = 'mauvesim'\n{key} = {value}\n".encode()
         ),
     ),
-    "flag": (35, (st.sampled_from(FLAGS), WORD), lambda flag, value: ((*ASK, f"{flag}={value}"), b"")),
+    "flag": (35, (st.sampled_from(GIVEN["flags"]), WORD), lambda flag, value: ((*ASK, f"{flag}={value}"), b"")),
     # Not outside the folder: what is written there would stay.
     "output": (5, (WORD,), lambda value: ((*ASK, f"--output={value.replace('/', '?').replace('..', '?')}"), b"")),
     "verb": (
-        30, (st.sampled_from(VERBS), TEXTS),
+        30, (st.sampled_from(GIVEN["verbs"]), TEXTS),
         lambda verb, value: (tuple(part.format(value) for part in verb.split()), b""),
     ),
-    "environment": (20, (st.sampled_from(ENVIRONMENT), TEXTS), lambda name, value: (("library", name, value), b"")),
+    "environment": (
+        20, (st.sampled_from(GIVEN["environment"]), TEXTS), lambda name, value: (("library", name, value), b"")
+    ),
 }  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 import os
 import shlex
 import shutil
-import tomllib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,10 +13,10 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from scripts import tool
+from tables import toml
 
 pytestmark = pytest.mark.long
 
-ROOT = Path(__file__).parents[2]
 GIB = 2**30
 
 
@@ -83,7 +82,7 @@ def many_comments(path: Path) -> None:
 
 
 ANALYSE = ("analyse", "--no-pictures", "--quiet", "--output", "out")
-TABLE = tomllib.loads((ROOT / "tests" / "data" / "hostile.toml").read_text(encoding="utf-8"))
+TABLE = toml("hostile.toml")
 #: What reads a file, and what finds it at fault: the file, and the command.
 READERS, VERIFIED = ({name: (file, tuple(shlex.split(words))) for name, (file, words) in TABLE[kind].items()}
                      for kind in ("read", "verified"))  # fmt: skip
