@@ -303,7 +303,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("ratio(log_k, 1) * linear[:, 1] / amplitude", "0.0 * amplitude"),
     ),
     "intervals clipped at a standard deviation": (
-        "test_intervals_agree_with_minos_and_emcee",
+        "test_intervals_agree_with_minos",
         ("rise = np.maximum(rise, 0.0)", "rise = np.clip(rise, 0.0, 1.0)"),
     ),
     "intervals beyond their bounds": (
@@ -375,7 +375,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("(1 - GENERAL_WEIGHT) / len(shapes)", "(1 - GENERAL_WEIGHT)"),
     ),
     "likelihood without the information on the level": (
-        "test_covariance_is_that_of_dense_matrices",
+        "test_level_norms_and_covariances_are_those_of_the_matrices",
         ("covariance.log_determinant + np.log(information)", "covariance.log_determinant"),
     ),
     "steps taken for flares": (
