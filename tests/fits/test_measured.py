@@ -288,7 +288,7 @@ def test_bins_have_correct_errors_and_marginalise_what_a_stare_does_not_know() -
         truth = [flux[a : a + n].mean() for a, n in zip(first, bins["frames"], strict=True)]
         truths = (("temperature", KELVIN), ("flux_bolometric", np.array(truth)))
         found = [(bins[name].value - value) / bins[f"{name}_error"].value for name, value in truths]
-        return np.transpose(found).tolist()  # type: ignore[no-any-return]
+        return np.transpose(found).tolist()
 
     plain, right, wrong = [], [], []
     for _ in range(20):
