@@ -11,7 +11,7 @@ from scenes import through
 from scipy.integrate import quad
 from scipy.special import erfc
 
-from mauvecl import SHAPES, EnergyScale, TableShape
+from mauvecl import SHAPES, EnergyScale, Event, TableShape
 
 #: A shape whose height and length follow from its equivalent duration.
 FIDUCIAL: Any = SHAPES["fiducial"]
@@ -94,6 +94,7 @@ def test_peak_and_width_agree_with_a_fine_scan(shape):
     # Davenport's peak is a step's upper edge.
     assert values.max() == pytest.approx(shape.peak, abs=1e-8)
     assert (values > shape.peak / 2).sum() * 1e-5 == pytest.approx(shape.width, abs=3e-5)
+    assert Event(0.0, 1.0, 0.4, shape=shape).peak == pytest.approx(0.4 * values.max(), abs=1e-8)
 
 
 @pytest.mark.parametrize("delta", [100.0, 1000.0, 1e5])
