@@ -552,11 +552,11 @@ MUTATIONS: dict[str, Mutation] = {
         ),
     ),
     "one visit against a known mean": (
-        "test_smallest_changes_have_the_power[2-0.05-0.5]",
+        "test_smallest_changes_have_the_power[2-0.001-0.95]",
         ("error * np.sqrt(centre * visits / dof)", "error * np.sqrt(centre)"),
     ),
     "scatter in the column of differences": (
-        "test_smallest_changes_have_the_power[2-0.05-0.5]",
+        "test_smallest_changes_have_the_power[2-0.001-0.95]",
         ('Column("smallest", "smallest.one"', 'Column("smallest", "smallest.scatter"'),
     ),
     "amplitudes of other cells": (
