@@ -1,6 +1,5 @@
 """Measured flares: forecasts, coverage of intervals, other minimisers; draws are normal, by seeds fixed beforehand."""
 
-import itertools
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -89,16 +88,6 @@ def test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies(row: tuple[float, ..
     assert longer["energy bolometric"] == pytest.approx(150.0 * longer["luminosity bolometric"], rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "wanted"), [("280", 0.050), ("Ca II K", 0.071), ("Ca II H", 0.071), ("H beta", 0.075), ("H alpha", 0.066)]
-)
-def test_line_snr_equals_its_closed_form(name: str, wanted: float) -> None:
-    """Compare 1e-12 erg s-1 cm-2 in 50 s at M3V of V = 9 with the specification."""
-    m, x = model(lines=(name,)), quiet()
-    line = 1e-12 * m.fixed[0]
-    assert np.sqrt(np.sum(line**2 / x.variance_dn2)) == pytest.approx(wanted, rel=0.01, abs=5e-4)
-
-
 @pytest.mark.parametrize("unknown", [False, True], ids=["known", "free"])
 @pytest.mark.parametrize(("library", "v", "kelvin", "jump", "line"), [
     ("K3V", 6.0, 7500.0, 1.8, 3e-12), ("G2V", 8.0, 14_000.0, 3.0, 0.0), ("M3V", 7.0, 25_000.0, 1.2, 8e-12),
@@ -143,30 +132,6 @@ def test_forecasts_agree_with_brute_force(
 
 #: Vacuum wavelengths of lines of Ca II, nm.
 CA_II_NM = np.array([393.478, 396.959])
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("unknown", [False, True], ids=["known", "free"])
-@pytest.mark.parametrize("jump", [False, True], ids=["blackbody", "jump"])
-def test_intervals_of_95_percent_cover(jump: bool, unknown: bool) -> None:
-    """Fit 24 cells of 600 draws; 4 or 5 quantities of each fail in 2e-6 of seeds, and all cells together in as many."""
-    x, m = quiet(), model(jump=jump)
-    unknowns = free(x, sky=0.1) if unknown else None
-    names = ["temperature", "amplitude", "flux 200-320 nm", "flux bolometric", *(["jump"] if jump else [])]
-    columns = [m.names.index(name) for name in names]
-    n, covered = 600, np.zeros(len(columns), np.int64)
-    cells = list(itertools.product((6000.0, 12_000.0, 30_000.0), (10.0, 100.0)))
-    for cell, (kelvin, snr) in enumerate(cells):
-        amplitudes = amplitudes_of(snr, x, m, kelvin, unknowns, 2.0 if jump else 1.0)
-        raw = drawn(x, m.counts(kelvin, amplitudes), n, 28_000 + cell, unknowns)
-        found = fit(raw, x, m, unknowns, levels=(0.95,))
-        truth = np.array(list(m.values(kelvin, amplitudes).values()))
-        inside = ((found.low[0] <= truth) & (truth <= found.high[0]))[:, columns].sum(axis=0)
-        assert_covered(inside, n, 0.94, 0.96)
-        # The goodness of fit is honest, too: a good fit is rejected at 1 % about that often.
-        assert scipy.stats.binom.sf((found.p_value < 0.01).sum() - 1, n, 0.01) > 1e-6
-        covered += inside
-    assert_covered(covered, n * len(cells), 0.94, 0.96)
 
 
 def test_hot_flare_has_a_lower_limit_of_temperature() -> None:
@@ -268,9 +233,9 @@ def test_limits_at_a_bound_have_nominal_coverage() -> None:
 
 
 @pytest.mark.long
-def test_intervals_agree_with_minos_and_emcee() -> None:
-    """Compare the full likelihood with unknown dark and star; emcee's noise is some 3 % of an error against 15 %."""
-    iminuit, emcee = pytest.importorskip("iminuit"), pytest.importorskip("emcee")
+def test_intervals_agree_with_minos() -> None:
+    """Compare the full likelihood with unknown dark and star."""
+    iminuit = pytest.importorskip("iminuit")
     x, m = quiet(), model(jump=True)
     raw = drawn(x, m.counts(9500.0, m.amplitudes(9500.0, 0.5, jump=2.0)), 1, 77)[0]
     found = fit(raw, x, m, free(x))
@@ -298,21 +263,6 @@ def test_intervals_agree_with_minos_and_emcee() -> None:
             error = found.errors[0, place]
             assert abs(found.estimates[0, place] - best) < 0.03 * error
             np.testing.assert_allclose([found.low[k, 0, place], found.high[k, 0, place]], ends, atol=0.05 * error)
-
-    centre, width = np.array(minuit.values), np.array(minuit.errors)
-
-    def log_posterior(theta: np.ndarray) -> float:
-        return -np.inf if theta[0] <= 0 or not 3 < theta[1] < 200 else -0.5 * minus_two_log(theta)
-
-    rng = np.random.RandomState(3)
-    sampler = emcee.EnsembleSampler(20, 5, log_posterior)
-    sampler.random_state = rng.get_state()
-    sampler.run_mcmc(centre + 0.3 * width * rng.standard_normal((20, 5)), 1200)
-    samples = sampler.get_chain(discard=300, flat=True)
-    for place, column, scale in ((1, 0, 1.0), (0, 1, 1e3), (2, 2, 1.0)):
-        low, high = scale * np.quantile(samples[:, column], [0.15865, 0.84135])
-        assert abs((high - low) - (found.high[0, 0, place] - found.low[0, 0, place])) < 0.15 * (high - low)
-        assert abs((high + low) - (found.high[0, 0, place] + found.low[0, 0, place])) / 2 < 0.15 * (high - low)
 
 
 #: Flares whose bolometric flux is near its least, where it bends: library star, V, K, jump.

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from marks import long_but
 from reference import stares as stare_reference
 from refusals import refused
 from scenes import NEAR, instrument, star
@@ -217,7 +216,6 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, 
 
 
 def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
-    """Return components, stare, flares of each stare, amplitudes and further arguments."""
     payload, wobble, n_sums, n_flares, n_scenarios, more = CASES[name]
     options = {"output_min_nm": 300.0, "output_max_nm": 312.0} | payload
     used = instrument(options.pop("name", "mauvesim"), **options)
@@ -232,15 +230,15 @@ def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
     return Components.of(quiet, flares, weights), stare, flare, amplitudes, more
 
 
-@pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
+@pytest.fixture(scope="module", params=["vectors", "scalar"])
 def any_stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
     """Return stares with vectors, as on processors, and with one stare or frame per work-item, as on a GPU."""
     return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles", "neighbours", "pointing drifts"))
-@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("method", METHODS)
 def test_stares_equal_the_reference(any_stares: Stares, name: str, method: Any) -> None:
     components, stare, flare, amplitudes, more = case(name)
     if more and method == "cumulants":
@@ -260,7 +258,7 @@ def test_stares_equal_the_reference(any_stares: Stares, name: str, method: Any) 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+@pytest.mark.parametrize("method", METHODS)
 def test_splitting_changes_no_bit(engine: Engine, method: Any) -> None:
     """Check that stares depend on seed and number alone, and frames on their time, however calls are divided."""
     components, stare, flare, amplitudes, _ = case("electrons")
@@ -296,7 +294,7 @@ class Beside:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", ["plain", "all that wobbles", "unknown alone"])
 def test_sums_for_flares_equal_the_reference(any_stares: Stares, name: str, method: Any) -> None:
     """Check their own normals and the light of the frames, for any share of drawn stares."""

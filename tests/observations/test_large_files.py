@@ -1,5 +1,6 @@
 """Files larger than memory are read in pieces, in a process whose address space is limited."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,75 +13,78 @@ from processes import python
 from mauvecl import read_frames
 from mauvecl.observations import frame_files
 
-FRAMES, PIXELS = 65_536, 1024
-#: The address space may grow by this while a file of 256 MiB is read.
-MARGIN_MIB = 96
-#: Light of a frame above that of its pixel.
-PATTERN = np.arange(FRAMES) * 7919 % 101
+#: The address space may grow by this while a file is read, of which at most the other is read at once.
+MARGIN_MIB, CONTENT_MIB = 96, 16
 #: A process that reads `path`, whose address space is limited after its imports and a first, small file.
-CHILD = """
-import resource, sys
+CHILD = f"""
+import json, resource, sys
 import astropy.io.fits, astropy.table, astropy.time, scipy.special
 import numpy as np
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.frame_files import read_frames, reduce_frames
 # OpenBLAS reserves address space at the first large product; reading does not need it.
 np.ones((300, 300)) @ np.ones((300, 300))
-path, out = sys.argv[1:]
-{first}
+small, path, out, mapping = sys.argv[1:]
+mapping = FrameMapping(**json.loads(mapping))
+weights = np.zeros((2, read_frames(small, mapping).wavelength_nm.size)); weights[0, 3] = 1.0; weights[1, :2] = 1.0
 pages = int(open("/proc/self/statm").read().split()[0])
-limit = pages * resource.getpagesize() + {margin} * 2**20
+limit = pages * resource.getpagesize() + {MARGIN_MIB} * 2**20
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-{then}
-print(*frames.remarks, sep=chr(10), file=sys.stderr)
-np.savez(out, white=frames.flux, **found)
-"""
-#: Reads all that an image or a table has.
-REDUCE = """
-mapping = FrameMapping(time="TIME", time_unit="s", flux="FLUX", wavelength="WAVES", wavelength_unit="nm", exposure_s=5)
 frames = read_frames(path, mapping)
-weights = np.zeros((2, 1024)); weights[0, 3] = 1.0; weights[1, :2] = 1.0
 reduced = reduce_frames(path, weights, mapping)
 one, two = (curve.flux for curve in reduced.light_curves)
-found = dict(one=one, two=two, mean=reduced.pixels.mean, scatter=reduced.pixels.scatter)
+print(*frames.remarks, sep=chr(10), file=sys.stderr)
+np.savez(out, time=frames.time_s, white=frames.flux, one=one, two=two, mean=reduced.pixels.mean,
+         scatter=reduced.pixels.scatter)
 """
+FITS = {"time": "TIME", "time_unit": "s", "flux": "FLUX", "wavelength": "WAVES", "wavelength_unit": "nm"}
+CSV = {"time": "time", "flux": "flux_*", "wavelength": "names", "wavelength_unit": "nm"}
 
 
-def _in_pieces(path: Path, margin: int, content_mib: int, then: str, first: str = "") -> tuple[Any, str]:
-    """Read a large file in a process with little memory, remove it, and return what is found and said."""
-    assert path.stat().st_size > margin * 2**20
-    out = path.with_suffix(".npz")
-    limits = {"MAUVECL_LARGEST_CONTENT_MIB": str(content_mib), "OPENBLAS_NUM_THREADS": "1"}
-    done = python(CHILD.format(margin=margin, first=first, then=then), path, out, **limits)
-    path.unlink()
-    return np.load(out), done.stderr
-
-
-LINUX = pytest.mark.skipif(
-    not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it"
-)
-
-
-@LINUX
-@pytest.mark.long
-@pytest.mark.parametrize("in_table", [False, True])
-def test_a_file_larger_than_memory_is_reduced_in_pieces(in_table: bool, tmp_path: Path) -> None:
-    """Read light of 256 MiB, an image or a spectrum in each row of a table, with its times and wavelengths."""
-    path, pixel, times = tmp_path / "large.fits", np.arange(PIXELS), np.arange(FRAMES) * 5.0
-    light = (PATTERN[:, None] + pixel).astype(np.float32)
-    hdus = [fits.ImageHDU(light, name="FLUX"), fits.ImageHDU(times, name="TIME")]
-    if in_table:
-        columns = [fits.Column("TIME", "D", array=times), fits.Column("FLUX", f"{PIXELS}E", array=light)]
+def write(path: Path, light: np.ndarray, form: str) -> None:
+    """Write frames of 5 s with their times and wavelengths: an image, or a spectrum in each row of a table."""
+    n, pixels = light.shape
+    if form == "csv":
+        start = np.datetime64("2026-03-01T00:00:00")
+        with path.open("w") as file:
+            file.write(",".join(["time", *(f"flux_{200 + k}" for k in range(pixels))]) + "\n")
+            for row, values in enumerate(light):
+                file.write(f"{start + np.timedelta64(5 * row, 's')},{','.join(map(str, values.tolist()))}\n")
+        return
+    flux, times = light.astype(np.float32), np.arange(n) * 5.0
+    hdus = [fits.ImageHDU(flux, name="FLUX"), fits.ImageHDU(times, name="TIME")]
+    if form == "table":
+        columns = [fits.Column("TIME", "D", array=times), fits.Column("FLUX", f"{pixels}E", array=flux)]
         hdus = [fits.BinTableHDU.from_columns(columns)]
-    fits.HDUList([fits.PrimaryHDU(), *hdus, fits.ImageHDU(pixel + 200.0, name="WAVES")]).writeto(path)
-    assert path.stat().st_size > 2.5 * MARGIN_MIB * 2**20
-    found, said = _in_pieces(path, MARGIN_MIB, 32, REDUCE)
-    assert "they were summed over wavelength while they were read" in said
-    np.testing.assert_allclose(found["white"], PIXELS * PATTERN + pixel.sum())
-    np.testing.assert_allclose(found["one"], PATTERN + 3)
-    np.testing.assert_allclose(found["two"], 2 * PATTERN + 1)
-    np.testing.assert_allclose(found["mean"], PATTERN.mean() + pixel)
-    np.testing.assert_allclose(found["scatter"], np.sqrt((np.diff(PATTERN) ** 2).mean() / 2))
+    waves = fits.ImageHDU(np.arange(pixels) + 200.0, name="WAVES")
+    fits.HDUList([fits.PrimaryHDU(), *hdus, waves]).writeto(path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("form", "n", "pixels", "mapping"),
+    [("image", 65_536, 1024, FITS), ("table", 65_536, 1024, FITS), ("csv", 44_000, 512, CSV)],
+)
+def test_a_file_larger_than_memory_is_read_in_pieces(
+    form: str, n: int, pixels: int, mapping: dict[str, str], tmp_path: Path
+) -> None:
+    small, path, out = tmp_path / f"small.{form}", tmp_path / f"large.{form}", tmp_path / "found.npz"
+    pattern, pixel = np.arange(n) * 7919 % 101, np.arange(pixels)
+    for file, rows in ((small, pattern[:30]), (path, pattern)):
+        write(file, rows[:, None] + pixel, form)
+    assert path.stat().st_size > (0.8 if form == "csv" else 2.5) * MARGIN_MIB * 2**20
+    limits = {"MAUVECL_LARGEST_CONTENT_MIB": str(CONTENT_MIB), "OPENBLAS_NUM_THREADS": "1"}
+    done = python(CHILD, small, path, out, json.dumps(mapping), **limits)
+    path.unlink()
+    found = np.load(out)
+    assert "they were summed over wavelength while they were read" in done.stderr
+    np.testing.assert_allclose(found["time"], np.arange(n) * 5.0, atol=1e-3)
+    np.testing.assert_allclose(found["white"], pixels * pattern + pixel.sum())
+    np.testing.assert_allclose(found["one"], pattern + 3)
+    np.testing.assert_allclose(found["two"], 2 * pattern + 1)
+    np.testing.assert_allclose(found["mean"], pattern.mean() + pixel)
+    np.testing.assert_allclose(found["scatter"], np.sqrt((np.diff(pattern) ** 2).mean() / 2))
 
 
 @pytest.mark.long
@@ -112,23 +116,3 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     steps = np.diff(np.where(np.arange(1500)[:, None] == 7, np.nan, flux), axis=0)
     np.testing.assert_allclose(pixels.scatter[6:], np.sqrt(np.nanmean(steps[:, 6:] ** 2, axis=0) / 2))
     np.testing.assert_allclose(pixels.stated[6:], np.sqrt((np.delete(error, 7, axis=0)[:, 6:] ** 2).mean(axis=0)))
-
-
-@LINUX
-@pytest.mark.long
-def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
-    """Read a table with a date and 512 columns of light in each row."""
-    n, path, small = 44_000, tmp_path / "large.csv", tmp_path / "small.csv"
-    start, pixel = np.datetime64("2026-03-01T00:00:00"), np.arange(512)
-    with path.open("w") as file:
-        file.write(",".join(["time", *(f"flux_{200 + k}" for k in pixel)]) + "\n")
-        for row in range(n):
-            light = ",".join(map(str, (PATTERN[row] + pixel).tolist()))
-            file.write(f"{start + np.timedelta64(5 * row, 's')},{light}\n")
-    small.write_text("time,flux_200\n" + "\n".join(f"{k},1" for k in range(30)) + "\n")
-    how = 'how = dict(time="time", flux="flux_*", wavelength="names", wavelength_unit="nm")\n'
-    first = f'{how}read_frames({str(small)!r}, FrameMapping(time_unit="s", **how))'
-    then = "frames = read_frames(path, FrameMapping(**how))\nfound = dict(time=frames.time_s)"
-    found, _ = _in_pieces(path, 80, 16, then, first)
-    np.testing.assert_allclose(found["white"], 512 * PATTERN[:n] + pixel.sum())
-    np.testing.assert_allclose(found["time"], np.arange(n) * 5.0, atol=1e-3)

@@ -150,7 +150,7 @@ def test_flares_on_sharp_rotation_in_long_frames_are_detected(seed: int) -> None
 
 @pytest.mark.long
 def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
-    """Observe eclipses of 12 and 5 %, which are left out, or a message says that there are no verdicts; five flares."""
+    """Observe eclipses of 12 and 5 % and five flares: a message says that there are no verdicts."""
     rng, frame_s, noise = np.random.default_rng([502, 1]), 120.0, 5e-4
     time = np.arange(int(5.0 * 86_400 / frame_s)) * frame_s
     period, spots = 1.37 * 86_400, rng.uniform(0.01, 0.03)
@@ -160,27 +160,19 @@ def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
     for middle, size in ((0.25, 0.12), (0.75, 0.05)):
         depth += size * np.clip(1.3 * (1 - np.abs(phase - middle) / 0.05), 0, 1)
     light = (1 + spots * (np.sin(turn) + rng.uniform(0, 0.7) * np.sin(2 * turn + 1))) * (1 - depth)
-    peaks = [float(one) for one in rng.uniform(0.03, 0.97, 5) * time[-1]]
-    for size, peak in zip(np.geomspace(0.008, 0.15, 5), peaks, strict=True):
+    for size, peak in zip(np.geomspace(0.008, 0.15, 5), rng.uniform(0.03, 0.97, 5) * time[-1], strict=True):
         light += size * flare(time, frame_s, peak, rng.uniform(200, 1000))
     answer = analyse(Study().paper(), frames=noisy(rng, time, light, noise, exposure_s=frame_s))
     searched = np.array(answer.frames["reason"]) == ""
     assert searched[depth < 1e-9].mean() > 0.9
-    events = answer.events[answer.events["verdict"] == "detected"]
-    if searched[depth > 0.005].mean() > 0.05:
-        assert answer.analysis.crowded
-        assert not len(events)
-        assert any("eclipses" in message and "no verdicts" in message for message in answer.messages)
-    start, stop = (events[name].to_value("s") - 600 for name in ("tstart", "tstop"))
-    # A flare in an eclipse may be seen by its tail.
-    for first, last in zip(start, stop, strict=True):
-        assert any(first < peak + 1200 and peak < last for peak in peaks)
-    assert (events["ed_rec"] > 0).all()
+    assert answer.analysis.crowded
+    assert "detected" not in set(answer.events["verdict"])
+    assert any("eclipses" in message and "no verdicts" in message for message in answer.messages)
 
 
 @pytest.mark.long
 def test_dips_at_random_are_no_flares() -> None:
-    """Observe dips of 2 to 30 %; where most frames are in events, none has a verdict, and a message says what to do."""
+    """Observe dips of 2 to 30 %; a message says what to do only where most frames are in events."""
     rng, frame_s = np.random.default_rng([503, 2]), 1800.0
     time = np.arange(1200) * frame_s
     flux = np.ones(time.size)
@@ -190,8 +182,6 @@ def test_dips_at_random_are_no_flares() -> None:
     assert "detected" not in set(answer.events["verdict"])
     messages = [one for one in answer.messages if "no verdicts" in one and "mapping" in one]
     assert len(messages) == int(answer.analysis.in_events > 0.5)
-    if messages:
-        assert set(answer.events["verdict"]) == {"undecided"}
 
 
 @pytest.mark.long

@@ -11,7 +11,10 @@ from scenes import paper
 from scipy.stats import binom, chi2
 
 from mauvecl import Event, Study, stare
+from mauvecl.answers.inject import survey_star
 from mauvecl.search import false_alarms
+from mauvecl.search.flare_fits import SummedStare
+from mauvecl.study.cases import Case
 
 #: One false alarm in a star-month is at 4.9.
 FAINT: tuple[str, ...] = ('star=[{library="M3V", magnitude=9}]',)
@@ -26,8 +29,7 @@ def one_threshold_per_star() -> Iterator[None]:
 
     def sampled_once(survey: Any, seed: int) -> Any:
         name = survey.components.quiet.name
-        if name not in rates:
-            rates[name] = sampled(survey, seed)
+        rates[name] = rates.get(name) or sampled(survey, seed)
         return rates[name]
 
     with pytest.MonkeyPatch.context() as patch:
@@ -134,3 +136,16 @@ def test_intervals_cover() -> None:
     assert (binom.cdf(held, seen, 0.65) > 1e-3).all(), (held, seen)
     assert (binom.sf(held - 1, seen, 0.75) > 1e-3).all(), (held, seen)
     assert (squares.sum(axis=0) < chi2.isf(1e-3, seen)).all(), pulls
+
+
+#: Two overlapping flares: log amplitude, peak time, log half-width and log temperature.
+FLARES = np.array([[-1.2, 2000.0, np.log(60.0), np.log(9000.0)], [-1.6, 2150.0, np.log(90.0), np.log(11_000.0)]])
+
+
+@pytest.mark.parametrize("others", [FLARES[:0], FLARES[1:]], ids=["alone", "next to another"])
+def test_light_of_a_block_counts_once(others: np.ndarray) -> None:
+    """A fit to sums without noise returns the flare; the light of others, and no other light, is subtracted."""
+    survey = survey_star(Case(paper(*FAINT)))
+    dark = SummedStare(survey, np.zeros((survey.stare.n_frames, 3)))
+    light = SummedStare(survey, dark.light(np.vstack([FLARES[:1], others])))
+    assert light.block(FLARES[:1], others).fit(FLARES[:1] + 0.02).theta == pytest.approx(FLARES[:1], rel=1e-6)

@@ -90,6 +90,7 @@ def test_largest_value_of_a_day():
         spread = 4 * np.sqrt(days * q * (1 - q))
         assert np.sum(largest < value + 0.02) > days * q - spread
         assert np.sum(largest < value - 0.02) < days * q + spread
+    assert completeness.search_threshold(np.log(2), EIGHT) == pytest.approx(3.73, abs=0.05)
     # The share below a value is (1 - Q)^(17280 N).
     tests = np.log(np.mean(largest < 3.9)) / np.log1p(-special.ndtr(-3.9)) / 17280
     assert 0.38 < tests < 0.55
@@ -117,13 +118,14 @@ def test_repeated_estimates_scatter_by_their_errors():
 
 def test_rate_of_one_filter_equals_the_closed_form():
     """Compare independent frames with P = 1 - (1 - Q)^n."""
-    stare = Stare.of(500.0)
-    search = Search(templates.Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
-    tail = false_alarms.sample_rate(search, seed=1, draws=50)
+    alone = templates.Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN)
+    tail = false_alarms.sample_rate(Search(alone, Stare.of(500.0)), seed=1, draws=50)
     # Both phases of a template see its one frame: they are the same filter.
     exact = -np.expm1(100 * np.log1p(-special.ndtr(-tail.thresholds)))
     kept = tail.thresholds >= 4.5
     assert tail.probability[kept] == pytest.approx(exact[kept], rel=2e-3)
+    for sigma in (4.5, 5.0, 6.0):
+        assert completeness.search_threshold(17_280 * special.ndtr(-sigma), alone) == pytest.approx(sigma, abs=1e-3)
 
 
 def test_threshold_inverts_the_rate():
@@ -146,11 +148,3 @@ def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
     for asked in (1.0, 1e-2, 1e-4, 1e-7, 1e-10):
         log_rate, error = tail.log_rate(completeness.search_threshold(asked, bank))
         assert -0.1 - 4 * error < log_rate - np.log(asked) < 4 * error
-
-
-def test_closed_form_of_the_rate_has_known_values():
-    """Eight filters a factor of two apart have a median of 3.73 a day (TIME.md), one of a frame 1 - (1 - Q)^n."""
-    assert completeness.search_threshold(np.log(2), EIGHT) == pytest.approx(3.73, abs=0.05)
-    alone = templates.Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN)
-    for sigma in (4.5, 5.0, 6.0):
-        assert completeness.search_threshold(17_280 * special.ndtr(-sigma), alone) == pytest.approx(sigma, abs=1e-3)
