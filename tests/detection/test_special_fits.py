@@ -259,7 +259,6 @@ def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> 
     assert stats.binom.sf(rejected - 1, 400, 0.01) > 1e-6
 
 
-@pytest.mark.long
 def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engine) -> None:
     """Fit a blackbody of 9000 K: the second temperature has no limit, and none where a second area fits no better."""
     x, one, m = scene("M3V", 9.0, 0.5, 9000.0, distance_pc=5.0)
