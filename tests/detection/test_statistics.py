@@ -7,7 +7,7 @@ from scenes import instrument, star
 from scipy import optimize, stats
 from scipy.ndimage import gaussian_filter1d
 
-from mauvecl import Expectation, Instrument, Sky, Source, expect
+from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
 from mauvecl.detection import chi2, distributions
 
 
@@ -145,6 +145,12 @@ def test_bands_hold_the_rows(chunk: int, changes: dict) -> None:
         window = np.append(window[count:], np.zeros(count))
     assert len(out) == len(smoothing.rows)
     np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
+
+
+def test_comparison_is_read_from_words() -> None:
+    assert Comparison.of("stack:5", "estimated") == Comparison(5, True)
+    assert Comparison.of("exposure").added_variance == 1.0
+    assert Comparison.of().plain
 
 
 #: Of the chi-squared statistic here.

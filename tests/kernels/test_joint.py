@@ -76,15 +76,9 @@ BOUNDS = [(np.log10(1.5), 1.5), (-1.0, 1.0), (-2.5, 3.3), (0.0, 1.0), (-4.5, 3.3
 def pixel_at(point: np.ndarray) -> Expectation:
     """Return a pixel of any noise: Gaussian over Poisson step, gain, dark, its unit, light, and phase within a DN."""
     over, gain, dark, _, light, _ = 10.0**point
-    electrons = point[3] > 0.5
-    read = over * (gain if electrons else max(1.0, gain))
-    x = one_frame(
-        dark * (gain if electrons else 1.0),
-        light if point[4] > -4 else 0.0,
-        read,
-        gain=gain,
-        unit="electrons" if electrons else "DN",
-    )
+    unit, step = ("electrons", gain) if point[3] > 0.5 else ("DN", 1.0)
+    light = light if point[4] > -4 else 0.0
+    x = one_frame(dark * step, light, over * max(step, gain), gain=gain, unit=unit)
     return replace(x, bias_dn=3000.0 + point[5] * np.ones(8))
 
 
