@@ -169,7 +169,7 @@ MUTATIONS: dict[str, Mutation] = {
         SWAPPED,
     ),
     "rounded normal for the dark": (
-        "test_pearson_of_draws",
+        "test_pearson_of_raw_counts[payload-apart]",
         ("nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
         (
             'nearest(fma(z, fma(z, curve, source["slope"]), source["offset"]))',
@@ -193,7 +193,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("345 * fourth**2", "34.5 * fourth**2"),
     ),
     "rounding taken for noise everywhere": (
-        "test_auto_mode_stacks_only_where_moments_agree",
+        "test_worst_allowed_stack_is_indistinguishable_from_frames",
         ("return ~is_noticeable(loss, n * frame)", "return frame > 0"),
     ),
     "fifth cumulants of varying dark forgotten": (

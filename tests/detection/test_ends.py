@@ -15,7 +15,8 @@ from scipy import stats
 from mauvecl import Comparison, CosmicRays, Detection, Engine, Expectation, Linear, Normal, Processes, Uniform
 
 N, FAP = 4000, 0.05
-SEED = 14
+#: The first realisation.
+START = 70
 
 
 def study(number: int) -> tuple[list[Expectation], dict]:
@@ -116,19 +117,23 @@ def check_distribution(d: Any, exact: Sorted) -> None:
 @pytest.mark.parametrize("number", long_but(range(8), 0, 1))
 def test_numbers_equal_those_of_sorting(engine: Engine, number: int) -> None:
     (quiet, *flares), how = study(number)
-    found = engine.detect(quiet, flares, realisations=N, seed=SEED, **how)
-    values = engine.statistic_values(quiet, flares, count=N, seed=SEED, **how)
+    found = engine.detect(quiet, flares, realisations=N, seed=14, start=START, **how)
+    values = engine.statistic_values(quiet, flares, count=N, seed=14, start=START, **how)
     rows = rows_of(found.statistics, len(flares))
     for statistic in found.statistics:
         for k in range(len(flares)):
             shaped = k if (statistic, 0, k) in rows else 0
             null, flare = found.closed_form(statistic, template=k), found.closed_form(statistic, k)
-            quiet_values = Sorted(values[rows[statistic, 0, shaped]], null.std, null.mean)
-            own = Sorted(values[rows[statistic, k + 1, shaped]], flare.std, flare.mean)
-            on_null = Sorted(values[rows[statistic, k + 1, shaped]], null.std, null.mean)
+            of_quiet, of_flare = (values[rows[statistic, scenario, shaped]] for scenario in (0, k + 1))
+            quiet_values, own = Sorted(of_quiet, null.std, null.mean), Sorted(of_flare, flare.std, flare.mean)
+            on_null = Sorted(of_flare, null.std, null.mean)
             check_distribution(found.distribution(statistic, template=k), quiet_values)
             check_distribution(found.distribution(statistic, k), own)
             check_answers(found, statistic, k, quiet_values, on_null)
+            largest, smallest = found.tail_samples(statistic, template=k), found.tail_samples(statistic, k)
+            for tail, exact in ((largest, quiet_values.values[::-1]), (smallest, own.values)):
+                np.testing.assert_array_equal(tail["value"], exact[:1000])
+            np.testing.assert_array_equal(of_quiet[largest["realisation"] - START], largest["value"])
 
 
 def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare: Sorted) -> None:
@@ -140,6 +145,12 @@ def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare:
         assert exact - null.slack <= edge <= exact + null.bin(exact)
     back = found.false_alarm_probability(cut.value, statistic, template=k)
     assert abs(round(back.value * N) - null.at_or_above(cut.value)) <= null.close(cut.value)
+    for value in (null.values[0] - null.sigma, null.values.mean(), cut.value, null.values[-1] + null.sigma):
+        back = found.false_alarm_probability(value, statistic, template=k)
+        # A threshold within a bin of the histogram shares its values out.
+        above = round(back.value * N, 6)
+        few, many = (stats.binomtest(int(count), N).proportion_ci() for count in (np.floor(above), np.ceil(above)))
+        assert (back.low, back.high) == pytest.approx((few.low, many.high), rel=1e-9)
     p = found.detection_probability(FAP, statistic)[k]
     assert abs(round(p.value * N) - flare.at_or_above(cut.value)) <= flare.close(cut.value)
     assert p.low <= p.value <= p.high

@@ -159,22 +159,6 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
     assert (*sums[0], outside[0]) == (*found.sums[:2], values.size - inside.size)
 
 
-@pytest.mark.long
-def test_neighbours_are_uncorrelated(engine: Engine) -> None:
-    """Neighbours in pixel, realisation, seed and frame: |z| < 5 for sums of 3e7 products."""
-    (x,) = star(exposure=5.0)
-
-    def drawn(seed: int, frame: int = 0) -> np.ndarray:
-        raw = engine.realise(x, count=20_000, seed=seed, first_frame=frame)
-        return (raw - x.mean_raw_dn) / np.sqrt(x.variance_dn2)
-
-    z, y, second, last = drawn(9), drawn(10), drawn(9, 1), drawn(9, 2**32 - 1)
-    within = [(z[:, 1:], z[:, :-1]), (z[:, 2:], z[:, :-2]), (z[1:], z[:-1]), (z[16:], z[:-16])]
-    for a, b in (*within, (z, y), (z, second), (z, last), (second, last)):
-        products = a * b
-        assert abs(products.sum()) < 5 * np.sqrt(products.size)
-
-
 @pytest.mark.parametrize("tile", [16, 64, 4096])
 def test_tile_size_does_not_affect_results(engine: Engine, tile: int) -> None:
     (quiet, *flares), _ = case("stack")

@@ -76,15 +76,9 @@ BOUNDS = [(np.log10(1.5), 1.5), (-1.0, 1.0), (-2.5, 3.3), (0.0, 1.0), (-4.5, 3.3
 def pixel_at(point: np.ndarray) -> Expectation:
     """Return a pixel of any noise: Gaussian over Poisson step, gain, dark, its unit, light, and phase within a DN."""
     over, gain, dark, _, light, _ = 10.0**point
-    electrons = point[3] > 0.5
-    read = over * (gain if electrons else max(1.0, gain))
-    x = one_frame(
-        dark * (gain if electrons else 1.0),
-        light if point[4] > -4 else 0.0,
-        read,
-        gain=gain,
-        unit="electrons" if electrons else "DN",
-    )
+    unit, step = ("electrons", gain) if point[3] > 0.5 else ("DN", 1.0)
+    light = light if point[4] > -4 else 0.0
+    x = one_frame(dark * step, light, over * max(step, gain), gain=gain, unit=unit)
     return replace(x, bias_dn=3000.0 + point[5] * np.ones(8))
 
 
@@ -122,25 +116,18 @@ def test_worst_draws_that_the_region_allows(what: str, varying: bool) -> None:
 
 def test_noise_that_is_not_smooth_is_drawn_separately() -> None:
     """Include noise whose skewness alone is too large, and steps of counts that nothing smooths."""
-    for dark, photons, read in ((2225.0, 0.0, 1.4), (2.0, 0.0, 1.0), (0.0, 9.0, 0.5), (500.0, 0.0, 3.0)):
-        assert not prepare([one_frame(dark, photons, read)]).joint
+    # Of the first gamma_3 is small, but 2e9 draws show a tail off by a fifth.
+    rough = ((0.14, 0.0, 1.5), (2225.0, 0.0, 1.4), (2.0, 0.0, 1.0), (0.0, 9.0, 0.5), (500.0, 0.0, 3.0))
+    for dark, photons, read in rough:
+        x = one_frame(dark, photons, read)
+        assert not prepare([x]).joint
+        with refused("recipe", "'joint'"):
+            prepare([x], recipe="joint")
+    with refused("qe_scale"):
+        prepare([one_frame(0.14, 0.0, 1.5)], processes=Processes(qe_scale=Uniform(0.9, 1.1)))
     # Rounding alone, or Gaussian photons alone, need no Poisson steps smoothed.
     assert prepare([one_frame(0.0, 500.0, 0.0, photon_noise="gaussian")]).joint
     assert prepare([one_frame(0.0, 0.0, 0.0)]).joint
-
-
-def test_smallest_poisson_means() -> None:
-    """Check 1.5 DN of noise with .14 counts, where gamma_3 is small but 2e9 draws show a tail off by a fifth."""
-    x = one_frame(0.14, 0.0, 1.5)
-    sd, shape = exact.expansion(*exact.noise_of(x))
-    p, q = exact.of_stack(x), exact.of_polynomial(shape, sd, float(x.mean_raw_dn[0]), *exact.span(x))
-    assert exact.draws_to_tell(p, q) < 5e9
-    assert exact.worst_tail(p, q) > 0.1
-    assert not prepare([x]).joint
-    with refused("recipe", "'joint'"):
-        prepare([x], recipe="joint")
-    with refused("qe_scale"):
-        prepare([x], processes=Processes(qe_scale=Uniform(0.9, 1.1)))
 
 
 @pytest.mark.parametrize("photon_noise", ["gaussian", "poisson"])

@@ -27,8 +27,6 @@ SCENES = {
     "priors": (detector(2225.0, 0.0, read=12.0), {"processes": Processes(qe_scale=Normal(1.0, 0.1, 0.5, 1.5))}),
     "tables": (detector(30.0 + np.arange(64), 60.0, photon_noise="poisson"), {}),
     "expansion": (detector(1500.0 + np.arange(64), 2000.0, photon_noise="poisson"), {}),
-    "dark by every mixture": (detector(MIXED, 0.0), {}),
-    "photons by every mixture": (detector(0.0, MIXED, photon_noise="poisson"), {}),
     "both by every mixture": (detector(MIXED, MIXED[::-1], photon_noise="poisson"), {"recipe": "apart"}),
     "cosmic rays": (
         detector(MIXED, 0.0),

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from marks import long_but
 from processes import python
 from scenes import instrument, star
 from scipy import integrate, stats
@@ -122,13 +121,10 @@ def test_charge_has_moments_of_compound_poisson_sum() -> None:
     assert weighted[3] < 1e-15 < weighted[2] < weighted[4]
 
 
-def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
+def test_prior_of_one_value_is_no_prior(engine: Engine) -> None:
     (x,) = star(exposure=5.0)
     clean = engine.realise(x, count=200, seed=4)
-    # Hits only: pixels without one are as they were.
-    hit = engine.realise(x, count=200, seed=4, processes=Processes(cosmic_rays=CosmicRays()))
-    assert np.mean(hit != clean) < 1e-3
-    # A prior of one value is no prior, but for the rounding of its arithmetic.
+    # But for the rounding of its arithmetic.
     same = Processes(light_loss=Uniform(0.34, 0.34), detector_temperature=Uniform(21.0, 21.0))
     still = engine.realise(x, count=200, seed=4, processes=same)
     assert np.mean(still != clean) < 1e-3
@@ -159,15 +155,12 @@ def test_components_have_correct_sum_and_moments(engine: Engine, name: str, reci
         "dark": n * x.dark_variance_dn2,
         "read_noise": n * x.read_noise_dn**2 + (n - 1) / 12,
     }
-    for part, variance in variances.items():
-        mean = n * x.dark_dn if part == "dark" else 0.0
-        z = (table[part].value - mean) / np.sqrt(variance)
-        assert abs(z.mean()) < 5 / np.sqrt(size)
-        assert abs(z.var() - 1) < 5 * np.sqrt(2 / size)
+    mean = {"dark": n * x.dark_dn}
+    z = np.array([(table[part].value - mean.get(part, 0.0)) / np.sqrt(own) for part, own in variances.items()])
+    assert np.abs(z.mean(axis=1)).max() < 5 / np.sqrt(size)
+    assert np.abs(z.var(axis=1) - 1).max() < 5 * np.sqrt(2 / size)
     # Independent of each other, as they were before they were added.
-    z = [table[p].value - (n * x.dark_dn if p == "dark" else 0.0) for p in variances]
-    for a, b in ((0, 1), (0, 2), (1, 2)):
-        assert abs(np.corrcoef(z[a], z[b])[0, 1]) < 5 / np.sqrt(size)
+    assert np.abs(np.corrcoef(z)[np.triu_indices(3, 1)]).max() < 5 / np.sqrt(size)
     steps = table["dark"].value / x.dark_step_dn
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
 
@@ -213,11 +206,10 @@ def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
                     reference.words_at(index, block, "jitter", 0, 1, exposure)
         counters = np.concatenate(seen)
         assert len(np.unique(counters, axis=0)) == len(counters)
-    # Streams of both exposures are distinct bytes, and the groups of the largest detector fit below them.
+    # Streams of both exposures are distinct bytes.
     streams = [s + e for s in layout.STREAMS.values() for e in (0, layout.REFERENCE)]
     assert len(set(streams)) == len(streams)
     assert max(streams) < 256
-    assert 65_536 // 4 <= 2**24
 
 
 @pytest.mark.parametrize("level", [Uniform(0.5, 1.5), Uniform(0.2, 9.0)])
@@ -285,20 +277,18 @@ TOY = """
 import json, sys
 from typing import ClassVar
 import numpy as np
+from scipy import stats
 import mauvecl.noise.disturbances as additive
 
 class Bursts(additive.AdditiveProcess):
-    "Bursts of the dark current: a Poisson number of bursts with exponentially distributed electrons."
+    "Bursts of the dark current: a Poisson number of bursts of 300 electrons."
     stream: ClassVar[int] = 40
     label: ClassVar[str] = "bursts"
     per_s: float = 0.02
-    mean_electrons: float = 300.0
     def charge(self, seconds):
-        size = 1 << 15
-        one = np.exp(-np.arange(size) / self.mean_electrons)
-        one[0] = 0.0
-        spectrum = np.exp(self.per_s * seconds * (np.fft.rfft(one / one.sum()) - 1.0))
-        return np.maximum(np.fft.irfft(spectrum, size), 0.0)[: self.most_electrons(seconds) + 1]
+        charge = np.zeros(self.most_electrons(seconds) + 1)
+        charge[::300] = stats.poisson.pmf(np.arange(41), self.per_s * seconds)
+        return charge
     def most_electrons(self, seconds):
         return 12_000
 
@@ -361,59 +351,26 @@ def test_another_process_needs_its_class_and_row_only() -> None:
     assert "bursts" not in layout.STREAMS
 
 
-#: Three statistical tests of 4.5 sigma and KS tests at 1e-5: about one run in 10 000 fails by chance. Seeds were fixed
-#: before the first run.
-SIGMA, LEAST_P, SEED = 4.5, 1e-5, 11
+SEED = 11
 DRIFTS = Study().with_settings(["stare.pointing={rate_per_h=6.0, duration_s=200.0, depth=0.8}"]).stare.pointing
 drifts, losses = (partial(function, DRIFTS) for function in (reference.pointing_drifts, reference.pointing_losses))
-WAIT_S = 600.0
-NUMBERS = np.arange(20_000, dtype=np.uint64)
+NUMBERS = np.arange(4000, dtype=np.uint64)
 
 
 def test_waits_durations_and_depths_have_their_distributions() -> None:
-    start, lasts, depth = drifts(NUMBERS[:4000], 5000.0, SEED)
-    assert (start[:, -1] >= 5000.0).all()
-    ends = np.column_stack([np.zeros(4000), (start + lasts)[:, :-1]])
-    waits = start - ends
+    """Use KS tests at 1e-5 and ranks at 4.5 sigma: one run in 7000 fails by chance; the seed was fixed beforehand."""
+    start, lasts, depth = drifts(NUMBERS, 20_000.0, SEED)
+    assert (start[:, -1] >= 20_000.0).all()
+    waits = start - np.column_stack([np.zeros(NUMBERS.size), (start + lasts)[:, :-1]])
     assert (waits > 0).all()
     # Drawn up to a fixed number of drifts, and so without the bias of a fixed time.
-    for values, law in (
-        (waits[:, :8], stats.expon(scale=WAIT_S)),
-        (lasts[:, :8], stats.expon(scale=200.0)),
-        (depth[:, :8], stats.uniform(0.0, 0.8)),
-    ):
-        assert stats.kstest(values.ravel(), law.cdf).pvalue > LEAST_P
-    # Nothing is related to anything else.
-    table = np.column_stack([waits[:, 0], waits[:, 1], lasts[:, 0], lasts[:, 1], depth[:, 0], depth[:, 1]])
+    laws = (stats.expon(scale=600.0), stats.expon(scale=200.0), stats.uniform(0.0, 0.8))
+    for values, law in zip((waits, lasts, depth), laws, strict=True):
+        assert stats.kstest(values[:, :8].ravel(), law.cdf).pvalue > 1e-5
+    # Nothing is related to anything else, such as drifts of the second group that are drawn together to the first.
+    table = np.column_stack([waits[:, [0, reference.DRIFTS_AT_ONCE]], lasts[:, :2], depth[:, :2]])
     rank = stats.spearmanr(table).statistic[np.triu_indices(6, 1)]
-    assert np.abs(rank).max() * np.sqrt(4000) < SIGMA
-
-
-@pytest.mark.parametrize(
-    ("time_s", "later_s"), long_but([(50.0, 100.0), (500.0, 30.0), (3000.0, 300.0)], (3000.0, 300.0))
-)
-def test_occupation_and_its_correlation_in_time(time_s: float, later_s: float) -> None:
-    """P(drift at t) and P(drift at t and t + h) follow in closed form."""
-    at = np.array([time_s, time_s + later_s])
-    lost = losses(NUMBERS, at, 1e-6, SEED) > 0
-    # A Markov chain of two states, first without a drift.
-    n, share, rates = len(NUMBERS), 200.0 / (200.0 + WAIT_S), 1 / WAIT_S + 1 / 200.0
-    p = -share * np.expm1(-rates * time_s)
-    assert abs(lost[:, 0].mean() - p) < SIGMA * np.sqrt(p * (1 - p) / n)
-    both = p * (share + (1 - share) * np.exp(-rates * later_s))
-    assert abs((lost[:, 0] & lost[:, 1]).mean() - both) < SIGMA * np.sqrt(both * (1 - both) / n)
-
-
-@pytest.mark.long
-def test_moments_of_the_loss() -> None:
-    """Long after the start, the loss in a drift is a share of its depth that is uniform between 0 and 1."""
-    lost = losses(NUMBERS, np.array([20_000.0]), 1e-6, SEED)[:, 0]
-    share = 200.0 / (200.0 + WAIT_S)
-    mean, square, fourth = share * 0.8 / 4, share * 0.8**2 / 9, share * 0.8**4 / 25
-    n = len(NUMBERS)
-    assert abs(lost.mean() - mean) < SIGMA * np.sqrt((square - mean**2) / n)
-    assert abs((lost**2).mean() - square) < SIGMA * np.sqrt((fourth - square**2) / n)
-    assert lost.max() <= 0.8
+    assert np.abs(rank).max() * np.sqrt(NUMBERS.size) < 4.5
 
 
 def test_frames_hold_the_mean_of_the_drift() -> None:

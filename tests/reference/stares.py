@@ -150,12 +150,8 @@ def _sums(scene: StareScene, table: SumTable, z: Any, conditions: Any, flare: li
     n = len(scene.weights)
     pairs = stare_scene.unique(n, 2)
     place = {key: i for i, key in enumerate(key for order in (1, 2, 3, 4) for key in stare_scene.unique(n, order))}
-    lit = [
-        (conditions["star"], 1),
-        (conditions["sky"], 2),
-        (conditions["neighbours"], 4),
-        *((f, 5 + j) for j, f in enumerate(flare)),
-    ]
+    lit = [(conditions["star"], 1), (conditions["sky"], 2), (conditions["neighbours"], 4)]
+    lit += [(f, 5 + j) for j, f in enumerate(flare)]
 
     def cumulant(key: tuple[int, ...], light: bool = True) -> np.ndarray:
         total = np.full_like(z[0], table.rows[0, place[key]])
@@ -196,11 +192,9 @@ def _sums(scene: StareScene, table: SumTable, z: Any, conditions: Any, flare: li
     for a in range(n):
         total = z[a]
         for b, d in pairs:
-            q = (
-                fma(z[b], z[b], np.float32(-1.0)) * np.float32(0.16666667)
-                if b == d
-                else z[b] * z[d] * np.float32(0.33333334)
-            )
+            q = z[b] * z[d] * np.float32(0.33333334)
+            if b == d:
+                q = fma(z[b], z[b], np.float32(-1.0)) * np.float32(0.16666667)
             total = fma(of(skew, a, b, d), q, total)
         if table.fourths:
             f = np.zeros_like(z[a])

@@ -138,17 +138,13 @@ def histograms(scene: Any, observers: Any, elements: np.ndarray, realisation: np
     """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
     counts = snr.Counts(scene.n_pixel, len(elements))
     n = reference.observed(scene, realisation, seed, scenarios=[0])[0]
-
-    def count(kind: str, which: int, numbers: np.ndarray) -> None:
-        counts.bins[kind].count(which, numbers)
-
     for e, element in enumerate(elements):
         first, end = int(element["first"]), int(element["end"])
         for p in range(first, end):
-            count("pixel", p, n[p] >> int(observers[p]["bin_shift"]))
+            counts.bins["pixel"].count(p, n[p] >> int(observers[p]["bin_shift"]))
         ratio = snr.signal_to_noise(n[first:end], observers[first:end], element["sky"])
         steps = (ratio - element["centre"]) * element["bins_per_unit"]
-        count("element", e, np.rint(steps).astype(np.int64))
+        counts.bins["element"].count(e, np.rint(steps).astype(np.int64))
     counts.clipped += reference.clipped(scene, realisation, seed).sum(axis=0)
     counts.n = len(realisation)
     return counts
