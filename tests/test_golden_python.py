@@ -6,6 +6,7 @@ differ.
 """
 
 import hashlib
+import itertools
 import json
 import sys
 import tempfile
@@ -18,10 +19,10 @@ import numpy as np
 import pytest
 from commands import run
 from golden_inputs import DATA, write_inputs
-from scenes import MG_II, NEAR, instrument, paper, source, star
+from scenes import BANDS, MG_II, NEAR, instrument, paper, source, star, study_of_g2v
 
 import mauvecl
-from mauvecl import BalmerFlare, EnergyScale, Engine, Event, FlareModel, Nuisances, Sky, Source, expect, fit
+from mauvecl import BalmerFlare, EnergyScale, Engine, Event, FlareModel, Nuisances, Sky, Source, Study, expect, fit
 from mauvecl.flares.frames import Components
 from mauvecl.observations import visits
 
@@ -36,7 +37,7 @@ INTERVALS = 1e-3
 Answer = dict[str, Any]
 ANSWERS: dict[str, Callable[[Path], Answer]] = {}
 # Answers that an iteration finds.
-ITERATED = ("fits", "fits_in_time", "answers_in_python")
+ITERATED = ("fits", "fits_in_time", "answers_in_python", "unknowns")
 
 
 def golden(function: Callable[[Path], Answer]) -> Callable[[Path], Answer]:
@@ -103,6 +104,8 @@ def sources(folder: Path) -> Answer:
     both = {"added": star.flaring(0.5, 9000.0), "replaces": star.flaring(0.01, 9000.0, geometry="replaces")}
     found: Answer = {name: one.flux_flam for name, one in both.items()}
     found |= {"binned": star.binned(20.0).flux_flam, "reddened": star.reddened(0.3).flux_flam}
+    found["dusty"] = star.reddened(0.3, rv=5.0).flux_flam
+    found["every band"] = {band: sun.magnitude(band) for band in sorted(BANDS)}
     bands = ("B", "V", "Kepler", "TESS", "Gaia G", "GALEX NUV")
     for name, one in {"M3V": star, "Sun": sun, "VB8": vb8, "slope": mine}.items():
         found[name] = {band: one.magnitude(band) for band in (bands if name != "VB8" else bands[:-1])}
@@ -112,15 +115,18 @@ def sources(folder: Path) -> Answer:
 
 @golden
 def library(folder: Path) -> Answer:
-    """Return mean fluxes of every star of the library."""
+    """Return mean fluxes of every star of the library and of formulas, temperatures and what is said of them."""
     names = [one["name"] for one in json.loads(run("library", "--json", folder=folder).stdout)]
-    return {name: Source.from_library(name).binned(50.0).flux_flam for name in names}
+    stars = {name: Source.from_library(name) for name in (*names, "Blackbody 5772 k", "power-law -4.0")}
+    about = {name: [one.temperature_k, bool(one.unscaled), *one.messages] for name, one in stars.items()}
+    return {name: one.binned(50.0).flux_flam for name, one in stars.items()} | {"about": about}
 
 
 @golden
 def flare_spectra(folder: Path) -> Answer:
     models = {
         "blackbody": mauvecl.Blackbody(10_000.0), "balmer": BalmerFlare(9000.0, 2.5),
+        "cool": BalmerFlare(9500.0, 2.5, 8000.0),
         "two": mauvecl.TwoBlackbodies(9000.0, 25_000.0, 0.1),
         "lines": mauvecl.FlareWithLines(BalmerFlare(9000.0, 2.0), {"Mg II": 0.05, "H alpha": 0.02}),
         "observed": mauvecl.ObservedFlare.read(
@@ -128,7 +134,15 @@ def flare_spectra(folder: Path) -> Answer:
             continue_at_k=9500.0,
         ),
     }  # fmt: skip
-    return {name: {"flux": one.flux(NM), "total": one.bolometric_flux()} for name, one in models.items()}
+    found: Answer = {}
+    for name, one in models.items():
+        lit = {band: source().flaring(0.3, spectrum=one, band=band).flux_flam for band in ("Kepler", "GALEX NUV")}
+        scales = (EnergyScale.of_star(source(), 5.0, flare=one, kind=kind) for kind in ("band", "bolometric"))
+        found[name] = {"flux": one.flux(NM), "total": one.bolometric_flux(), "grid": one.grid(NM), "lit": lit,
+                       "erg_per_s": [scale.erg_per_s for scale in scales]}  # fmt: skip
+    # Grids have points around each line.
+    names = ("H alpha", "H beta", "H gamma", "H delta", "H epsilon", "H8", "Ca II", "Mg II")
+    return found | {name: mauvecl.FlareWithLines(models["blackbody"], {name: 0.1}).grid(NM) for name in names}
 
 
 @golden
@@ -162,12 +176,28 @@ def instruments(folder: Path) -> Answer:
             "quantum": one.quantum_efficiency(SEEN_NM),
             "numbers": [one.dark_dn_per_s, one.gain_dn_per_electron, one.saturation_dn, one.field_of_view_arcsec2],
             "warm": one.with_(temperature_c=10.0).dark_dn_per_s,
+            "aimed": one.with_(pointing_loss=0.05).efficiency(300.0),
         }  # fmt: skip
     drawn = mauvecl.PixelMap.made_up(1643, seed=5, hot_share=0.01)
     drawn.write(folder / "map.ecsv")
     read = mauvecl.PixelMap.read(folder / "map.ecsv").response
-    found["map"] = {"response": drawn.response, "dark": drawn.dark, "read": read}
+    found["map"] = {"response": drawn.response, "dark": drawn.dark, "read": read, "mean": drawn.dark.mean()}
     return found
+
+
+@golden
+def orbits(folder: Path) -> Answer:
+    """Return the documented values of the orbit: ten whole ones, in steps of 0.04 % of them, and a year."""
+    of = {"start": "2026-09-14T12:00", "days": 0.6572, "step_s": 20.0}
+    short = mauvecl.visible(Study.build({"orbit": of | {"targets": ["10 85", "200 -30"]}}, "test")).visibility
+    year = Study.build({"orbit": of | {"days": 365.0, "step_s": 7200.0}}, "test").orbit
+    elements, track = year.orbit().elements, year.orbit().track(year.times())
+    return {
+        "elements": [elements.period_s, elements.axis_km], "epoch": elements.epoch, "shadow": short.shadow.mean(),
+        "local time": short.track.local_time_h.mean(), "beta": [track.beta_deg.min(), track.beta_deg.max()],
+        "kept": short.kept_by, "position": short.track.position_km[::50], "target": short.target,
+        "moon": track.bodies.moon_km[::99], "sun": track.bodies.sun[::99], "below": short.track.subsatellite_deg,
+    }  # fmt: skip
 
 
 @golden
@@ -324,6 +354,37 @@ def answers_in_python(folder: Path) -> Answer:
         "exposure for": table(mauvecl.exposure_for(asked, 5.0, 450.0).table),
         "matters": table(mauvecl.what_matters(asked)),
     }  # fmt: skip
+
+
+@golden
+def unknowns(folder: Path) -> Answer:
+    """Return limits over draws of unknown values, with what each draw and value contributes, and a map's means."""
+    few, engine = {"run": {"realisations": 10_000}, "unknowns": {"draws": 8}}, Engine()
+    (found,) = mauvecl.limit(study_of_g2v(**few), engine).limits
+    of, axes = found.unknown, [("x", "magnitude", [7.0, 10.5]), ("y", "amplitude", [0.1, 0.24])]
+    asked = {name: {"quantity": quantity, "values": values} for name, quantity, values in axes}
+    drawn = {"draws": 4, "known": of.draws.names[2:], "light_loss": {"uniform": [0.25, 0.25]}}
+    mean = mauvecl.map(study_of_g2v(**few | {"unknowns": drawn}, map=asked), engine)
+    return {
+        "draws": dict(zip(of.draws.names, of.draws.values.T, strict=True)), "limits": of.limits, "shares": of.shares,
+        "limit": [found.closed_form, found.value.value], "range": of.range, "probability": mean.probability,
+        "low": mean.low, "high": mean.high,
+        "parts": {name: round(share, 9) for name, share in mean.shares["matched"].items()},
+    }  # fmt: skip
+
+
+@golden
+def formulas_of_noise(folder: Path) -> Answer:
+    """Return departures of both instruments from the Gaussian formula, warm and cold."""
+    found, engine = {}, Engine()
+    for celsius, name in itertools.product((21.0, -30.0), ("mauvesim", "mauve")):
+        part = {"output_min_nm": 340.0, "output_max_nm": 350.0, "temperature_c": celsius}
+        asked = study_of_g2v(observation={"instrument": name, "changes": part}, sweep={
+            "axes": [{"quantity": "exposure", "values": [5.0]}]
+        })  # fmt: skip
+        answer = mauvecl.gaussian(asked, engine)
+        found[f"{name} {celsius}"] = {"shown": answer.signal.shown_nm, **table(answer.cells), **table(answer.elements)}
+    return found
 
 
 @golden

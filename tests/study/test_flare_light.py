@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import expectations
-from astropy.table import Table
 from refusals import refused
+from scenes import source
 
 import mauvecl
-from mauvecl import BalmerFlare, Blackbody, FlareWithLines, Source, Study, stare
+from mauvecl import BalmerFlare, Blackbody, FlareWithLines, Study, stare
 
 DATA = Path(__file__).parent.parent / "data"
 FILE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
@@ -54,46 +54,11 @@ def test_spectrum_of_a_study_round_trips_through_toml(name: str, tmp_path: Path)
 
 
 @TOGETHER
-@pytest.mark.parametrize("band", ["Kepler", "GALEX NUV"])
-def test_amplitude_is_the_rise_of_photons_in_the_band(name: str, band: str) -> None:
-    star, spectrum = Source.from_library("M3V").at_magnitude(9), TEXTS[name][1]
-    lit = star.flaring(0.3, spectrum=spectrum, band=band)
-    # Magnitudes count photons. Narrow lines are sampled differently there.
-    rise = 10 ** (0.4 * (star.magnitude(band) - lit.magnitude(band))) - 1
-    assert rise == pytest.approx(0.3, rel=3e-3 if name in ("lines", "file") else 1e-9)
-    added = lit.flux_flam - np.interp(lit.wavelength_nm, star.wavelength_nm, star.flux_flam)
-    shape = spectrum.flux(lit.wavelength_nm)
-    used = shape > 0.01 * shape.max()
-    np.testing.assert_allclose(added[used] / shape[used], (added[used] / shape[used])[0], rtol=1e-6)
-
-
-@TOGETHER
-def test_energies_equal_those_of_the_light(name: str) -> None:
-    """Energies equal the integral of the flux added by `flaring`, extended by the flare's own spectrum."""
-    star, spectrum = Source.from_library("M3V").at_magnitude(9), TEXTS[name][1]
-    lit = star.flaring(1.0, spectrum=spectrum)
-    nm = lit.wavelength_nm
-    added = lit.flux_flam - np.interp(nm, star.wavelength_nm, star.flux_flam)
-    sphere = 4 * np.pi * (5.0 * 3.0856775814913674e18) ** 2
-    curve = Table.read(Path(mauvecl.__file__).parent / "host/stars/library/bands/kepler.ecsv")
-    fine = np.union1d(nm, curve["wavelength"])
-    response = np.interp(fine, curve["wavelength"], curve["throughput"] / curve["throughput"].max(), 0, 0)
-    band = 10 * np.trapezoid(response * np.interp(fine, nm, added), fine) * sphere
-    far = spectrum.grid(np.geomspace(20.0, 200_000.0, 30_001))
-    share = np.trapezoid(added[(nm > 400) & (nm < 600)], nm[(nm > 400) & (nm < 600)])
-    inside = spectrum.grid(np.linspace(400.0, 600.0, 40_001))
-    whole = 10 * share * np.trapezoid(spectrum.flux(far), far) / np.trapezoid(spectrum.flux(inside), inside) * sphere
-    for kind, energy in (("band", band), ("bolometric", whole)):
-        scale = mauvecl.EnergyScale.of_star(star, 5.0, flare=spectrum, kind=kind)
-        assert scale.erg_per_s == pytest.approx(energy, rel=5e-3), kind
-
-
-@TOGETHER
 def test_answers_take_any_spectrum(name: str) -> None:
     """Detections and stares have the light of the spectrum, and stares its energy."""
     short = ["stare.duration_s=600", "observation.exposure_s=5", "stare.search=false"]
     study, spectrum = study_of(name, amplitudes=[0.05]).with_settings(short), TEXTS[name][1]
-    star = Source.from_library("M3V").at_magnitude(9)
+    star = source()
     wanted = mauvecl.expect(star.flaring(0.05, spectrum=spectrum), "mauvesim", exposure=5.0)
     quiet, flaring = expectations(study)
     np.testing.assert_allclose(flaring.recorded_dn, wanted.recorded_dn, rtol=1e-12)
@@ -118,7 +83,7 @@ def test_search_injects_the_flare_of_the_file() -> None:
 
 
 def test_lines_of_a_fixed_flux_do_not_scale() -> None:
-    star = Source.from_library("M3V").at_magnitude(9)
+    star = source()
     fixed = FlareWithLines(Blackbody(9000.0), {}, {"Mg II": 1e-12, "H beta": 2e-12})
     for amplitude in (0.01, 0.1):
         plain, lit = star.flaring(amplitude, 9000.0), star.flaring(amplitude, spectrum=fixed)

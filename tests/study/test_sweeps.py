@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import instrument, star, study_of_g2v
-from scipy import stats
+from scenes import study_of_g2v
 
 import mauvecl
 from mauvecl import Blackbody, Engine, Study, TwoBlackbodies, detect, gaussian
@@ -127,21 +126,10 @@ def test_limits_follow_the_sweep(engine: Engine) -> None:
 def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -> None:
     """The formula holds for the nominal payload and fails with a bias near zero, which clips counts."""
     asked = study([MAGNITUDES, EXPOSURES])
-    answer = gaussian(asked, engine)
-    cells, elements = answer.cells, answer.elements
+    cells = gaussian(asked, engine).cells
     assert len(cells) == 4
     assert np.all(np.abs(cells["fap_ratio"] - 1) < 1e-9)
     assert np.all((cells["coverage_low"] > 0.66) & (cells["coverage_high"] < 0.71))
-    # Coverage from histograms equals that of the same realisations.
-    quiet = mauvecl.snr(asked, engine).stars[0].result.expectation
-    raw = engine.realise(quiet, count=20_000, seed=5)
-    net = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
-    known = quiet.n_frames * (quiet.read_noise_dn**2 + quiet.dark_variance_dn2)
-    sigma = np.sqrt(quiet.gain_dn_per_electron * np.maximum(net, 0) + known)
-    direct = np.mean(np.abs(net - quiet.recorded_light_dn) <= sigma, axis=0)
-    first = (elements["magnitude"].value == 6) & (elements["exposure"].value == 5)
-    count = quiet.per_element(np.ones(quiet.wavelength_nm.size))
-    np.testing.assert_allclose(elements[first]["coverage"].value, quiet.per_element(direct) / count, atol=0.003)
     low = gaussian(asked.with_instrument({"bias_dn": 5.0, "dark_scale_dn_per_s": 0.01}), engine)
     # Counts are cut off at zero, not at saturation.
     assert not any("saturation" in text for text in low.signal.messages)
@@ -154,33 +142,3 @@ def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -
     rare = gaussian(study([]).with_settings(["run.fap=1e-6", "run.tails=sampled"]), engine)
     assert np.isnan(rare.cells["fap_ratio"][0])
     assert "as many" not in rare.headline
-
-
-@pytest.mark.parametrize("name", ["mauvesim", "mauve"])
-@pytest.mark.parametrize("temperature", [21.0, -30.0])
-def test_pixels_beyond_five_sigma_are_counted(name: str, temperature: float, engine: Engine) -> None:
-    """The saddle-point tail agrees with the exact sum over dark counts to 0.3 %; the distribution is skewed upward."""
-    part = {"output_min_nm": 340.0, "output_max_nm": 350.0, "temperature_c": temperature}
-    asked = study([{"quantity": "exposure", "values": [5.0]}], observation={"changes": part})
-    answer = gaussian(asked.with_settings([f"observation.instrument={name}"]), engine)
-    (cell,) = answer.cells
-    # A part of the spectrum without any of the usual wavelengths shows its middle.
-    assert answer.signal.shown_nm == [pytest.approx(345.0, abs=0.2)]
-    assert len(answer.signal.views[0].table) == 1
-    (quiet,) = star(exposure=5.0, payload=instrument(name, **part))
-    poisson = quiet.photon_noise == "poisson"
-    found: dict[int, list[float]] = {1: [], -1: []}
-    for p in range(quiet.wavelength_nm.size):
-        step = float(quiet.dark_step_dn[p])
-        # Both photons and dark current are then Poisson in electrons.
-        mean = quiet.dark_dn[p] / step + (quiet.source_electrons + quiet.sky_electrons)[p] * poisson
-        goal = 5 * np.sqrt(quiet.variance_dn2[p] - 1 / 12)
-        photon = quiet.gain_dn_per_electron[p] * quiet.recorded_light_dn[p]
-        sd = np.sqrt(quiet.read_noise_dn[p] ** 2 + photon * (not poisson))
-        counts = np.arange(int(mean + 14 * np.sqrt(mean) + 30))
-        for side in (1, -1):
-            exact = stats.poisson.pmf(counts, mean) @ stats.norm.sf((goal - side * (counts - mean) * step) / sd)
-            found[side].append(float(exact / stats.norm.sf(5.0)))
-    assert cell["five_sigma_above"] == pytest.approx(max(found[1]), rel=3e-3)
-    assert cell["five_sigma_below"] == pytest.approx(min(found[-1]), rel=3e-3)
-    assert cell["five_sigma_above"] > 1 > cell["five_sigma_below"]
