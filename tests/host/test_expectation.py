@@ -202,23 +202,6 @@ def test_user_file_extends_an_embedded_instrument(tmp_path: Path, mauve: Instrum
     assert Instrument.load(tmp_path / "colder.toml").with_(temperature_c=21) == mine
 
 
-def test_each_column_changes_its_own_quantity(mauve: Instrument) -> None:
-    n, part, star = np.arange(2048), mauve.read_pixels, Source.from_library("G2V").at_magnitude(6.0)
-    given = PixelMap(
-        response=n % 64 / 64, dark=1 + n / 1024, gain=1 - n / 8192, bias_dn=500.0 + n, read_noise_dn=10 + n / 500
-    )
-    maps = (None, given, PixelMap(dark=given.dark))
-    plain, uneven, only_dark = (expect(star, mauve.with_(pixel_map=one), exposure=5.0) for one in maps)
-    assert (part.start, part.stop - part.start) == (76, plain.wavelength_nm.size)
-    for name, factor in (("source_electrons", "response"), ("dark_dn", "dark"), ("gain_dn_per_electron", "gain")):
-        found = getattr(plain, name) * getattr(given, factor)[part]
-        np.testing.assert_allclose(getattr(uneven, name), found, rtol=1e-12)
-    np.testing.assert_array_equal(uneven.bias_dn, given.bias_dn[part])
-    np.testing.assert_array_equal(uneven.read_noise_dn, given.read_noise_dn[part])
-    np.testing.assert_array_equal(only_dark.source_electrons, plain.source_electrons)
-    assert mauve.with_(pixel_map=given).digest != mauve.digest
-
-
 def test_written_maps_are_read_back(tmp_path: Path) -> None:
     made = PixelMap.made_up(2048, seed=3, hot_share=0.01, hot_dark=50.0)
     assert 5 < np.sum(made.dark > 10) < 50

@@ -11,7 +11,7 @@ import pytest
 from refusals import refused
 from scenes import BANDS, instrument, source
 
-from mauvecl import Blackbody, FlareWithLines, ObservedFlare, Source, TwoBlackbodies, expect
+from mauvecl import Blackbody, ObservedFlare, Source, expect
 
 NM = np.arange(170.0, 1100.0, 1.0)
 GOOD = NM * 1e-15
@@ -64,21 +64,6 @@ def test_flares_do_not_depend_on_the_system_of_magnitudes() -> None:
         np.testing.assert_allclose(flare, SUN.flaring(0.24).flux_flam)
 
 
-def test_replacing_flare_hides_photosphere() -> None:
-    """Compare with the exact area-weighted sum of two blackbodies, for a star that is a blackbody."""
-    cool, hot = (Blackbody(kelvin).flux(NM) for kelvin in (5000.0, 10_000.0))
-    star = Source.from_arrays(NM, cool)
-    difference = star.magnitude("Kepler") - Source.from_arrays(NM, hot).magnitude("Kepler")
-    f = 0.1 / (10 ** (0.4 * difference) - 1)
-    flare = star.flaring(0.1, 10_000, geometry="replaces", photosphere_temperature=5000)
-    np.testing.assert_allclose(flare.flux_flam, (1 - f) * cool + f * hot, rtol=1e-9)
-    # Two halves of a flare hide as much as one of both.
-    halves = TwoBlackbodies(10_000.0, 10_000.0, 1.0)
-    for light in (halves, FlareWithLines(halves)):
-        parts = star.flaring(0.1, spectrum=light, geometry="replaces", photosphere_temperature=5000)
-        np.testing.assert_allclose(parts.flux_flam, flare.flux_flam, rtol=1e-9)
-
-
 def test_short_spectra_are_used_where_they_suffice() -> None:
     """The nominal range refuses others: `data/refusals/host.toml`."""
     narrow, parts = MAUVE.with_(output_min_nm=250.0, output_max_nm=600.0), (slice(None), slice(31, None), slice(500))
@@ -99,19 +84,6 @@ def test_short_spectra_are_used_where_they_suffice() -> None:
         cut.magnitude("GALEX NUV")
     # Noise below zero is not continued.
     assert Source.from_arrays(NM[15:], np.where(NM < 200, -1e-17, GOOD)[15:]).flux_flam[0] == 0.0
-
-
-def test_extension_by_another_star() -> None:
-    """Cut the library's Sun at both ends and extend it by itself at another brightness."""
-    kept = (SUN.wavelength_nm > 250) & (SUN.wavelength_nm < 650)
-    short = (SUN.wavelength_nm[kept], 1e-3 * SUN.flux_flam[kept])
-    for extension in ("G2V", Source.from_library("G2V")):
-        star = Source.from_arrays(*short, name="short", extend=extension)
-        assert sum("it is continued by G2V, scaled by" in text for text in star.messages) == 2
-        one, other = (expect(x, MAUVE, exposure=5).source_electrons for x in (star.at_magnitude(7.4), SUN))
-        np.testing.assert_allclose(one, other, rtol=1e-6)
-    whole = Source.from_arrays(SUN.wavelength_nm, SUN.flux_flam, extend="G2V")
-    assert "reaches no farther and is not used" in whole.messages[-1]
 
 
 def test_measured_noise_is_kept_and_reported_once() -> None:
@@ -147,30 +119,6 @@ def test_stated_error_of_a_mean_equals_the_scatter_of_means() -> None:
         at, error = re.search(r"at ([\d.]+) nm.* error of ([\d.e+]+)", str(caught.value)).groups()
         ratios.append(float(error) / np.interp(float(at), MAUVE.wavelength_nm, scatter))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.3)
-
-
-def test_relative_lines_carry_their_fraction_and_absolute_ones_their_flux() -> None:
-    plain, nm = Blackbody(10_000.0), np.linspace(200.0, 700.0, 50_001)
-    lined = FlareWithLines(plain, {"Mg II": 0.05}, {"H beta": 2e-13})
-    grid = lined.grid(nm)
-    added = np.trapezoid(lined.flux(grid) - plain.flux(grid), grid) / np.trapezoid(plain.flux(nm), nm)
-    assert added == pytest.approx(0.05, rel=1e-6)
-    assert 10 * np.trapezoid(lined.flux_at_telescope(grid), grid) == pytest.approx(2e-13, rel=1e-12)
-    assert lined.fixed_lines
-    assert not FlareWithLines(plain, {"Mg II": 0.05}).fixed_lines
-
-
-def test_coarse_spectrum_is_continued_from_its_last_point_if_asked() -> None:
-    flare = ObservedFlare.from_arrays([150.0, 300.0, 500.0], [1.0, 2.0, 3.0], continue_at_k=8000.0)
-    assert flare.measured_nm == (150.0, 500.0)
-    assert "8000 K continues it" in flare.messages[-1]
-    far = Blackbody(8000.0).flux(np.array([500.0, flare.wavelength_nm[-1]]))
-    assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
-    # A finer one is continued from the mean of its last 20 nm.
-    nm = np.arange(200.0, 801.0)
-    flare, last = ObservedFlare.from_arrays(nm, nm**4, continue_at_k=8000.0), nm >= 780.0
-    level = np.trapezoid(nm[last] ** 4) / np.trapezoid(Blackbody(8000.0).flux(nm[last]))
-    assert flare.flux_flam[-1] == pytest.approx(level * Blackbody(8000.0).flux(flare.wavelength_nm[-1:])[0])
 
 
 def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:

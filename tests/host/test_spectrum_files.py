@@ -230,6 +230,9 @@ def test_messages_of_the_star_that_continues_a_spectrum() -> None:
     dark = Source.from_arrays(wavelength, np.where(wavelength < 300.0, 0.0, 1e-12), extend="M4V")
     for star in (Source.read(HERE / "vb8_stiswfcnic_004.fits", extend="M4V"), dark):
         assert f"in M4V, {noisy}" in star.messages
+    star = Source.from_library("G2V")
+    whole = Source.from_arrays(star.wavelength_nm, star.flux_flam, extend=star)
+    assert "reaches no farther and is not used" in whole.messages[-1]
 
 
 def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
