@@ -123,7 +123,8 @@ def test_messages_and_noise_of_neighbours(tmp_path: Path) -> None:
     # Noise by origin has no number where a star has no neighbour.
     alone = {"library": "G2V", "magnitude": 7.4}
     both = [alone | {"neighbours": str(tmp_path / "near.csv")}, alone]
-    noise = snr(Study.build({"star": both, "observation": {"exposure_s": 50.0}}, "test")).views[1].table
+    few = {"star": both, "observation": {"exposure_s": 50.0}, "run": {"realisations": 1000}}
+    noise = snr(Study.build(few, "test")).views[1].table
     assert np.isnan(noise["neighbour_photon"].value).tolist() == [False] * 4 + [True] * 4
 
 
