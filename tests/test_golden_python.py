@@ -383,7 +383,7 @@ def unknowns(folder: Path) -> Answer:
     return {
         "draws": dict(zip(of.draws.names, of.draws.values.T, strict=True)), "limits": of.limits, "shares": of.shares,
         "limit": [found.closed_form, found.value.value], "range": of.range, "probability": mean.probability,
-        "low": mean.low, "high": mean.high,
+        "ends": [mean.low, mean.high],
         "parts": {name: round(share, 9) for name, share in mean.shares["matched"].items()},
     }  # fmt: skip
 
