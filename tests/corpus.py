@@ -249,7 +249,8 @@ def written(case: Case, folder: Path) -> Path:
         content = changed
     if "encoding" in case:
         content = content.decode().encode(case["encoding"])
-    content = PACKERS[packing](content)
+    part = -(-len(content) // case.get("members", 1)) or 1
+    content = b"".join(PACKERS[packing](content[k : k + part]) for k in range(0, len(content) or 1, part))
     content = content[: round(len(content) * case.get("share", 1))]
     path = folder / Path(case.get("file", f"a.{case['form']}")).name
     path.write_bytes(content)

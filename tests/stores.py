@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scenes import study_of_g2v
 
 from mauvecl import Engine, Study
 
@@ -19,15 +20,10 @@ CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
 def study(realisations: int = 300, **sections: Any) -> Study:
     """Return a study of one star with one flare on 197 pixels, by default of one frame."""
-    data = {
-        "star": [{"library": "G2V", "magnitude": 7.4}],
-        "flare": {"amplitudes": [0.24]},
-        "observation": {"exposure_s": 5.0, "changes": {"output_min_nm": 300.0, "output_max_nm": 360.0}},
-        "run": {"realisations": realisations, "seed": 11},
-    }
-    for name, values in sections.items():
-        data[name] = {**data.get(name, {}), **values}  # type: ignore[dict-item]
-    return Study.build(data, "test").paper()
+    observed = {"exposure_s": 5.0, "changes": {"output_min_nm": 300.0, "output_max_nm": 360.0}}
+    observed |= sections.pop("observation", {})
+    run = {"realisations": realisations, "seed": 11} | sections.pop("run", {})
+    return study_of_g2v(observation=observed, run=run, **sections).paper()
 
 
 @contextmanager

@@ -200,9 +200,18 @@ def _curve(path: Path, case: Case) -> tuple[str, ...]:
     return ()
 
 
+def _efficiency(path: Path, case: Case) -> tuple[str, ...]:
+    """Read a curve of an instrument, whose end values hold beyond its knots."""
+    curve = getattr(instrument(**{case["scale"]: path}), case["scale"])
+    np.testing.assert_allclose(curve.wavelength_nm, [180.0, 500.0, 800.0])
+    np.testing.assert_allclose(curve.at([100.0, 180.0, 340.0, 500.0, 900.0]), [0.05, 0.05, 0.075, 0.1, 0.05])
+    return ()
+
+
 READERS: dict[str, Callable[[Path, Case], tuple[str, ...]]] = {
     "spectrum": _spectrum, "points": _points, "frames": _frames, "summary": _summary, "targets": _targets,
     "neighbours": _neighbours, "flares": _flares, "unknown": _unknown, "curve": _curve,
+    "efficiency": _efficiency,
 }  # fmt: skip
 
 

@@ -29,14 +29,6 @@ def all_pages() -> list[Path]:
     return [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
-def test_every_page_is_in_the_contents() -> None:
-    contents = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    pages = [p for p in (ROOT / "docs").glob("*.md") if p.name != "index.md"]
-    pages += list((ROOT / "docs" / "notebooks").glob("*.ipynb"))
-    for page in pages:
-        assert str(page.relative_to(ROOT / "docs").with_suffix("")) in contents
-
-
 def test_documented_names_exist() -> None:
     named = [(page.name, *found) for page in all_pages() for found in NAMED.findall(page.read_text(encoding="utf-8"))]
     assert not [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
@@ -45,13 +37,9 @@ def test_documented_names_exist() -> None:
     for page, file, name in defined:
         pattern, text = DEFINITIONS[Path(file).suffix].format(name), (ROOT / file).read_text(encoding="utf-8")
         assert re.search(pattern, text, re.MULTILINE), (page, file, name)
-
-
-def test_dotted_names_of_the_architecture_exist() -> None:
-    """Import every name in backticks that begins with the package's."""
-    names = re.findall(r"`(mauvecl(?:\.\w+)+)`", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
-    assert len(names) > 25
-    for name in names:
+    dotted = re.findall(r"`(mauvecl(?:\.\w+)+)`", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
+    assert len(dotted) > 25
+    for name in dotted:
         pkgutil.resolve_name(name)
 
 
@@ -130,7 +118,5 @@ def test_examples_of_docstrings_run(name: str) -> None:
 
 
 def test_main_names_have_examples() -> None:
-    finder = doctest.DocTestFinder(recurse=False)
-    for name in ("Source", "Sky", "Instrument", "expect", "Engine", "Study"):
-        thing = getattr(mauvecl, name)
-        assert any(test.examples for test in finder.find(thing, name)), name
+    for main in (mauvecl.Source, mauvecl.Sky, mauvecl.Instrument, mauvecl.expect, mauvecl.Engine, mauvecl.Study):
+        assert ">>> " in main.__doc__, main

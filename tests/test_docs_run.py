@@ -36,24 +36,16 @@ def snippets(page: Path) -> Iterator[tuple[str, str]]:
             yield kind, block
 
 
-def brought(*folders: str) -> Callable[[], None]:
-    """Return what copies the files that readers bring, by their folders among the data."""
-
-    def copy() -> None:
-        for folder in folders:
-            shutil.copytree(ROOT / "tests" / "data" / folder, ".", dirs_exist_ok=True)
-
-    return copy
-
-
-def shown(page: str, begin: str, name: str) -> Callable[[], None]:
-    """Return what writes a table that a page shows."""
-
-    def write() -> None:
+def bring(brought: str | tuple[str, str, str] | Callable[[], object]) -> None:
+    """Copy a folder of the data, write a table that a page shows (page, first words and file), or call."""
+    if isinstance(brought, str):
+        shutil.copytree(ROOT / "tests" / "data" / brought, ".", dirs_exist_ok=True)
+    elif isinstance(brought, tuple):
+        page, begin, name = brought
         (text,) = re.findall(rf"```\n({begin}.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.DOTALL)
         Path(name).write_text(text)
-
-    return write
+    else:
+        brought()
 
 
 def standards() -> None:
@@ -65,23 +57,19 @@ def standards() -> None:
         read_snippet(kind, snippet, names)
 
 
-own_study = brought("brought/study")
-targets = shown("plan.md", "name,ra,", "targets.csv")
-observed_frames = brought("brought/frames", "flares")
-BROUGHT: dict[str, tuple[Callable[[], object], ...]] = {
-    "README.md": (targets, observed_frames, standards),
+TARGETS, FRAMES = ("plan.md", "name,ra,", "targets.csv"), ("brought/frames", "flares")
+BROUGHT: dict[str, tuple[str | tuple[str, str, str] | Callable[[], object], ...]] = {
+    "README.md": (TARGETS, *FRAMES, standards),
     "gallery.md": (lambda: Path("tests").symlink_to(ROOT / "tests"),),
-    "cluster.md": (own_study,),
-    "mapping.md": (brought("brought/mauve"), lambda: documented_files(Path())),
-    "long-runs.md": (own_study,),
-    "my-instrument.md": (brought("brought/efficiency"),),
-    "neighbours.md": (shown("neighbours.md", "name,sep", "near.csv"), brought("brought/neighbours"), observed_frames),
-    "my-star.md": (brought("brought/own-star", "brought/spectra"),),
-    "observations.md": (observed_frames,),
-    "page.md": (own_study,),
-    "plan.md": (targets,),
-    "tutorial.md": (brought("brought/own-star"),),
-    "unknowns.md": (brought("brought/stray-light"),),
+    "mapping.md": ("brought/mauve", lambda: documented_files(Path())),
+    "my-instrument.md": ("brought/efficiency",),
+    "neighbours.md": (("neighbours.md", "name,sep", "near.csv"), "brought/neighbours", *FRAMES),
+    "my-star.md": ("brought/own-star", "brought/spectra"),
+    "observations.md": FRAMES,
+    "plan.md": (TARGETS,),
+    "tutorial.md": ("brought/own-star",),
+    "unknowns.md": ("brought/stray-light",),
+    **dict.fromkeys(("cluster.md", "long-runs.md", "page.md"), ("brought/study",)),
 }
 
 
@@ -102,8 +90,8 @@ def not_run(command: str) -> bool:
 def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MAUVECL_DATA_DIR", str(tmp_path / "data"))
-    for bring in BROUGHT.get(page.name, ()):
-        bring()
+    for brought in BROUGHT.get(page.name, ()):
+        bring(brought)
     names: dict[str, object] = {}
     for kind, snippet in snippets(page):
         if kind == "command":

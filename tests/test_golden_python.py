@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from commands import run
 from golden_inputs import DATA, write_inputs
-from scenes import MG_II, NEAR, instrument, paper, source, star
+from scenes import BANDS, MG_II, NEAR, instrument, paper, source, star
 
 import mauvecl
 from mauvecl import BalmerFlare, EnergyScale, Engine, Event, FlareModel, Nuisances, Sky, Source, expect, fit
@@ -103,6 +103,14 @@ def sources(folder: Path) -> Answer:
     both = {"added": star.flaring(0.5, 9000.0), "replaces": star.flaring(0.01, 9000.0, geometry="replaces")}
     found: Answer = {name: one.flux_flam for name, one in both.items()}
     found |= {"binned": star.binned(20.0).flux_flam, "reddened": star.reddened(0.3).flux_flam}
+    found["dusty"] = star.reddened(0.3, rv=5.0).flux_flam
+    halves = mauvecl.TwoBlackbodies(9000.0, 9000.0, 1.0)
+    for name, light in {"halves": halves, "lines": mauvecl.FlareWithLines(halves)}.items():
+        found[name] = star.flaring(0.01, spectrum=light, geometry="replaces", photosphere_temperature=3400).flux_flam
+    cut = slice(*np.searchsorted(sun.wavelength_nm, [250.0, 650.0]))
+    short = Source.from_arrays(sun.wavelength_nm[cut], 1e-3 * sun.flux_flam[cut], name="cut", extend="G2V")
+    found["extended"] = short.flux_flam
+    found["every band"] = {band: sun.magnitude(band) for band in sorted(BANDS)}
     bands = ("B", "V", "Kepler", "TESS", "Gaia G", "GALEX NUV")
     for name, one in {"M3V": star, "Sun": sun, "VB8": vb8, "slope": mine}.items():
         found[name] = {band: one.magnitude(band) for band in (bands if name != "VB8" else bands[:-1])}
@@ -112,23 +120,38 @@ def sources(folder: Path) -> Answer:
 
 @golden
 def library(folder: Path) -> Answer:
-    """Return mean fluxes of every star of the library."""
+    """Return mean fluxes of every star of the library and of formulas, temperatures and what is said of them."""
     names = [one["name"] for one in json.loads(run("library", "--json", folder=folder).stdout)]
-    return {name: Source.from_library(name).binned(50.0).flux_flam for name in names}
+    stars = {name: Source.from_library(name) for name in (*names, "Blackbody 5772 k", "power-law -4.0")}
+    about = {name: [one.temperature_k, bool(one.unscaled), *one.messages] for name, one in stars.items()}
+    return {name: one.binned(50.0).flux_flam for name, one in stars.items()} | {"about": about}
 
 
 @golden
 def flare_spectra(folder: Path) -> Answer:
     models = {
         "blackbody": mauvecl.Blackbody(10_000.0), "balmer": BalmerFlare(9000.0, 2.5),
+        "cool": BalmerFlare(9500.0, 2.5, 8000.0),
         "two": mauvecl.TwoBlackbodies(9000.0, 25_000.0, 0.1),
         "lines": mauvecl.FlareWithLines(BalmerFlare(9000.0, 2.0), {"Mg II": 0.05, "H alpha": 0.02}),
+        "coarse": mauvecl.ObservedFlare.from_arrays([150.0, 300.0, 500.0], [1.0, 2.0, 3.0], continue_at_k=8000.0),
         "observed": mauvecl.ObservedFlare.read(
             DATA / "flares" / "ADLeo_1497s.dat", DATA / "flares" / "adleo_quiescent2.dat", wavelength_unit="Angstrom",
             continue_at_k=9500.0,
         ),
     }  # fmt: skip
-    return {name: {"flux": one.flux(NM), "total": one.bolometric_flux()} for name, one in models.items()}
+    found: Answer = {}
+    for name, one in models.items():
+        lit = {band: source().flaring(0.3, spectrum=one, band=band).flux_flam for band in ("Kepler", "GALEX NUV")}
+        scales = (EnergyScale.of_star(source(), 5.0, flare=one, kind=kind) for kind in ("band", "bolometric"))
+        found[name] = {"flux": one.flux(NM), "total": one.bolometric_flux(), "grid": one.grid(NM), "lit": lit,
+                       "erg_per_s": [scale.erg_per_s for scale in scales]}  # fmt: skip
+    fixed = mauvecl.FlareWithLines(mauvecl.Blackbody(9000.0), {"Mg II": 0.05}, {"H beta": 2e-13})
+    found["fixed"] = {"flux": fixed.flux_at_telescope(fixed.grid(NM)), "fixed": fixed.fixed_lines}
+    found["coarse"] |= {"measured": models["coarse"].measured_nm, "said": models["coarse"].messages}
+    # Grids have points around each line.
+    names = ("H alpha", "H beta", "H gamma", "H delta", "H epsilon", "H8", "Ca II", "Mg II")
+    return found | {name: mauvecl.FlareWithLines(models["blackbody"], {name: 0.1}).grid(NM) for name in names}
 
 
 @golden
@@ -162,11 +185,12 @@ def instruments(folder: Path) -> Answer:
             "quantum": one.quantum_efficiency(SEEN_NM),
             "numbers": [one.dark_dn_per_s, one.gain_dn_per_electron, one.saturation_dn, one.field_of_view_arcsec2],
             "warm": one.with_(temperature_c=10.0).dark_dn_per_s,
+            "aimed": one.with_(pointing_loss=0.05).efficiency(300.0),
         }  # fmt: skip
     drawn = mauvecl.PixelMap.made_up(1643, seed=5, hot_share=0.01)
     drawn.write(folder / "map.ecsv")
     read = mauvecl.PixelMap.read(folder / "map.ecsv").response
-    found["map"] = {"response": drawn.response, "dark": drawn.dark, "read": read}
+    found["map"] = {"response": drawn.response, "dark": drawn.dark, "read": read, "mean": drawn.dark.mean()}
     return found
 
 
@@ -183,10 +207,15 @@ def skies(folder: Path) -> Answer:
 @golden
 def expectations(folder: Path) -> Answer:
     """Return means, variances and S/N in both orders, with neighbours, in electrons, and near saturation."""
+    n = np.arange(2048)
+    uneven = mauvecl.PixelMap(
+        response=n % 64 / 64, dark=1 + n / 1024, gain=1 - n / 8192, bias_dn=500.0 + n, read_noise_dn=10 + n / 500
+    )
     cases = {
         "paper": star(), "physical": [expect(source(), instrument(), exposure=300.0, order="physical")],
         "electrons": star("K5V", 8.0, amplitudes=(0.1,), payload=instrument("mauve")),
         "neighbours": star(neighbours=NEAR), "bright": star("A0V", 1.0, exposure=5.0),
+        "uneven": star(payload=instrument(pixel_map=uneven)),
     }  # fmt: skip
     found: Answer = {}
     for name, all_of in cases.items():
@@ -194,7 +223,7 @@ def expectations(folder: Path) -> Answer:
         found[name] = {
             "signal": one.signal_dn, "variance": one.variance_dn2, "snr": one.snr(), "element": one.snr_per_element(),
             "numbers": [one.exposure_s, one.highest_dn, one.longest_safe_frame_s, one.target_share, one.ceiling_dn],
-            "budget": table(one.noise_budget()),
+            "budget": table(one.noise_budget()), "raw": one.mean_raw_dn,
         }  # fmt: skip
     return found
 

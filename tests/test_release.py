@@ -46,26 +46,22 @@ def test_version_date_and_authors_are_the_same_everywhere() -> None:
     assert [one["name"] for one in CITATION["authors"]] == [author["name"]]
 
 
-LIBRARY = ROOT / "host" / "stars" / "library"
-#: What their licences ask to be kept with every copy.
+#: What the licences of the embedded data ask to be kept with every copy.
 NOTICES = {
-    "pyphot": ("Copyright (c) 2016 Morgan Fouesneau", "The above copyright notice and this permission notice shall be"),
-    "speclite": (
-        "Copyright (c) 2015-2025, Speclite Developers",
-        "Redistributions in binary form must reproduce the above",
-    ),
-    "EXOSIMS": ("Copyright (c) 2015, Dmitry Savransky", "Redistributions in binary form must reproduce the above"),
+    "pyphot": "Copyright \\(c\\) 2016 Morgan Fouesneau.* The above copyright notice and this permission notice",
+    "speclite": "Copyright \\(c\\) 2015-2025, Speclite Developers.* Redistributions in binary form must reproduce",
+    "EXOSIMS": "Copyright \\(c\\) 2015, Dmitry Savransky.* Redistributions in binary form must reproduce",
 }
 
 
 def test_all_data_have_a_licence() -> None:
-    for package, notices in NOTICES.items():
-        text = (LIBRARY / "licenses" / f"{package}.txt").read_text()
-        assert all(notice in text for notice in notices)
-    for file in LIBRARY.glob("*/*.ecsv"):
-        meta = Table.read(file, format="ascii.ecsv").meta
-        assert meta["licence"]
-        assert any(package in meta["origin"] for package in NOTICES), file
+    """What the data state of their licences is in `tests/host/test_names_of_stars.py`."""
+    library = ROOT / "host" / "stars" / "library"
+    for package, notice in NOTICES.items():
+        assert re.search(notice, " ".join((library / "licenses" / f"{package}.txt").read_text().split()))
+    for file in library.glob("*/*.ecsv"):
+        origin = Table.read(file, format="ascii.ecsv").meta["origin"]
+        assert any(package in origin for package in NOTICES), file
 
 
 def test_paper_cites_its_references_and_has_the_form_that_the_journal_asks_for() -> None:

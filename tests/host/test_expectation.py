@@ -164,15 +164,6 @@ def test_random_spectra_agree_with_quadrature(mauve: Any, top_hat: float, fwhm: 
         assert rate[pixel] == pytest.approx(by_quadrature(instrument, wavelength, flux, pixel, order), rel=1e-9)
 
 
-def test_efficiency_is_the_product_of_the_paper(mauve: Instrument) -> None:
-    # The knots at 300 nm, by hand.
-    by_hand = 0.80 * 0.977 * 0.96**4 * 0.910**2 * 0.888**2 * 0.92 * 0.999 * 0.66
-    assert mauve.efficiency(300.0) == pytest.approx(by_hand, rel=1e-12)
-    assert mauve.quantum_efficiency(300.0) == pytest.approx(0.122 * 1239.84198 / 300, rel=1e-8)
-    assert mauve.throughput(300.0) == pytest.approx(by_hand * 0.122 * 1239.84198 / 300, rel=1e-8)
-    assert mauve.with_(pointing_loss=0.05).efficiency(300.0) == pytest.approx(0.95 * by_hand, rel=1e-12)
-
-
 @pytest.mark.parametrize("name", ["mauvesim", "mauve"])
 def test_every_value_has_a_source(name: str) -> None:
     instrument = Instrument.load(name)
@@ -209,44 +200,6 @@ def test_user_file_extends_an_embedded_instrument(tmp_path: Path, mauve: Instrum
     # A file may extend a user's own, too.
     (tmp_path / "colder.toml").write_text('extends = "mine.toml"\ntemperature_c = 13\n')
     assert Instrument.load(tmp_path / "colder.toml").with_(temperature_c=21) == mine
-
-
-@pytest.mark.parametrize(("length", "unit", "per_nm", "value"), [
-    ("ANGSTROMS", "A / W", 10, 0.05), ("A", "A/W", 10, 0.05), ("microns", "A / W", 1e-3, 0.05),
-    ("Nanometers", "mA / W", 1, 50.0), ("nm", "%", 1, 5.0), ("nm", "percent", 1, 5.0),
-])  # fmt: skip
-def test_curve_units_in_any_spelling(
-    tmp_path: Path, mauve: Instrument, length: str, unit: str, per_nm: float, value: float
-) -> None:
-    """Read A as Angstrom of a wavelength and as ampere of a sensitivity."""
-    rows = "\n".join(f"{nm * per_nm:g} {value * k}" for k, nm in ((1, 180), (2, 500), (1, 800)))
-    (tmp_path / "curve.ecsv").write_text(
-        "# %ECSV 1.0\n# ---\n# datatype:\n"
-        f"# - {{name: wavelength, unit: '{length}', datatype: float64}}\n"
-        f"# - {{name: value, unit: '{unit}', datatype: float64}}\n# schema: astropy-2.0\nwavelength value\n{rows}\n"
-    )
-    name = "quantum_efficiency_a_per_w" if "W" in unit else "grating_efficiency"
-    curve = getattr(mauve.with_(**{name: tmp_path / "curve.ecsv"}), name)
-    np.testing.assert_allclose(curve.wavelength_nm, [180.0, 500.0, 800.0])
-    # The end values hold beyond the knots.
-    np.testing.assert_allclose(curve.at([100.0, 180.0, 340.0, 500.0, 900.0]), [0.05, 0.05, 0.075, 0.1, 0.05])
-
-
-def test_each_column_changes_its_own_quantity(mauve: Instrument) -> None:
-    n, part, star = np.arange(2048), mauve.read_pixels, Source.from_library("G2V").at_magnitude(6.0)
-    given = PixelMap(
-        response=n % 64 / 64, dark=1 + n / 1024, gain=1 - n / 8192, bias_dn=500.0 + n, read_noise_dn=10 + n / 500
-    )
-    maps = (None, given, PixelMap(dark=given.dark))
-    plain, uneven, only_dark = (expect(star, mauve.with_(pixel_map=one), exposure=5.0) for one in maps)
-    assert (part.start, part.stop - part.start) == (76, plain.wavelength_nm.size)
-    for name, factor in (("source_electrons", "response"), ("dark_dn", "dark"), ("gain_dn_per_electron", "gain")):
-        found = getattr(plain, name) * getattr(given, factor)[part]
-        np.testing.assert_allclose(getattr(uneven, name), found, rtol=1e-12)
-    np.testing.assert_array_equal(uneven.bias_dn, given.bias_dn[part])
-    np.testing.assert_array_equal(uneven.read_noise_dn, given.read_noise_dn[part])
-    np.testing.assert_array_equal(only_dark.source_electrons, plain.source_electrons)
-    assert mauve.with_(pixel_map=given).digest != mauve.digest
 
 
 def test_written_maps_are_read_back(tmp_path: Path) -> None:

@@ -1,19 +1,14 @@
 """Stars of the library and their names wherever a star can be given, formulas, and neighbours in the fibre."""
 
 import re
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import Table
 from refusals import refused
-from scenes import quiescent, source
-from synphot import SourceSpectrum
-from synphot.models import BlackBodyNorm1D
-from synphot.units import FLAM
+from scenes import quiescent
 
 import mauvecl
 from mauvecl import Expectation, PixelMap, Source, Study, expect, simulate, snr, visible
@@ -32,18 +27,15 @@ def target(name: str) -> Any:
     ("gj581", "M3V"), ("GX And", "M1V"),  # stars with spectra of their own; the library has one as GJ 15A
     ("BLACK BODY 9e3K", "blackbody 9000 K"), ("planck 5772.5 K", "blackbody 5772.5 K"),
     ("powerlaw +1.50", "power law 1.5"),
-])  # fmt: skip
-def test_names_of_spectra_are_resolved(text: str, name: str) -> None:
-    assert Source.from_library(text).name == name
-    assert Source.from_library(name).digest == Source.from_library(text).digest
-
-
-@pytest.mark.parametrize(("text", "name"), [
-    ("epsilon Eri", "eps Eri"), ("EPS ERI", "eps Eri"), ("hd22049", "eps Eri"), ("gj581", "GJ 581"),
+    ("epsilon Eri", "eps Eri"), ("EPS ERI", "eps Eri"), ("hd22049", "eps Eri"), ("gj581", "GJ 581"),  # targets
     ("Proxima", "Proxima Cen"), ("GJ 354.1", "DX Leo"),  # a decimal point that counts
 ])  # fmt: skip
-def test_names_of_targets_are_resolved(text: str, name: str) -> None:
-    assert target(text).name == name
+def test_names_are_resolved(text: str, name: str) -> None:
+    if name in KNOWN["name"]:
+        assert target(text).name == name
+    else:
+        assert Source.from_library(text).name == name
+        assert Source.from_library(name).digest == Source.from_library(text).digest
 
 
 def test_given_values_win_over_those_of_the_list() -> None:
@@ -74,7 +66,7 @@ def test_given_values_win_over_those_of_the_list() -> None:
 def test_types_between_those_of_the_library_take_the_nearest_with_a_message(text: str, nearest: str) -> None:
     star = Source.from_library(text)
     np.testing.assert_array_equal(star.flux_flam, Source.from_library(nearest).flux_flam)
-    assert star.messages[0].startswith(f"spectrum of {Source.from_library(nearest).name}, the nearest to type ")
+    assert star.messages[0].startswith(f"spectrum of {nearest}, the nearest to type ")
 
 
 def test_every_listed_star_is_found_with_its_light_and_place() -> None:
@@ -95,31 +87,8 @@ def test_every_listed_star_is_found_with_its_light_and_place() -> None:
     assert target("19h22m00s -11d12m00s").ra_deg == pytest.approx(290.5)
 
 
-@pytest.mark.parametrize("kelvin", [3000, 5772, 30_000])
-def test_blackbody_equals_that_of_synphot(kelvin: int) -> None:
-    """Between its points, too, since answers interpolate it; relative to its flux at 550 nm."""
-    star = Source.from_library(f"Blackbody {kelvin} k")
-    at = np.linspace(200.0, 700.0, 1001)
-    other = SourceSpectrum(BlackBodyNorm1D, temperature=kelvin)(at * u.nm, flux_unit=FLAM).value
-    own = np.interp(at, star.wavelength_nm, star.flux_flam)
-    middle = np.searchsorted(at, 550.0)
-    np.testing.assert_allclose(own / own[middle], other / other[middle], rtol=3e-5)
-    assert star.temperature_k == kelvin
-
-
-@pytest.mark.parametrize("index", [-4.0, 0.0, 2.5])
-def test_power_law_has_its_index_and_no_level(index: float) -> None:
-    formula = Source.from_library(f"power-law {index}")
-    assert formula.unscaled
-    star = formula.at_magnitude(9.0)
-    assert not star.unscaled
-    slope = np.diff(np.log(star.flux_flam)) / np.diff(np.log(star.wavelength_nm))
-    np.testing.assert_allclose(slope, index, atol=1e-9)
-    assert star.magnitude("V") == pytest.approx(9.0)
-
-
 ALONE = quiescent("G2V", 7.4)
-B, C, FAR = "B,12.5,6.9,K5V", "C,47.0,8.0,F5V", "D,47.47,1.0,A0V"
+B, FAR = "B,12.5,6.9,K5V", "D,47.47,1.0,A0V"
 
 
 def seen(folder: Path, *rows: str, share: float = 1.0, **changes: Any) -> Expectation:
@@ -127,26 +96,6 @@ def seen(folder: Path, *rows: str, share: float = 1.0, **changes: Any) -> Expect
     star = {"library": "G2V", "magnitude": 7.4, "neighbours": str(folder / "near.csv"), "neighbour_share": share}
     study = {"star": [star], "observation": {"exposure_s": 50.0, "changes": changes}}
     return simulate(Study.build(study, "test").paper()).inputs[0]
-
-
-@pytest.mark.parametrize("share", [1.0, 0.3])
-def test_light_and_noise_equal_those_of_the_summed_spectrum(tmp_path: Path, share: float) -> None:
-    stars = source("G2V", 7.4), source("K5V", 6.9), source("F5V", 8.0)
-    nm = np.unique(np.concatenate([star.wavelength_nm for star in stars]))
-    nm = nm[(nm >= max(star.wavelength_nm[0] for star in stars)) & (nm <= 1000)]
-    own, *others = (np.interp(nm, star.wavelength_nm, star.flux_flam) for star in stars)
-    whole = expect(Source.from_arrays(nm, own + share * sum(others)), "mauvesim", exposure=50.0)
-    x = seen(tmp_path, B, C, FAR, share=share)
-    np.testing.assert_allclose(x.mean_raw_dn, whole.mean_raw_dn, rtol=1e-9)
-    np.testing.assert_allclose(x.variance_dn2, whole.variance_dn2, rtol=1e-9)
-    # The signal is the star's alone, and its S/N falls by the noise of the others.
-    np.testing.assert_allclose(x.signal_dn, ALONE.signal_dn, rtol=1e-9)
-    noise = np.sqrt(whole.variance_dn2 - x.n_frames / 12)
-    np.testing.assert_allclose(x.snr(), ALONE.signal_dn / noise, rtol=1e-6)
-    budget = x.noise_budget()
-    parts = [budget[name].value ** 2 for name in budget.colnames if name not in ("wavelength", "total")]
-    np.testing.assert_allclose(np.sum(parts, axis=0), budget["total"].value ** 2, rtol=1e-12)
-    assert "neighbour_photon" not in ALONE.noise_budget().colnames
 
 
 def test_light_of_neighbours_follows_from_magnitude_share_and_place(tmp_path: Path) -> None:
@@ -157,12 +106,13 @@ def test_light_of_neighbours_follows_from_magnitude_share_and_place(tmp_path: Pa
     twin = seen(tmp_path, "twin,1.0,7.4,G2V", pixel_map=str(tmp_path / "map.ecsv"))
     np.testing.assert_allclose(twin.neighbour_electrons, twin.source_electrons, rtol=1e-12)
     # A star beyond the fibre needs neither magnitude nor type.
+    assert "neighbour_photon" not in ALONE.noise_budget().colnames
     for x in (seen(tmp_path, FAR), seen(tmp_path, "x,50,,"), seen(tmp_path, B, share=0.0)):
         np.testing.assert_array_equal(x.variance_dn2, ALONE.variance_dn2)
         assert x.target_share == 1.0
 
 
-def test_messages_on_neighbours(tmp_path: Path) -> None:
+def test_messages_and_noise_of_neighbours(tmp_path: Path) -> None:
     for row, said in (
         (FAR, "none within 47.46 arcsec; 1 star beyond does not enter"),
         ("c,1,9,M2V", "of type M2V: M1V, the nearest type"),
@@ -170,13 +120,11 @@ def test_messages_on_neighbours(tmp_path: Path) -> None:
         ("A,0.3,7.2,G2V", "neighbours_of"),
     ):
         assert said in " ".join(seen(tmp_path, row).messages)
-
-
-def test_noise_by_origin_has_no_number_where_a_star_has_no_neighbour(tmp_path: Path) -> None:
-    (tmp_path / "near.csv").write_text(f"name,separation,V,sptype\n{B}\n")
+    # Noise by origin has no number where a star has no neighbour.
     alone = {"library": "G2V", "magnitude": 7.4}
     both = [alone | {"neighbours": str(tmp_path / "near.csv")}, alone]
-    noise = snr(Study.build({"star": both, "observation": {"exposure_s": 50.0}}, "test")).views[1].table
+    few = {"star": both, "observation": {"exposure_s": 50.0}, "run": {"realisations": 1000}}
+    noise = snr(Study.build(few, "test")).views[1].table
     assert np.isnan(noise["neighbour_photon"].value).tolist() == [False] * 4 + [True] * 4
 
 
@@ -194,41 +142,6 @@ def test_each_spectrum_is_usable_and_has_an_origin(entry: Any) -> None:
     header = Table.read(LIBRARY / "spectra" / entry["file"], format="ascii.ecsv").meta
     for key in ("origin", "citation", "licence", "uv_quality"):
         assert header[key] == entry[key] != ""
-    assert 2500 < float(entry["temperature_k"]) < 30_000
-    assert source.temperature_k == float(entry["temperature_k"])
-    # Templates are kept at V = 0; the Sun and Vega need no magnitude.
-    assert bool(source.unscaled) == (entry["name"] not in ("Sun", "Vega"))
-    assert not source.at_magnitude(7.0).unscaled
-
-
-def mean(name: str, low: float, high: float) -> float:
-    star = Source.from_library(name)
-    return float(star.flux_flam[(star.wavelength_nm >= low) & (star.wavelength_nm < high)].mean())
-
-
-def test_ultraviolet_falls_with_class_or_is_reported_as_noise() -> None:
-    """Check the near ultraviolet of G5V to M4V; that of M5V and M6V is noise, and blue ends fall 20 nm by 20 nm."""
-    order = ["G5V", "G8V", "K1V", "K2.5V", "K5V", "K6V", "M0V", "M1V", "M3V", "M4V", "M5V", "M6V"]
-    near = {name: mean(name, 290, 310) / mean(name, 540, 560) for name in order}
-    assert all(near[own] < 2 * near[warm] for warm, own in pairwise(order[:-2]))
-    for name, limit in {"M0V": 0.0, "M1V": 240.0, "M3V": 0.0, "M4V": 240.0, "M5V": 300.0, "M6V": 300.0}.items():
-        said = f"noise rules its ultraviolet below {limit:g} nm, where its flux is an upper limit"
-        assert Source.from_library(name).messages == ((said,) if limit else ())
-        assert (near[name] > 2 * near["M4V"]) <= (limit >= 300 or name in ("M0V", "M1V"))
-        starts = [nm for nm in np.arange(max(limit, 200.0), 400.0, 20.0) if nm != 280.0]
-        bands = [mean(name, nm, nm + 20) for nm in starts]
-        assert all(blue < 1.2 * red for blue, red in pairwise(bands))
-
-
-def test_colours_are_those_of_the_classes() -> None:
-    """Compare B - V with Pickles (1998, table 2) to 0.03, and check Vega's zero and Gaia's colour of red stars."""
-    for name, colour in (("B5V", -0.14), ("A5V", 0.17), ("F0V", 0.31), ("G0V", 0.59), ("G2V", 0.63), ("G5V", 0.68)):
-        star = Source.from_library(name)
-        assert star.magnitude("B") - star.magnitude("V") == pytest.approx(colour, abs=0.03)
-    stars = map(Source.from_library, ("Vega", "G2V", "K5V", "M0V", "M3V", "M6V"))
-    gaia = [star.magnitude("Gaia BP") - star.magnitude("Gaia RP") for star in stars]
-    assert gaia[0] == pytest.approx(0.0, abs=1e-9)
-    assert all(a < b for a, b in pairwise(gaia))
 
 
 def test_every_spectrum_and_band_states_its_source() -> None:

@@ -160,21 +160,6 @@ def test_wavelength_and_bin_of_an_snr_are_kept_in_the_text(settings: dict[str, A
     assert "signal" not in tomllib.loads(Study().toml())
 
 
-@pytest.mark.parametrize(
-    ("key", "words"),
-    [
-        ("flare.amplitudes", "between 0 and 1e6,"),
-        ("star.0.distance_pc", "between 1e-7 and 1e6 pc,"),
-        ("observation.exposure_s", "above 0 and up to 86400 s,"),
-        ("stare.pointing.rate_per_h", "above 0 and up to 3600 per hour,"),
-    ],
-)
-def test_ends_of_a_range_are_written_as_people_write_them(key: str, words: str) -> None:
-    value = "[-1]" if key == "flare.amplitudes" else "-1"
-    with pytest.raises(InputError, match=words):
-        Study().with_settings([f"{key}={value}"])
-
-
 def test_study_of_an_older_version_is_read_and_keeps_its_keys() -> None:
     """Read a study of the version in which limits, curves and cooling had classes for their text."""
     given = tomllib.loads((STUDIES / "older.toml").read_text(encoding="utf-8"))
