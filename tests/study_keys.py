@@ -26,9 +26,10 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from models_in(part)
 
 
-def metadata(field: FieldInfo, kind: str) -> Any:
-    """Return the first piece of metadata of a kind, by the name of its class."""
-    return next((one for one in (*field.metadata, *_within(field.annotation)) if type(one).__name__ == kind), None)
+def metadata(field: FieldInfo, kind: str, *, every: bool = False) -> Any:
+    """Return the first piece of metadata of a kind, by the name of its class, or all of them."""
+    found = [one for one in (*field.metadata, *_within(field.annotation)) if type(one).__name__ == kind]
+    return found if every else next(iter(found), None)
 
 
 def _within(annotation: Any) -> Iterator[Any]:
