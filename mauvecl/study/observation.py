@@ -11,7 +11,7 @@ from pydantic import AfterValidator, create_model, model_validator
 
 from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
+from mauvecl.host.instrument import DEFAULT_INSTRUMENT, FORMERLY_MAUVE, current_name, shipped_names
 from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
 from mauvecl.schema import fields
@@ -27,6 +27,13 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.background import Sky
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
+
+
+#: Embedded instruments in help texts.
+INSTRUMENTS = [
+    f"{name} (with the conventions of the MauveSim paper)" if name == FORMERLY_MAUVE else name
+    for name in shipped_names()
+]
 
 
 class Observation(Section):
@@ -45,11 +52,11 @@ class Observation(Section):
         DEFAULT_INSTRUMENT,
         "Instrument",
         flag="--instrument",
-        choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file",
+        choices=f"{', '.join(INSTRUMENTS)}, or your own TOML file",
         label="Payload",
         hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
         "MauveSim paper, which makes the dark noise 1.3 times as large.",
-        options=("mauve", "mauvesim"),
+        options=shipped_names(),
     )
     temperature_c: fields.DetectorTemperature | None = setting(
         None,
