@@ -52,13 +52,16 @@ def valued(data: Any, key: str) -> Any:
 
 
 def test_fields_are_shown_where_they_matter(words: dict[str, Any]) -> None:
-    assert {tab: {*seen["reads"]} for tab, seen in words["tabs"].items()} == SHOWN
+    assert words["tabs"].keys() == SHOWN.keys(), "shown.toml lists the fields of every tab"
+    for tab, seen in words["tabs"].items():
+        assert {*seen["reads"]} == SHOWN[tab], f"shown.toml lists other fields of the tab {tab}"
 
 
 async def test_every_field_is_a_key_of_the_study(talk: Talk, words: dict[str, Any]) -> None:
     """In the downloaded study, in the printed command and in the printed program."""
     uploads = {name for name, one in words["uploads"].items() for name in (name, *one["options"])}
-    assert FIELDS.keys() == words["fields"].keys() - uploads - {"as_observed", "change_band"} | {"star", "own_unknown"}
+    expected = words["fields"].keys() - uploads - {"as_observed", "change_band"} | {"star", "own_unknown"}
+    assert FIELDS.keys() == expected, "fields.toml has a key and a value of every field"
     for name, row in FIELDS.items():
         tab = row.get("tab") or next(tab for tab in SHOWN if name in SHOWN[tab])
         before = row.get("before", {})
