@@ -332,7 +332,7 @@ def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]
     return low, high
 
 
-def read_frames(text: str, name: str) -> str | list[int]:
+def read_frame_choice(text: str, name: str) -> str | list[int]:
     """Read which frames are stored: stack, all, or numbers such as 0,4,9."""
     if text in ("stack", "all"):
         return text
