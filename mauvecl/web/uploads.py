@@ -32,7 +32,7 @@ from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import built
 from mauvecl.study.questions import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN, read_points
-from mauvecl.web.sandboxed_reader import read_limited
+from mauvecl.web.sandboxed_reader import EXPECTED_FRAMES, read_limited
 
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
@@ -281,7 +281,8 @@ def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bi
     if mapping is not None:
         mapping_name = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[mapping_name] = mapping.content
-    return read_limited(Frames, read_frames, files, mapping=mapping_name, quality_bits=quality_bits)
+    options = {"mapping": mapping_name, "quality_bits": quality_bits}
+    return read_limited(Frames, read_frames, files, expected=EXPECTED_FRAMES, **options)
 
 
 #: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.
