@@ -444,6 +444,7 @@ def choose(roles: Sequence[Role], words: Sequence[str] = ()) -> tuple[tuple[int,
 
 
 def _named(name: str, names: Sequence[str]) -> int:
+    """Return the place of the column that a user names; raises InputError unless it is one."""
     indices = [i for i, column in enumerate(names) if column.strip() == name]
     if not indices and (index := numbered("column", name, len(names))) is not None:
         return index
@@ -455,6 +456,7 @@ def _named(name: str, names: Sequence[str]) -> int:
 
 
 def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ...]) -> int:
+    """Return the place of the column of flux; raises InputError if none is recognised."""
     if best := _best("flux", roles, wavelength) or _best("model", roles, wavelength):
         return _only("flux", names, best)
     candidates = [i for i in range(len(names)) if i not in wavelength]
@@ -477,6 +479,7 @@ def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list
 
 
 def _only(quantity: str, names: Sequence[str], indices: Sequence[int]) -> int:
+    """Return the place of the only column of a quantity; raises InputError if there are several."""
     if len(indices) == 1:
         return indices[0]
     if not indices:

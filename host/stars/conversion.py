@@ -375,6 +375,7 @@ def _stated_unit(quantity: str, role: Role, user_unit: Any, messages: list[str])
 
 
 def _power(values: Float, base: str, limits: tuple[float, float], column: str) -> Float:
+    """Return the values whose logarithms a column holds; raises InputError if they cannot be logarithms."""
     logarithms = values * np.log10(np.e) if base == "e" else values
     finite = logarithms[np.isfinite(logarithms)]
     # Linear fluxes under a wrong name are all but zero.
@@ -386,6 +387,7 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
 
 
 def _check_flux_unit(unit: Any, role: Role) -> None:
+    """Raise InputError unless a unit is that of a flux density, or of a flux if the name of its column says so."""
     kind, usual = flux_kind(unit), "such as erg / (s cm2 Angstrom)"
     fault = ""
     if kind == "other":

@@ -196,6 +196,7 @@ class LimitSearch:
             return float("nan")
 
     def _beyond(self, value: float, verb: str) -> InputError:
+        """Return the error of a limit that lies beyond the searched range."""
         star, (low, high) = self.case.star, sorted(SEARCH[self.of])
         name = str(star.library or star.file)
         if self.of != "magnitude" and star.magnitude is not None:

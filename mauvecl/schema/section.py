@@ -79,6 +79,7 @@ def input_error(where: str, model: type[BaseModel], error: ValidationError) -> I
 
 
 def _input_error_of(model: type[BaseModel], fault: Any) -> InputError:
+    """Return a fault that pydantic finds in a model as an InputError."""
     path = [str(step) for step in fault["loc"] if step != "[key]"]
     key = ".".join(path) or model.__name__.lower()
     value, message = fault.get("input"), fault["msg"]

@@ -256,6 +256,7 @@ READERS: dict[str, Callable[[str], Any]] = {
 
 
 def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> Callable[[str], Any]:
+    """Return the function that reads the text of a field."""
     choices = widget.choices or (get_args(field.annotation) if get_origin(field.annotation) is Literal else ())
     if choices:
         return Choice(choices)
