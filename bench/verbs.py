@@ -22,6 +22,8 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
+from mauvecl import Engine
+
 #: Words of each command, wanted wall seconds, and the wanted ratio to the kernels' own time.
 CASES: dict[str, tuple[list[str], float, float]] = {
     "--version": (["--version"], np.nan, np.nan),
@@ -54,7 +56,8 @@ def aside():
     living = [t.ident for t in threading.enumerate() if t not in gone and t is not threading.current_thread()]
     clocks = [time.clock_gettime(time.pthread_getcpuclockid(i)) for i in living]
     return sum(clocks) + sum(gone.values())
-sys.argv = ["mauvecl", *json.loads(sys.argv[1])]
+home, words = sys.argv[1:]
+sys.argv = ["mauvecl", *json.loads(words)]
 found = {"kernel": 0.0, "alone": 0.0}
 def watched(inner):
     def count(self, *given, **more):
@@ -68,7 +71,7 @@ def watched(inner):
 class Watch:
     # Modules are left to be loaded when the command asks for them.
     def find_spec(self, name, path, target=None):
-        if name != "mauvecl.device.engine":
+        if name != home:
             return None
         sys.meta_path.remove(self)
         import importlib.util
@@ -93,7 +96,11 @@ def measured(words: list[str], folder: str) -> dict[str, float]:
     """Return the times of one run, s."""
     start = time.perf_counter()
     child = subprocess.run(
-        [sys.executable, "-c", CHILD, json.dumps(words)], capture_output=True, text=True, cwd=folder, check=False
+        [sys.executable, "-c", CHILD, Engine.__module__, json.dumps(words)],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        check=False,
     )
     wall = time.perf_counter() - start
     seconds: dict[str, float] = json.loads(child.stderr.splitlines()[-1])

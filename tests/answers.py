@@ -4,12 +4,14 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from typer.main import get_command
 
+import mauvecl
 from mauvecl import Detection, Engine, Expectation, Study, simulate
+from mauvecl.cli import app
 
-#: Questions, in the order of the command line.
-VERBS = ("simulate", "snr", "exposure", "detect", "limit", "map", "gaussian", "measure", "stare", "inject", "analyse",
-         "change", "calibrate", "visible", "plan")  # fmt: skip
+#: Questions, in the order of the command line: commands that are functions in Python, too.
+VERBS = tuple(name for name in get_command(app.app).commands if name in mauvecl.__all__)  # type: ignore[attr-defined]
 #: All statistics.
 STATISTICS = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")
 #: Realisations: several shards, the last a short one.

@@ -19,8 +19,11 @@ from mauvecl import Instrument, Study
 from mauvecl.cli import app
 
 ROOT = Path(__file__).parent.parent
-#: `mauvecl/detection/detection.py`, or with a name in it: `mauvecl/detection/detection.py: Roc`.
-NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
+#: `mauvecl/detection/detection.py`, or with a name in it: `mauvecl/detection/detection.py: Roc`. Paths of sources may
+#: begin below `mauvecl`.
+NAMED = re.compile(
+    r"`((?:(?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)|(?:\w+/[\w/]+\.py))(?::\s*(\w+))?[^`]*`"
+)
 #: What defines a name, by a file's ending.
 DEFINITIONS = {".py": r"^\s*(?:def|class) {0}\b|^{0}\b.* = |^    {0}: ", ".mako": r"^(?:INLINE )?\w+ {0}\("}
 
@@ -31,11 +34,14 @@ def all_pages() -> list[Path]:
 
 def test_documented_names_exist() -> None:
     named = [(page.name, *found) for page in all_pages() for found in NAMED.findall(page.read_text(encoding="utf-8"))]
-    assert not [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
+    places = {
+        file: next((one for top in ("", "mauvecl") for one in (ROOT / top).glob(file)), None) for _, file, _ in named
+    }
+    assert [(page, file) for page, file, _ in named if places[file] is None] == []
     defined = [(page, file, name) for page, file, name in named if name]
     assert len(defined) > 40
     for page, file, name in defined:
-        pattern, text = DEFINITIONS[Path(file).suffix].format(name), (ROOT / file).read_text(encoding="utf-8")
+        pattern, text = DEFINITIONS[Path(file).suffix].format(name), places[file].read_text(encoding="utf-8")
         assert re.search(pattern, text, re.MULTILINE), (page, file, name)
     dotted = re.findall(r"`(mauvecl(?:\.\w+)+)`", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
     assert len(dotted) > 25

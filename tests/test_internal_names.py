@@ -6,8 +6,10 @@ reasons that are there, and leaves those of new names empty.
 
 import ast
 import json
+import pkgutil
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 TESTS = Path(__file__).parent
@@ -18,20 +20,29 @@ HEAD = """# Names inside mauvecl that tests import or replace, and why the publi
 """
 
 
+#: Imports and names in texts: names to replace, and code that tests run in other processes.
+IN_TEXT = re.compile(r"\bfrom (mauvecl[\w.]*) import (\w+(?:, \w+)*)|\b(mauvecl(?:\.\w+){2,})")
+
+
+def named(node: ast.AST) -> Iterator[tuple[str, str]]:
+    """Yield the names that an import or a text has from mauvecl, each with the module that it needs."""
+    if isinstance(node, ast.ImportFrom) and node.module is not None:
+        yield from ((f"{node.module}.{one.name}", node.module) for one in node.names)
+    elif isinstance(node, ast.Import):
+        yield from ((one.name, one.name) for one in node.names)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+        for home, names, name in IN_TEXT.findall(node.value):
+            yield from ((f"{home}.{one}", home) for one in names.split(", ") if one)
+            if name:
+                yield name, name
+
+
 def internal_names() -> set[str]:
-    """Return every name that a test imports from below the root of the package, or writes as text to replace it."""
+    """Return every name from below the root of the package that a test, or code that it runs, imports or replaces."""
     found = set()
     for path in TESTS.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module is not None:
-                modules = [(f"{node.module}.{one.name}", node.module) for one in node.names]
-            elif isinstance(node, ast.Import):
-                modules = [(one.name, one.name) for one in node.names]
-            elif isinstance(node, ast.Constant) and re.fullmatch(r"mauvecl(\.\w+){2,}", str(node.value)):
-                modules = [(node.value, node.value)]
-            else:
-                continue
-            for name, module in modules:
+            for name, module in named(node):
                 package = module.split(".")[0]
                 if package == "host" or (package == "mauvecl" and module != "mauvecl"):
                     found.add(name)
@@ -44,6 +55,12 @@ def listed() -> dict[str, str]:
 
 def test_internal_names_are_those_of_the_list() -> None:
     assert sorted(internal_names()) == sorted(listed())
+
+
+def test_internal_names_exist() -> None:
+    """Resolve every name: a test that something is not loaded would pass for ever if that had moved."""
+    for name in listed():
+        pkgutil.resolve_name(name)
 
 
 if __name__ == "__main__":

@@ -94,6 +94,7 @@ def electrons_per_second(
 
 @lru_cache(maxsize=8)
 def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
+    """Return the cached matrix of an instrument for nodes, which are bytes."""
     by_light = instrument if order == "physical" else None
     matrix = _product(LineSpread.of(instrument), nodes, by_light)
     if by_light:

@@ -418,7 +418,7 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
 
 
-def as_typed(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
+def choice_example(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
     typed = TYPED.fullmatch(word) is not None and word.isprintable()
@@ -444,6 +444,7 @@ def choose(roles: Sequence[Role], words: Sequence[str] = ()) -> tuple[tuple[int,
 
 
 def _named(name: str, names: Sequence[str]) -> int:
+    """Return the place of the column that a user names; raises InputError unless it is one."""
     indices = [i for i, column in enumerate(names) if column.strip() == name]
     if not indices and (index := numbered("column", name, len(names))) is not None:
         return index
@@ -455,6 +456,7 @@ def _named(name: str, names: Sequence[str]) -> int:
 
 
 def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ...]) -> int:
+    """Return the place of the column of flux; raises InputError if none is recognised."""
     if best := _best("flux", roles, wavelength) or _best("model", roles, wavelength):
         return _only("flux", names, best)
     candidates = [i for i in range(len(names)) if i not in wavelength]
@@ -464,7 +466,9 @@ def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ..
     shown = (unknown or candidates or [0])[0]
     descriptions = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in candidates]
     fault = f"no column is recognised as a star's flux, only {listed(descriptions) or 'the wavelength'}"
-    raise InputError(f"{fault}; give the column as in {as_typed(names[shown], 'column', shown, names)}", key="columns")
+    raise InputError(
+        f"{fault}; give the column as in {choice_example(names[shown], 'column', shown, names)}", key="columns"
+    )
 
 
 def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list[int]:
@@ -475,6 +479,7 @@ def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list
 
 
 def _only(quantity: str, names: Sequence[str], indices: Sequence[int]) -> int:
+    """Return the place of the only column of a quantity; raises InputError if there are several."""
     if len(indices) == 1:
         return indices[0]
     if not indices:
@@ -482,4 +487,6 @@ def _only(quantity: str, names: Sequence[str], indices: Sequence[int]) -> int:
         raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     several = [names[i].strip() for i in indices]
     fault = f"{len(several)} columns may be the {quantity}: {listed(several)}"
-    raise InputError(f"{fault}; give one as in {as_typed(several[-1], 'column', indices[-1], names)}", key="columns")
+    raise InputError(
+        f"{fault}; give one as in {choice_example(several[-1], 'column', indices[-1], names)}", key="columns"
+    )

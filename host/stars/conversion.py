@@ -17,7 +17,17 @@ import astropy.units as u
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.stars.columns import Role, as_typed, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
+from mauvecl.host.stars.columns import (
+    Role,
+    choice_example,
+    choose,
+    flux_kind,
+    is_spectral,
+    linear,
+    listed,
+    numbered,
+    role_of,
+)
 from mauvecl.host.stars.spectrum import FLUX_UNIT, check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, ends_of, marks_in, without_indefinite
@@ -104,7 +114,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> Spectr
         segments = [segment for spectrum in spectra for segment in spectrum.segments]
         message = f"its parts {listed(titles)} are joined"
         return replace(first, segments=segments, messages=(*first.messages, message))
-    example = as_typed(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
+    example = choice_example(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
     raise InputError(f"{len(titles)} tables have a spectrum: {listed(titles)}; give one as in {example}", key="table")
 
 
@@ -237,7 +247,7 @@ def _selected_row(identifiers: Sequence[Sequence[str]], words: Sequence[str], na
     labels = [(identifiers[row] or [""])[0] or number for row, number in zip(fitting, numbers, strict=True)]
     labels = labels if len(set(labels)) == len(labels) else numbers
     fault = f"it contains {len(fitting)} spectra, one in each row ({listed(labels)})"
-    raise InputError(f"{fault}; give one as in {as_typed(labels[0], 'row', fitting[0], labels)}", key="rows")
+    raise InputError(f"{fault}; give one as in {choice_example(labels[0], 'row', fitting[0], labels)}", key="rows")
 
 
 #: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.
@@ -365,6 +375,7 @@ def _stated_unit(quantity: str, role: Role, user_unit: Any, messages: list[str])
 
 
 def _power(values: Float, base: str, limits: tuple[float, float], column: str) -> Float:
+    """Return the values whose logarithms a column holds; raises InputError if they cannot be logarithms."""
     logarithms = values * np.log10(np.e) if base == "e" else values
     finite = logarithms[np.isfinite(logarithms)]
     # Linear fluxes under a wrong name are all but zero.
@@ -376,6 +387,7 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
 
 
 def _check_flux_unit(unit: Any, role: Role) -> None:
+    """Raise InputError unless a unit is that of a flux density, or of a flux if the name of its column says so."""
     kind, usual = flux_kind(unit), "such as erg / (s cm2 Angstrom)"
     fault = ""
     if kind == "other":

@@ -258,6 +258,7 @@ class _Reader:
         return [column for column in columns if column is not None]
 
     def _of_table(self, number: int) -> SpectrumTable:
+        """Return the spectrum of a table of the file."""
         # The units of the file apply to columns that state none (SDSS).
         flux, wave = (unit_at(keys, self.primary, self.hdus[number].header) for keys in (FLUX_UNITS, WAVE_UNITS))
         units_by_kind = dict.fromkeys(("flux", "model"), flux) | dict.fromkeys(AXES, wave)
@@ -313,6 +314,7 @@ class _Reader:
         return tables
 
     def _of_image(self, number: int) -> SpectrumTable:
+        """Return the spectrum of an image of the file, with wavelengths from its header."""
         hdu = self.hdus[number]
         header = hdu.header
         if (orders := _spextool_orders(header, hdu.data)) is not None:

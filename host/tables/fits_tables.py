@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mauvecl.host.tables import table
 from mauvecl.host.tables.files import check_content, limit_bytes, reading
 from mauvecl.host.tables.names import match_name, text_at
-from mauvecl.host.tables.table import TableFile, Values, dates_in, number_in, stacked
+from mauvecl.host.tables.table import TableFile, Values, as_one_array, dates_in, number_in
 from mauvecl.host.tables.units import SCALES
 from mauvecl.schema.errors import InputError
 
@@ -451,7 +451,7 @@ class FitsTables(TableFile):
         ucd, unit = text_at(hdu.header, f"TUCD{place}"), str(column.unit or "").strip()
         if column.format.format in ("P", "Q"):
             with reading(self.label, WHOLE):
-                return Values.of(column.name, stacked(_arrays(hdu, place)), unit, self.label, ucd)
+                return Values.of(column.name, as_one_array(_arrays(hdu, place)), unit, self.label, ucd)
         row_shape = np.shape(read(slice(0, min(1, n_rows))))
         width = 0 if small else 2 * int(hdu.header["NAXIS1"])
         return Values(column.name, (n_rows, *row_shape[1:]), read, unit, self.label, width, ucd, keywords=keywords)

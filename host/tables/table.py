@@ -171,7 +171,7 @@ def dates_in(scale: str) -> dict[str, Any]:
     return {"MJDREFI": 0, "MJDREFF": 0.0, "TIMESYS": scale.upper()}
 
 
-def stacked(cells: Any) -> Any:
+def as_one_array(cells: Any) -> Any:
     """Return arrays of variable length as one array if all have the same length; other cells are unchanged."""
     is_even = getattr(cells, "dtype", np.dtype(float)).kind == "O" and len({np.shape(cell) for cell in cells}) == 1
     return np.ma.stack(list(cells)) if is_even and np.ndim(cells[0]) else cells
@@ -332,7 +332,7 @@ class MemoryTable(TableFile):
             days = column.mjd if isinstance(column, Time) else column.to_value("d")
             values = Values.of(name, np.asarray(np.ma.filled(days, np.nan)), "d", self.label)
             return values if isinstance(column, TimeDelta) else replace(values, keywords=dates_in(column.scale))
-        meta, cells = column.info.meta or {}, stacked(getattr(column, "value", column))
+        meta, cells = column.info.meta or {}, as_one_array(getattr(column, "value", column))
         values = Values.of(name, cells, getattr(column, "unit", None), self.label, str(meta.get("ucd", "")),
                            column.info.description or "")  # fmt: skip
         return replace(values, keywords={key: meta[key] for key in TIMES if key in meta})

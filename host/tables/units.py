@@ -295,6 +295,7 @@ def position_of(text: str) -> str:
 
 
 def _number(header: Mapping[str, Any], key: str, label: str) -> float | None:
+    """Return a keyword as a number, or None without it; raises InputError for anything else."""
     value = header.get(key)
     if value is None or value == "":
         return None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, TableOf, metadata_of
+from mauvecl.answers.answer import Answer, TableOf, answer_metadata
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.fits.spectrum import Measurement
@@ -378,8 +378,8 @@ class AnalyseAnswer(Answer):
 
     #: One row per event, in order of time.
     events = TableOf("events", EVENTS, "rows", key="events", about=lambda answer: {
-        **metadata_of(answer, "study"), **answer.analysis.frames.time_keywords, "star": answer.analysis.frames.name,
-        **metadata_of(answer, "analysis.frames.unit", "analysis.threshold")})  # fmt: skip
+        **answer_metadata(answer, "study"), **answer.analysis.frames.time_keywords, "star": answer.analysis.frames.name,
+        **answer_metadata(answer, "analysis.frames.unit", "analysis.threshold")})  # fmt: skip
     #: One row per frame: flux, level, noise, and why it is not searched.
     frames = TableOf("frames", FRAMES, "analysis", about=lambda answer: {
         "star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit,

@@ -44,7 +44,7 @@ def name_of_instrument(study: Study) -> str:
     return "Mauve" if study.observation.instrument in shipped_names() else Path(study.observation.instrument).stem
 
 
-def first_of(number: int, name: str) -> str:
+def first_of_several(number: int, name: str) -> str:
     """Return the end of a sentence on the first of several things, as in ", the first of 3 limits", or nothing."""
     return f", the first of {number} {name}" if number > 1 else ""
 
@@ -98,7 +98,7 @@ class TableOf:
             return rows
         if isinstance(rows, Mapping) or not isinstance(rows, Iterable):
             rows = [rows]
-        about = self.about(answer) if callable(self.about) else metadata_of(answer, *self.about)
+        about = self.about(answer) if callable(self.about) else answer_metadata(answer, *self.about)
         if self.of is None:
             return table_of(self.columns_of(answer), rows, **about)
         tables = [(row, self.of(answer, row)) for row in rows]
@@ -122,7 +122,7 @@ def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
     return get(answer) if callable(get) else attrgetter(get)(answer)
 
 
-def metadata_of(answer: Answer, *paths: str) -> dict[str, object]:
+def answer_metadata(answer: Answer, *paths: str) -> dict[str, object]:
     """Return attributes of an answer by the last names of their paths; "study" is the text of the study."""
     values = {path.rpartition(".")[2]: attrgetter(path)(answer) for path in paths}
     return values | ({"study": answer.study.text()} if "study" in values else {})

@@ -20,7 +20,7 @@ from mauvecl.detection.distributions import CONFIDENCE_SD
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting
 from mauvecl.host.arrays import Float
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, values_of
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, unknown_values_of
 from mauvecl.schema.columns import Column, FirstItems, chance_text, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
@@ -184,7 +184,7 @@ def drawn(study: Study) -> DrawnStudies:
     nominal = o.load_instrument()
     # Values that the study sets are known.
     known_names = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
-    rows, priors = values_of(nominal), question.priors(nominal)
+    rows, priors = unknown_values_of(nominal), question.priors(nominal)
     priors = {name: prior for name, prior in priors.items() if name not in known_names}
     if question.draws and not priors:
         raise InputError("no instrument value is unknown; give a prior, or unknowns.draws = 0", key="unknowns.draws")
@@ -217,7 +217,7 @@ def throughput_cases(case: Case) -> list[Case]:
     the wavelengths are not known well enough for that.
     """
     moved, pixels = [], case.instrument.read_pixels
-    for mode in (row for row in values_of(case.instrument).values() if row.mode is not None):
+    for mode in (row for row in unknown_values_of(case.instrument).values() if row.mode is not None):
         signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
         same = next((sign for sign in signs if sign.instrument.read_pixels == pixels), None)
         if same is None:

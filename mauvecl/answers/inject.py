@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, first_of, reported, share_column
+from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, first_of_several, reported, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import Interval
 from mauvecl.device.stares import Stares
@@ -267,7 +267,7 @@ class InjectAnswer(Answer):
         scale, unit = (100, "%") if star.size == "amplitude" else (1, unit)
         of = star.size.replace("_", " ")
         ideal = "" if np.isnan(star.ideal_share) else f"; {scale * half.value * star.ideal_share:.3g} {IF_KNOWN}"
-        least = first_of(len(self.stars), "cases")
+        least = first_of_several(len(self.stars), "cases")
         if not np.isfinite(half.value):
             return f"Fewer than half of the injected flares on {star.title} are found at any {of}{least}."
         return (

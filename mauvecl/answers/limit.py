@@ -17,16 +17,16 @@ import numpy as np
 from scipy import special
 
 from mauvecl.answers import closed_forms as forms
-from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, first_of, share_column
+from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, first_of_several, share_column
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.detection.distributions import Interval, smallest_integer
-from mauvecl.detection.requests import STATISTICS, check_shape, fall_between
+from mauvecl.detection.requests import STATISTICS, check_template, fall_between
 from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.device.engine import Engine
 from mauvecl.host.arrays import Float
 from mauvecl.noise.disturbances import Uniform
-from mauvecl.noise.unknowns import values_of
+from mauvecl.noise.unknowns import unknown_values_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import INTERVAL, Column, View, interval, interval_columns, number, table_of
@@ -125,7 +125,7 @@ class LimitSearch:
             return 0.0
         statistic.check(setting)
         if statistic.shaped and not flare.saturated[setting.used].all():
-            check_shape(quiet, flare, setting.used)
+            check_template(quiet, flare, setting.used)
         return statistic.detection_forms(setting, flare, self.fap).probability
 
     def simulated(self, value: float, seed: int) -> Interval:
@@ -196,6 +196,7 @@ class LimitSearch:
             return float("nan")
 
     def _beyond(self, value: float, verb: str) -> InputError:
+        """Return the error of a limit that lies beyond the searched range."""
         star, (low, high) = self.case.star, sorted(SEARCH[self.of])
         name = str(star.library or star.file)
         if self.of != "magnitude" and star.magnitude is not None:
@@ -298,7 +299,7 @@ def what_matters(study: Study) -> QTable:
     rows = list[dict[str, Any]]()
     for case, statistic in product(_single_flares(cases(study, swept=False)), study.run.statistics):
         payload, nominal, moves = case.instrument, LimitSearch(case, statistic).root(), list[dict[str, Any]]()
-        values, changes = values_of(payload), dict[str, dict[str, Mapping[str, Any]]]()
+        values, changes = unknown_values_of(payload), dict[str, dict[str, Mapping[str, Any]]]()
         for name, prior in Unknowns().priors(payload).items():
             if isinstance(prior, Uniform):
                 ends = (prior.low, prior.high)
@@ -317,7 +318,7 @@ def what_matters(study: Study) -> QTable:
                 "nominal": nominal, "at_low_end": low, "at_high_end": high, "span": abs(high - low),
             })  # fmt: skip
         rows += sorted(moves, key=lambda row: -row["span"])
-    columns = assumption_columns(study.limit.of)
+    columns = limit_assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
     for name in (study.limit.of, "at_low_end", "at_high_end", "span"):
         table[name].info.format = LIMIT
@@ -335,7 +336,7 @@ def _single_flares(prepared: Sequence[Case]) -> list[Case]:
 LIMIT = ".3f"
 
 
-def assumption_columns(of: str) -> tuple[Column, ...]:
+def limit_assumption_columns(of: str) -> tuple[Column, ...]:
     """Return the columns of the table of assumptions, for limits of a quantity."""
     return (
         star_column(),
@@ -482,7 +483,7 @@ class LimitAnswer(Answer):
     #: One row per limit and draw of the unknown: its values and the closed-form limit.
     draws = TableOf("unknowns", _draw_columns, "limits", place=True, when="study.unknowns.draws")
     _assumptions = TableOf(
-        "assumptions", lambda answer: assumption_columns(answer.study.limit.of), "assumptions", key="assumptions",
+        "assumptions", lambda answer: limit_assumption_columns(answer.study.limit.of), "assumptions", key="assumptions",
         title=lambda answer: f"What is assumed, and how far it moves the closed-form limit of {answer.study.limit.of}, "
         "the largest first",
         when=lambda answer: answer.assumptions is not None,
@@ -502,7 +503,7 @@ class LimitAnswer(Answer):
         flare = "flares" if question.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
         within = "" if question.of == "exposure" else f" in {limit.quiet.exposure_s:g} s"
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
-        least = first_of(len(self.limits), "limits")
+        least = first_of_several(len(self.limits), "limits")
         return (
             f"{self.instrument_name} would see {flare} on {limit.title}{within} with a "
             f"chance of {100 * question.power:g} % {before} {number(limit.value.value)} "

@@ -427,6 +427,7 @@ class PlanAnswer(Answer):
 
     @property
     def _assumptions(self) -> list[tuple[str, str, str]]:
+        """Quantity, value and source of every assumption."""
         study, orbit, law = self.study, self.study.orbit.orbit(), self.study.plan.law()
         e = orbit.elements
         elements = f"{e.source}, epoch {e.epoch}; mean is a Sun-synchronous orbit through them"
@@ -467,6 +468,7 @@ class PlanAnswer(Answer):
 
     @property
     def _along_orbit(self) -> list[tuple[str, str, str]]:
+        """Assumptions on what changes along the orbit."""
         if not self.study.plan.along_orbit:
             return [("temperature and particles", "the study's", "the same for all targets")]
         hits, mean_c = self.study.processes.with_particles(0.0).particle_processes, self.study.observation.temperature_c
@@ -521,6 +523,7 @@ class PlanAnswer(Answer):
 
     @property
     def _messages_on_rates(self) -> list[str]:
+        """Messages on targets whose flare rates are typical, unknown or extrapolated."""
         planned, lines = self.planned, list[str]()
         typical = [target.name for target in planned if target.rates is not None and "typical" in target.rates.source]
         if typical:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, StarInCell, TableOf, first_of, reported
+from mauvecl.answers.answer import Answer, StarInCell, TableOf, first_of_several, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import smallest_integer
 from mauvecl.detection.snr import COLUMNS
@@ -89,7 +89,7 @@ class ExposureAnswer(Answer):
     @property
     def headline(self) -> str:
         """The exposure of the first star."""
-        first, least = self.exposures[0], first_of(len(self.exposures), "stars")
+        first, least = self.exposures[0], first_of_several(len(self.exposures), "stars")
         return (
             f"{first.star} reaches an S/N of {first.wanted:g} per {first.per} at {first.wavelength_nm:g} nm in "
             f"{first.exposure_s:g} s, {counted(first.frames, 'frame')}{least}."
@@ -182,7 +182,7 @@ def _best(title: str, x: Expectation, number: int) -> str:
     saturated = int(x.saturated.sum())
     without = f"; {saturated} of {x.saturated.size} pixels saturate" if saturated else ""
     best = f"{title} has an S/N of up to {snr.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
-    return f"{best}{without}{first_of(number, 'cases')}."
+    return f"{best}{without}{first_of_several(number, 'cases')}."
 
 
 class SimulatedObservation(NamedTuple):

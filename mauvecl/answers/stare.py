@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from mauvecl.answers.answer import Answer, StarInCell, TableOf, first_of, metadata_of, reported
+from mauvecl.answers.answer import Answer, StarInCell, TableOf, answer_metadata, first_of_several, reported
 from mauvecl.answers.inject import survey_star
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.device.stares import Stares
@@ -314,7 +314,7 @@ class StareAnswer(Answer):
         """The number of flares that the search of the first stare finds, or what is drawn."""
         stare = self.stares[0]
         frames, flares = stare.staring.stare.n_frames, len(stare.flares)
-        least = first_of(len(self.stares), "stares")
+        least = first_of_several(len(self.stares), "stares")
         drawn = f"{counted(flares, 'flare')} in {counted(frames, 'frame')} of {stare.title}"
         if np.isnan(stare.threshold):
             return f"The stare has {drawn}, which {'is' if flares == 1 else 'are'} not searched for{least}."
@@ -341,7 +341,7 @@ class StareAnswer(Answer):
         for (k, band), (kind, (attribute, text)) in product(enumerate(star.light.bands), LIGHT.items()):
             column = Column(kind + band_suffix(band, k), itemgetter(k), "DN / s", f"{band}: {text}")
             columns.append(column.of(attrgetter(f"light.{attribute}.T")))
-        return table_of(columns, [star], star=star.label, **metadata_of(self, *SEED), **star.at)
+        return table_of(columns, [star], star=star.label, **answer_metadata(self, *SEED), **star.at)
 
     @property
     def tables(self) -> dict[str, Table]:

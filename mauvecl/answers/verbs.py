@@ -76,13 +76,6 @@ class Verb:
     default: Callable[[dict[str, Any]], Study] | None = None
     # Whether the page has a tab with this answer; one without a class of its own shows its first view.
     tab: bool = False
-    # Module of `mauvecl.answers` that holds the function, if it is not named after it; it is imported at the first use.
-    home: str = ""
-
-    @property
-    def module(self) -> str:
-        """Name of the module that holds the function."""
-        return f"answers.{self.home or self.name}"
 
     def accepts(self, key: str) -> bool:
         """Return whether the command has the flags of a key or section of the study."""
@@ -114,8 +107,8 @@ class Verb:
 
     @property
     def ask(self) -> Callable[..., Any]:
-        """The function that answers."""
-        function: Callable[..., Any] = getattr(import_module(f"mauvecl.{self.module}"), self.name)
+        """The function that answers, whose module is imported at the first use."""
+        function: Callable[..., Any] = getattr(import_module("mauvecl"), self.name)
         return function
 
 
@@ -151,7 +144,6 @@ VERBS: dict[str, Verb] = {
             (*OBSERVATION, "flare", *SIGNAL, "run.seed"),
             group="simulate",
             common=("flare_temperature", "sky", "seed"),
-            home="signal",
         ),
         Verb(
             "snr",
@@ -173,7 +165,6 @@ VERBS: dict[str, Verb] = {
             counts="realisations",
             defaults=FEWER,
             default=_budgets_or_star,
-            home="signal",
         ),
         Verb(
             "exposure",
@@ -185,7 +176,6 @@ VERBS: dict[str, Verb] = {
     """,
             (*WITHOUT_EXPOSURE, "signal", *SIGNAL),
             common=("snr", "at", "per", "sky"),
-            home="signal",
         ),
         Verb(
             "detect",

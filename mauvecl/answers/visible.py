@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer, TableOf, first_of, metadata_of
+from mauvecl.answers.answer import Answer, TableOf, answer_metadata, first_of_several
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import Float, true_runs
@@ -131,7 +131,7 @@ class VisibleAnswer(Answer):
     table = TableOf(
         "visible", _target_columns, lambda answer: [answer._row(k) for k in range(len(answer.targets))],
         title=lambda answer: f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
-        about=lambda answer: {"start": answer.times.iso(0.0), **metadata_of(answer, "times.days", "study")},
+        about=lambda answer: {"start": answer.times.iso(0.0), **answer_metadata(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
     months = TableOf("months", lambda answer: (
@@ -150,7 +150,7 @@ class VisibleAnswer(Answer):
     def headline(self) -> str:
         """The hours in which the first target is seen."""
         row, duty_cycle = self._row(0), self.visibility.limits.duty_cycle
-        least = first_of(len(self.targets), "targets")
+        least = first_of_several(len(self.targets), "targets")
         if not row["hours"]:
             return f"{row['target']} is not seen in {self.times.days:g} days from {self.times.iso(0.0)[:10]}{least}."
         exposed = "" if duty_cycle == 1 else f" and exposed for {row['hours']:.0f} h"

@@ -112,7 +112,7 @@ TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.
 def light_curves(star: StarStare) -> Picture:
     """Plot light curves in all bands, relative to the quiescent star, with injected and found flares."""
     stare, bands, rows = star.staring.stare, star.light.bands, list[list[Panel]]()
-    scale, unit = time_unit(stare.duration_s)
+    scale, unit = shown_time_unit(stare.duration_s)
     lost = stare.numbers[:0] if star.pointing_loss is None else stare.numbers[star.pointing_loss > 0]
     ends = [(lost[run[0]] * stare.frame_s, (lost[run[-1]] + 1) * stare.frame_s) for run in _runs(lost) if run.size]
     always = [
@@ -149,7 +149,7 @@ def _stare_points(star: StarStare, band: int) -> tuple[tuple[Float, Float], tupl
     counts = np.diff(np.append(starts, stare.n_frames))
     columns = stare.middle_s, light.flux[:, band], light.mean[:, band]
     time, flux, mean = (np.add.reduceat(values, starts) / counts for values in columns)
-    time, level = time / time_unit(stare.duration_s)[0], np.median(light.mean[:, band])
+    time, level = time / shown_time_unit(stare.duration_s)[0], np.median(light.mean[:, band])
     at, is_gap = _with_gaps(np.arange(starts.size), np.searchsorted(starts, [run[0] for run in runs[1:]]))
     return (time, flux / level), (time[at], np.where(is_gap, np.nan, mean[at] / level))
 
@@ -179,7 +179,7 @@ def spectra_panel(
 
     The ends of events in time are marked above the spectra in colours.
     """
-    scale, unit = time_unit(stare.duration_s)
+    scale, unit = shown_time_unit(stare.duration_s)
     # The stare is shown on a regular grid with empty gaps.
     numbers = stare.numbers - stare.numbers[0]
     excess, _, step = column_sums(spectra - np.median(spectra, axis=0), numbers, MOST_ROWS)
@@ -217,7 +217,7 @@ def column_sums(values: Float, numbers: NDArray[np.int64], most: int) -> tuple[F
     return sums, counts, step
 
 
-def time_unit(duration_s: float) -> tuple[float, str]:
+def shown_time_unit(duration_s: float) -> tuple[float, str]:
     """Return the length of the unit in which a duration is shown, and its name."""
     return next((length_s, name) for longest_s, length_s, name in TIME_UNITS if duration_s <= longest_s)
 
@@ -301,7 +301,7 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     """
     analysis, used = answer.analysis, answer.analysis.level.used
     frames, flux, error = analysis.frames, analysis.flux, analysis.level.error
-    unit_s, unit = time_unit(float(np.ptp(frames.time_s)))
+    unit_s, unit = shown_time_unit(float(np.ptp(frames.time_s)))
     x = PlotAxis(f"time ({unit}) from {frames.date(float(frames.time_s[0]))[:19]}")
     label = f"flux ({frames.unit})" if frames.unit else "flux"
     around = float(np.min((flux - error)[used])), float(np.max((flux + error)[used]))
@@ -332,7 +332,7 @@ def observed_dynamic_spectrum(answer: AnalyseAnswer) -> Picture:
     marks, verdicts = [], [row.verdict for row in answer.rows]
     for event, verdict in zip(analysis.events, verdicts, strict=True):
         first, last = stare.start_s[[event.first, event.last]]
-        ends = np.array([first, last + stare.frame_s]) / time_unit(stare.duration_s)[0]
+        ends = np.array([first, last + stare.frame_s]) / shown_time_unit(stare.duration_s)[0]
         marks.append((ends, VERDICTS[verdict]))
     panel, _ = spectra_panel(stare, spectra.excess, sd, noise.wavelength_nm, marks)
     marked = ", ".join(f"{name} ({WORDS[colour]})" for name, colour in VERDICTS.items() if name in verdicts)
@@ -359,7 +359,7 @@ def observed_residuals(answer: AnalyseAnswer) -> Picture:
     """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
     analysis = answer.analysis
     residual, likeness = analysis.residual[:, 0], analysis.likeness
-    unit_s, unit = time_unit(float(np.ptp(analysis.frames.time_s)))
+    unit_s, unit = shown_time_unit(float(np.ptp(analysis.frames.time_s)))
     time = (analysis.survey.time_s[analysis.quiet] - analysis.frames.time_s[0]) / unit_s
     size = 1.7 if time.size > 1000 else 4
 

@@ -207,6 +207,7 @@ def remove(
 
 
 def _tell(star: OwnStar, quiet: bool) -> None:
+    """Print the name of a kept star and what its use needs, unless `quiet`."""
     if quiet:
         return
     name = json.dumps(star.name) if " " in star.name else star.name

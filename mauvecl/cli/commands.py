@@ -417,6 +417,7 @@ def realise(session: Session) -> None:
 
 
 def _tell(store: Store, place: Path, session: Session) -> None:
+    """Print what a written store holds, as text or as JSON."""
     from mauvecl.runs.store import ARRAY_COLUMNS
     from mauvecl.study.cases import assumptions_of, collect_messages
 
@@ -519,6 +520,7 @@ def export(
 
 
 def _rows_of(text: str | None) -> tuple[int, int] | None:
+    """Read a range of rows, such as 1000:2000."""
     if text is None:
         return None
     first, _, stop = text.partition(":")

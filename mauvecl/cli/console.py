@@ -93,8 +93,6 @@ def guarded(app: typer.Typer) -> int:
 
 def _failed(error: Exception) -> int:
     """Report bad input, a wrong use of flags, a device or file that fails, or an unforeseen failure."""
-    # Imported here, because verbs that draw nothing do not need it.
-    device = sys.modules.get("mauvecl.device.drivers")
     if isinstance(error, InputError):
         return _say(name_flag(error), BAD_INPUT)
     if isinstance(error, MemoryError):
@@ -112,7 +110,10 @@ def _failed(error: Exception) -> int:
     # Python wraps an interrupt while a class is made, and pydantic one of its builders.
     if type(error).__name__ == "Abort" or "KeyboardInterrupt" in f"{error!r} {error.__cause__!r}":
         return _say("interrupted", INTERRUPTED)
-    if device is not None and isinstance(error, device.DeviceError):
+    # Other failures are reported without what it loads.
+    from mauvecl.device.drivers import DeviceError
+
+    if isinstance(error, DeviceError):
         return _say(str(error), BAD_INPUT, keep_lines=error.kind == "kernel")
     file = _write_traceback(error)
     name = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

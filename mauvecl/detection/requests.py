@@ -84,7 +84,7 @@ class Hypotheses:
         for k, flare in enumerate(self.flares if "matched" in self._chosen else ()):
             # `messages` report a flare that saturates every pixel.
             if k not in self.blinding:
-                check_shape(self.quiet, flare, scene.used, k)
+                check_template(self.quiet, flare, scene.used, k)
 
     def statistic(self, name: str) -> Statistic:
         """Return a statistic by name; raises InputError if it was not requested."""
@@ -176,7 +176,7 @@ def fall_between(null: Form, flare: Form) -> float:
     return -shift if shift < -1e-3 else 0.0
 
 
-def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], number: int = 0) -> None:
+def check_template(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], number: int = 0) -> None:
     """Raise InputError if a flare changes no used pixel, since it cannot be a template."""
     if not (flare.recorded_light_dn != quiet.recorded_light_dn)[used].any():
         raise InputError(

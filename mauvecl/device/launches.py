@@ -137,7 +137,9 @@ class Launches:
         job = scene.job.copy()
         job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
         per_pixel = (scene.pixels, scene.levels, scene.edges, scene.dark_counts, scene.photon_counts, scene.responses)
-        self._arguments = [*map(self.upload, (job.reshape(1), *map(padded, per_pixel), scene.tables, scene.priors))]
+        self._arguments = [
+            *map(self.upload, (job.reshape(1), *map(with_padding, per_pixel), scene.tables, scene.priors))
+        ]
 
     def __enter__(self) -> Self:
         return self
@@ -220,7 +222,7 @@ class Launches:
     def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
         """Upload the observer's subtraction and variances, and the resolution elements."""
         n_pixel, n_element, bins = self._scene.n_pixel + PIXEL_BLOCK, len(elements), layout.OBSERVER_BINS
-        self._observing = [self.upload(padded(observers)), self.upload(elements)]
+        self._observing = [self.upload(with_padding(observers)), self.upload(elements)]
         self._begin(pixels=(n_pixel, bins), elements=(n_element, bins), clipped=(n_pixel, 2), outside=(n_element,))
         self._observed = observers, elements
 
@@ -272,7 +274,7 @@ class Launches:
         constants = scene.constants(plan.weights, plan.linear_end, plan.pixels_end)
         self._weighing = [*map(self.upload, (constants, weights, plan.linear_end, plan.pixels_end))]
         if self.variant.compared:
-            compared = map(self.upload, (padded(scene.estimates), bands, finished, plan.scales, plan.scale_end))
+            compared = map(self.upload, (with_padding(scene.estimates), bands, finished, plan.scales, plan.scale_end))
             # All scenarios are compared with the first.
             references = self.upload(np.zeros(len(scene.levels), np.uint32))
             self._weighing = [references, *self._weighing, *compared, np.uint32(plan.scales.shape[1])]
@@ -332,7 +334,7 @@ def contiguous(array: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
 
 
-def padded(array: NDArray[np.void]) -> NDArray[np.void]:
+def with_padding(array: NDArray[np.void]) -> NDArray[np.void]:
     """Flatten per-pixel structs and append a block, since kernels may read, but not use, pixels past the last one."""
     return np.concatenate([array.ravel(), np.zeros(PIXEL_BLOCK, array.dtype)])
 

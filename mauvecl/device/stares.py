@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.requests import Shard
 from mauvecl.device.build import Device, Variant
-from mauvecl.device.launches import TILE_BYTES, Launches, Progress, Tile, Tiles, contiguous, padded
+from mauvecl.device.launches import TILE_BYTES, Launches, Progress, Tile, Tiles, contiguous, with_padding
 from mauvecl.flares import stare_scene
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare import Stare
@@ -175,7 +175,7 @@ class StareLaunches(Launches):
         stare.check(request.flares)
         self._by_sums = request.method == "cumulants"
         if self._by_sums:
-            stare_scene.check_sums(stare, request.flares)
+            stare_scene.check_cumulants(stare, request.flares)
         table = _table_of(stare.components) if self._by_sums else None
         scene = stare.scene
         variant = replace(
@@ -197,7 +197,7 @@ class StareLaunches(Launches):
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
-            by_pixels = (padded(stare.mixtures), stare.spectra, stare.weights, stare.constants)
+            by_pixels = (with_padding(stare.mixtures), stare.spectra, stare.weights, stare.constants)
             # Only the range of pixels that a sum weights is drawn.
             chunks = np.flatnonzero(stare.weights.reshape(len(stare.weights), -1, variant.chunk).any(axis=(0, 2)))
             first, last = (chunks[0], chunks[-1] + 1) if chunks.size else (0, 0)

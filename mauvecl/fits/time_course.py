@@ -524,6 +524,7 @@ def _data(
     raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare, shape: Shape,
     skipped_nm: Ranges,
 ) -> _Data:  # fmt: skip
+    """Return the data of a fit to a stare, with its unknowns as parameters."""
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
     clipped = clipped_pixels(raw, quiet)
     reduction = ReducedSums.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)

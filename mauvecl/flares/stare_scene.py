@@ -426,7 +426,7 @@ class SumTable:
         return np.concatenate([self.rows.ravel(), self.lower])
 
 
-def check_sums(scene: StareScene, flares: Flares) -> None:
+def check_cumulants(scene: StareScene, flares: Flares) -> None:
     """Raise InputError if cumulants do not describe frames: clipping, pixels without noise, or rare large hits."""
     for name in scene.scene.additive:
         raise InputError(f"{ADDITIVE[name].label} must be drawn with method 'pixels', not 'cumulants'", key="method")
@@ -452,7 +452,7 @@ def method_for(components: Components, stare: Stare, processes: Processes = NONE
     """Return the method for frames without flares: cumulants if these describe them, otherwise pixels."""
     scene = StareScene.of(components, stare, processes)
     try:
-        check_sums(scene, Flares.of(components, stare, None, None, 1))
+        check_cumulants(scene, Flares.of(components, stare, None, None, 1))
         SumTable.of(components)
     except InputError:
         return "pixels"

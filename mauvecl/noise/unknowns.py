@@ -237,7 +237,7 @@ MAX_MODES = 15
 MODE_PRIOR = Normal(0.0, 1.0, -5.0, 5.0)
 
 
-def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
+def unknown_values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
     """Return the unknown values of an instrument by name.
 
     These are `INSTRUMENT_VALUES`. If the throughput is calibrated, its modes replace those that change the throughput,

@@ -438,6 +438,7 @@ class SimulatedRate:
         return float(np.exp(self._log_rate(threshold)))
 
     def _log_rate(self, threshold: float) -> float:
+        """Return the logarithm of an upper limit of the rate of alarms above a threshold, per day."""
         n = self.largest.size
         anchor = float(self.largest[-min(n, MIN_ALARMS)])
         above = int(np.count_nonzero(self.largest > min(threshold, anchor)))

@@ -291,6 +291,7 @@ def verify(
 
 
 def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: bool, redraw: bool) -> Fault | None:
+    """Check a chunk, if `redraw` by drawing it again; `repair` a faulty one, and return its fault, if any."""
     fault = state(store, chunk)
     if fault == "good" and not redraw:
         return None
@@ -466,6 +467,7 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
 
 
 def _fits(selection: Selection) -> HDUList:
+    """Return a selection as FITS: an image for each scene, a table of pixels for each group, and the study."""
     from astropy.io import fits
 
     store = selection.store
@@ -496,6 +498,7 @@ def _fits(selection: Selection) -> HDUList:
 
 
 def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
+    """Return the FITS image of a scene, whose header names the table of its pixels."""
     from astropy.io import fits
 
     x = scene.expectation
@@ -529,6 +532,7 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
 
 
 def _hdf5(selection: Selection, content: io.BytesIO) -> None:
+    """Write a selection as HDF5; raises InputError without h5py."""
     try:
         import h5py
     except ImportError as error:

@@ -177,6 +177,7 @@ def validated(target: Public) -> Public:
 
 
 def _validated(function: Public, owner: type | None = None) -> Public:
+    """Return a function that validates its arguments; `owner` is the class of a method."""
     parameters = list(inspect.signature(function).parameters.values())
     in_order = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     variadic = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
@@ -206,6 +207,7 @@ def _validator(kind: Any) -> Callable[[Any], Any]:
 
 
 def _converted(validate: Callable[[Any], Any], name: str, value: Any) -> Any:
+    """Return a validated value; raises InputError that names the innermost wrong part of it."""
     try:
         return validate(value)
     except ValidationError as error:

@@ -79,6 +79,7 @@ def input_error(where: str, model: type[BaseModel], error: ValidationError) -> I
 
 
 def _input_error_of(model: type[BaseModel], fault: Any) -> InputError:
+    """Return a fault that pydantic finds in a model as an InputError."""
     path = [str(step) for step in fault["loc"] if step != "[key]"]
     key = ".".join(path) or model.__name__.lower()
     value, message = fault.get("input"), fault["msg"]
@@ -332,7 +333,7 @@ def _pair(text: str, name: str, expected: str, unit: str) -> tuple[float, float]
     return low, high
 
 
-def read_frames(text: str, name: str) -> str | list[int]:
+def read_frame_choice(text: str, name: str) -> str | list[int]:
     """Read which frames are stored: stack, all, or numbers such as 0,4,9."""
     if text in ("stack", "all"):
         return text

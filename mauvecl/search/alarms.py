@@ -281,6 +281,7 @@ class _StareSearch:
         return moved
 
     def _fit(self, block: list[Candidate], new: Collection[Candidate]) -> set[Candidate]:
+        """Fit the flares of a block together, drop those that are not needed, and return those that moved."""
         others = self.others(block)
         best = self._best(self.sums.block(_thetas(block), others), block, new)
         # The noise depends on the fitted flares.

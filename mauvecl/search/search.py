@@ -205,6 +205,7 @@ class Search:
         return slice(-self._first % template.stride, self.n_grid, template.stride)
 
     def _rows_of(self, template: Template) -> Iterator[Row]:
+        """Yield the row of each phase of a template; where gaps leave little of it, it is not searched."""
         n = len(self._terms)
         peaks = np.arange(self.n_grid)[self._onsets(template)]
         time = template.time

@@ -73,6 +73,7 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
 
 
 def _instrument(study: Study, swept: set[str], uses: Collection[str]) -> str:
+    """Return the clause on the instrument."""
     o = study.observation
     text = f"instrument {o.instrument}"
     if o.changes:
@@ -87,6 +88,7 @@ def _instrument(study: Study, swept: set[str], uses: Collection[str]) -> str:
 
 
 def _flare(study: Study, swept: set[str], uses: Collection[str]) -> str:
+    """Return the clause on the flares."""
     f, replaces = study.flare, "replacing photosphere"
     temperature = "of swept temperature" if "flare_temperature" in swept else f"of {f.light().describe()}"
     if "stare" in uses and any(event.temperature_k is not None for event in study.events):

@@ -11,9 +11,9 @@ from pydantic import AfterValidator, create_model, model_validator
 
 from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
 from mauvecl.host.exposure import DEFAULT_SKY
-from mauvecl.host.instrument import DEFAULT_INSTRUMENT, current_name
+from mauvecl.host.instrument import DEFAULT_INSTRUMENT, FORMERLY_MAUVE, current_name, shipped_names
 from mauvecl.noise.disturbances import Prior, PriorField
-from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, values_of
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, INSTRUMENT_VALUES, NUISANCES, Comparison, unknown_values_of
 from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import Accepted, Flag, Help, Range, Slider, says_none
@@ -27,6 +27,13 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.background import Sky
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
+
+
+#: Embedded instruments in help texts.
+INSTRUMENTS = [
+    f"{name} (with the conventions of the MauveSim paper)" if name == FORMERLY_MAUVE else name
+    for name in shipped_names()
+]
 
 
 class Observation(Section):
@@ -45,11 +52,11 @@ class Observation(Section):
         DEFAULT_INSTRUMENT,
         "Instrument",
         flag="--instrument",
-        choices="mauve, mauvesim (with the conventions of the MauveSim paper), or your own TOML file",
+        choices=f"{', '.join(INSTRUMENTS)}, or your own TOML file",
         label="Payload",
         hint="mauve: dark counts are Poisson in electrons, as in physics. mauvesim: Poisson in DN, as in the "
         "MauveSim paper, which makes the dark noise 1.3 times as large.",
-        options=("mauve", "mauvesim"),
+        options=shipped_names(),
     )
     temperature_c: fields.DetectorTemperature | None = setting(
         None,
@@ -324,7 +331,7 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
                 raise InputError.of("unknowns.known", name, f"some of {', '.join(INSTRUMENT_VALUES)}")
 
     def priors(self, instrument: Instrument) -> dict[str, Prior]:
-        """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.values_of`."""
-        rows = {name: row for name, row in values_of(instrument).items() if name not in self.known}
+        """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.unknown_values_of`."""
+        rows = {name: row for name, row in unknown_values_of(instrument).items() if name not in self.known}
         priors: dict[str, Any] = {name: getattr(self, name, row.prior) for name, row in rows.items()}
         return {name: prior for name, prior in priors.items() if prior is not None}

@@ -84,7 +84,7 @@ class BulkQuestion(Section):
     ] = setting(
         "stack",
         "Stored frames",
-        flag=Flag("--frames", kind=str, read=section.read_frames),
+        flag=Flag("--frames", kind=str, read=section.read_frame_choice),
         choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9",
     )
     components: bool = setting(False, "Also store the mean of star, sky and noise of each pixel", flag="--components")

@@ -128,7 +128,7 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     return fractions
 
 
-def draws(text: str) -> tuple[int, str]:
+def parse_draws(text: str) -> tuple[int, str]:
     """Parse the number of realisations, and how the tail is found, such as "100000" or "100000 sampled"."""
     number, _, tails = text.partition(" ")
     return int(number), tails or "counted"
@@ -256,6 +256,7 @@ READERS: dict[str, Callable[[str], Any]] = {
 
 
 def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> Callable[[str], Any]:
+    """Return the function that reads the text of a field."""
     choices = widget.choices or (get_args(field.annotation) if get_origin(field.annotation) is Literal else ())
     if choices:
         return Choice(choices)
@@ -320,7 +321,7 @@ _OWN_FIELDS = {
     ),
     "realisations": Field(
         label="Realisations", first="100000",
-        read=Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
+        read=Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), parse_draws),
         hint="How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
         "(importance sampling) needs fewer.", group="Detection", place=2, own_keys=("run.realisations", "run.tails"),
     ),

@@ -18,7 +18,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import Tab, target_words
-from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, unpacked
+from mauvecl.web.uploads import MOST_VALUES, VisitorFile, read_frames_of, unzipped
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
@@ -135,7 +135,7 @@ ANALYSE = Tab(
 def read_observations(question: FieldValues) -> dict[str, Any]:
     """Read frames and spectra."""
     archive: Observations = question.uploads["observations"]
-    files = {name: VisitorFile(name, content) for name, content in unpacked(archive.content).items()}
+    files = {name: VisitorFile(name, content) for name, content in unzipped(archive.content).items()}
     frames, stars = [], []
     for row in archive.rows:
         mapping = files[str(row.mapping)] if row.mapping else None

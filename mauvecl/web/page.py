@@ -264,6 +264,7 @@ def known_values(state: State) -> dict[str, Any]:
 
 
 def _target(row: dict[str, Any]) -> dict[str, str]:
+    """Return what is known of a target, as text for the page, or its fault."""
     try:
         star = PlanTarget.model_validate(row).target(simbad=False)
     except InputError as error:

@@ -37,16 +37,24 @@ EXPECTED_FRAMES = "fewer frames", "frames as FITS, ECSV or CSV"
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
-def read_limited(kind: Callable[..., T], reader: Callable[..., T], files: Mapping[str, bytes], **options: Any) -> T:
+def read_limited(
+    kind: Callable[..., T],
+    reader: Callable[..., T],
+    files: Mapping[str, bytes],
+    *,
+    expected: tuple[str, str] = EXPECTED_SPECTRUM,
+    **options: Any,
+) -> T:
     """Read the first of some files, by their names, in a process with limited memory and time.
 
     The reader, a function of a path and of options, may need the other files; it returns a dataclass of this kind.
+    Errors say what is `expected`: of a file that is too large, and in general.
     Blocks for about a second, most of it for the start of Python: call it from a thread.
     """
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time: try again in a minute", key="upload")
     try:
-        answer = _read_apart(reader, files, options)
+        answer = _read_apart(reader, files, options, expected)
     finally:
         _turns.release()
     with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
@@ -55,8 +63,11 @@ def read_limited(kind: Callable[..., T], reader: Callable[..., T], files: Mappin
         return kind(**values, **{name: arrays[name] for name in arrays.files if name != "words"})
 
 
-def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options: dict[str, Any]) -> bytes:
+def _read_apart(
+    reader: Callable[..., Any], files: Mapping[str, bytes], options: dict[str, Any], expected: tuple[str, str]
+) -> bytes:
     """Run the reading process and return its output."""
+    smaller, content = expected
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
         **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
@@ -68,11 +79,10 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
     name = f"{reader.__module__}:{reader.__qualname__}"
     words = json.dumps({"reader": name, "file": next(iter(files)), "options": options})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), words]
-    smaller, expected = EXPECTED_FRAMES if name.startswith("mauvecl.observations.") else EXPECTED_SPECTRUM
+    command = [sys.executable, "-m", __name__, str(MEMORY_MIB), str(SECONDS), words]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
-        for file, content in files.items():
-            (Path(folder) / file).write_bytes(content)
+        for file, contained in files.items():
+            (Path(folder) / file).write_bytes(contained)
         try:
             process = subprocess.run(
                 command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
@@ -89,7 +99,7 @@ def _read_apart(reader: Callable[..., Any], files: Mapping[str, bytes], options:
         _REFUSED: process.stderr.decode("utf-8", "replace").strip(),
         _NO_ROOM: f"the upload takes more than {MEMORY_MIB} MiB of memory to read; give {smaller}",
     }
-    raise InputError(reasons.get(process.returncode, f"the upload ended its reader; give {expected}"), key="upload")
+    raise InputError(reasons.get(process.returncode, f"the upload ended its reader; give {content}"), key="upload")
 
 
 def _main() -> int:

@@ -71,7 +71,7 @@ def netloc(address: str, port: int) -> str:
     return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
 
 
-def plain(host: str) -> str:
+def plain_host(host: str) -> str:
     """Return a host in lower case without default ports."""
     return re.sub(r":(80|443)$", "", host.strip().lower())
 
@@ -89,7 +89,7 @@ def hosts(address: str, port: int, allowed: Sequence[str]) -> frozenset[str]:
             key="address",
         )
     addresses = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
-    return frozenset(plain(host) for host in (*named, *(netloc(address, port) for address in addresses)))
+    return frozenset(plain_host(host) for host in (*named, *(netloc(address, port) for address in addresses)))
 
 
 class PageApplication(Application):
@@ -99,9 +99,9 @@ class PageApplication(Application):
         """Return the handler of a request, or of a refusal: unknown names (DNS rebinding) and other servers' pages."""
         origins, allowed = request.headers.get_list("Origin"), self.settings["hosts"]
         status, message, is_visitor = 403, "", request.path == "/live"
-        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in allowed]:
+        if [plain_host(host) for host in request.headers.get_list("Host")] not in [[host] for host in allowed]:
             message = "The page is not served under this host name; see `mauvecl serve --allow-origin`."
-        elif any(plain(re.sub(r"^https?://", "", origin.lower())) not in allowed for origin in origins):
+        elif any(plain_host(re.sub(r"^https?://", "", origin.lower())) not in allowed for origin in origins):
             message = "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
         elif is_visitor and not origins:
             message = "Expected a connection from the page."

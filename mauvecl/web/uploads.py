@@ -32,7 +32,7 @@ from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.schema.section import built
 from mauvecl.study.questions import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN, read_points
-from mauvecl.web.sandboxed_reader import read_limited
+from mauvecl.web.sandboxed_reader import EXPECTED_FRAMES, read_limited
 
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
@@ -73,7 +73,7 @@ class Observations:
     @classmethod
     def of(cls, name: str, content: bytes) -> Observations:
         """Keep an archive, which must hold one study with observations, and all files that it names."""
-        files = unpacked(content)
+        files = unzipped(content)
         studies = [rows for file, text in files.items() if file.endswith(".toml") and (rows := _rows_of(file, text))]
         if len(studies) != 1:
             raise refusal(
@@ -93,12 +93,12 @@ class Observations:
 
     def written(self, folder: Path) -> list[dict[str, Any]]:
         """Write the files below a folder, once, and return the observations with their paths."""
-        home = content_folder(folder, self.content, lambda: unpacked(self.content))
+        home = content_folder(folder, self.content, lambda: unzipped(self.content))
         data = (row.model_dump(exclude_none=True) for row in self.rows)
         return [row | {key: str(home / row[key]) for key in PATHS if key in row} for row in data]
 
 
-def unpacked(content: bytes) -> dict[str, bytes]:
+def unzipped(content: bytes) -> dict[str, bytes]:
     """Return the files of a zip archive by their names without folders, but hidden ones, which some systems add."""
     remedy = "give a TOML file and the files that it names, in a sound zip archive without a password"
     with parsing("the archive", remedy), zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -281,7 +281,8 @@ def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bi
     if mapping is not None:
         mapping_name = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[mapping_name] = mapping.content
-    return read_limited(Frames, read_frames, files, mapping=mapping_name, quality_bits=quality_bits)
+    options = {"mapping": mapping_name, "quality_bits": quality_bits}
+    return read_limited(Frames, read_frames, files, expected=EXPECTED_FRAMES, **options)
 
 
 #: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.

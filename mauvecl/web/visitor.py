@@ -36,7 +36,7 @@ from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import SIMULATIONS, TABS, State, card, known_values, reads_of
-from mauvecl.web.sandboxed_reader import read_limited
+from mauvecl.web.sandboxed_reader import EXPECTED_FRAMES, read_limited
 from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, as_file, commands_and_programs, simulate, study_file
 from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
 
@@ -459,7 +459,8 @@ class Visitor(WebSocketHandler):
         """Send the names of the columns of the visitor's frames; none if they are no table."""
         file, names = UPLOAD_SHELF.get(self, "upload", "frames"), tuple[str, ...]()
         if file is not None:
-            work = READER.submit(read_limited, ColumnNames, ColumnNames.read, {file.name: file.content})
+            frames, expected = {file.name: file.content}, EXPECTED_FRAMES
+            work = READER.submit(read_limited, ColumnNames, ColumnNames.read, frames, expected=expected)
             names = (await asyncio.wrap_future(work)).names
         self.send(n=request.n, columns=names)
 

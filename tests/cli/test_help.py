@@ -54,8 +54,14 @@ def all_flags() -> dict[str, dict[str, Any]]:
 
 
 def test_flags_equal_those_of_the_file() -> None:
-    """Compare with the file; `python tests/cli/test_help.py` accepts a change."""
-    assert all_flags() == json.loads(FILE.read_text(encoding="utf-8"))
+    """Compare with the file, flag by flag, and the order of flags as well."""
+    listed, accept = json.loads(FILE.read_text(encoding="utf-8")), "`python tests/cli/test_help.py` accepts a change"
+    now = all_flags()
+    for verb in {**listed, **now}:
+        old, new = listed.get(verb, {}), now.get(verb, {})
+        changed = [flag for flag in {**old, **new} if old.get(flag) != new.get(flag)]
+        assert changed == [], f"flags of {verb} are not those of {FILE.name}: {accept}"
+        assert list(old) == list(new), f"flags of {verb} have another order than in {FILE.name}: {accept}"
 
 
 @pytest.mark.parametrize("name", [name for name, verb in VERBS.items() if not hasattr(verb, "commands")])

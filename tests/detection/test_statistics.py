@@ -8,7 +8,12 @@ from scipy import optimize, stats
 from scipy.ndimage import gaussian_filter1d
 
 from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
-from mauvecl.detection import chi2, distributions
+from mauvecl.detection import STATISTIC_NAMES, chi2, distributions, requests
+
+
+def test_every_statistic_can_be_asked_for_in_the_order_of_tables() -> None:
+    """Compare with the names that studies accept, which are listed apart, in a module that is fast to import."""
+    assert tuple(requests.STATISTICS) == STATISTIC_NAMES
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 29, 400, 1643])

@@ -13,16 +13,15 @@ pytestmark = pytest.mark.long
 #: Script that draws on the default device and prints the level and the counts' digest, or the error.
 RUN = """
 import hashlib, sys
+from mauvecl import Engine, InputError
 from mauvecl.device import drivers
-from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.device.selftest import toy
-from mauvecl.schema.errors import InputError
 {before}
 try:
     engine = Engine()
     print("digest", hashlib.sha256(engine.realise(toy(), count=64, seed=1).tobytes()).hexdigest())
     print("level", *drivers.settled.values())
-except (DeviceError, InputError) as error:
+except (drivers.DeviceError, InputError) as error:
     print("sentence", str(error).count(chr(10)), error)
 """
 #: Child that fails when it compiles for the first name, and does nothing otherwise.

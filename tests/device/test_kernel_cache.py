@@ -25,14 +25,14 @@ def digest(engine):
     raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
     return hashlib.sha256(raw.tobytes() + seen.counts.dense("pixel").tobytes()).hexdigest()
 {before}
-from mauvecl.device.engine import DeviceError, Engine
+from mauvecl import Engine
 restore, restored = drivers.KernelCache.restore, []
 drivers.KernelCache.restore = lambda cache, key: restored.append(restore(cache, key)) or restored[-1]
 try:
     print("digest", digest(Engine()))
     print("restored", sum(restored), "of", len(restored))
     print("work", drivers.kernel_cache().work)
-except DeviceError as error:
+except drivers.DeviceError as error:
     print("sentence", error)
 """
 
@@ -161,7 +161,7 @@ def test_working_folder_of_killed_process_is_removed_after_90_days(tmp_path: Pat
 def test_second_engine_does_not_rewrite_loaded_kernels(filled: tuple[Path, str]) -> None:
     """Keep the files of loaded kernels, since a process crashes if they are written again."""
     before = """
-from mauvecl.device.engine import Engine as E
+from mauvecl import Engine as E
 one = E()
 first = digest(one)
 two = E()

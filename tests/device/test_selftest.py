@@ -112,8 +112,8 @@ KERNELS = """
 import sys
 import numpy as np
 from reference import known_answers
+from mauvecl import Engine
 from mauvecl.device import selftest
-from mauvecl.device.engine import Engine
 from probes import Probes
 from mauvecl.noise import layout
 

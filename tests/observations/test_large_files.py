@@ -21,7 +21,8 @@ import json, resource, sys
 import astropy.io.fits, astropy.table, astropy.time, scipy.special
 import numpy as np
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.frame_files import read_frames, reduce_frames
+from mauvecl import read_frames
+from mauvecl.observations.frame_files import reduce_frames
 # OpenBLAS reserves address space at the first large product; reading does not need it.
 np.ones((300, 300)) @ np.ones((300, 300))
 small, path, out, mapping = sys.argv[1:]

@@ -50,9 +50,10 @@ def valued(data: Any, key: str) -> Any:
 
 async def test_every_field_is_a_key_of_the_study(talk: Talk, words: dict[str, Any]) -> None:
     """Fields are shown where they matter, and are in the downloaded study, the printed command and program."""
-    assert {tab: {*seen["reads"]} for tab, seen in words["tabs"].items()} == SHOWN
+    assert {tab: {*seen["reads"]} for tab, seen in words["tabs"].items()} == SHOWN, "shown.toml lists fields of tabs"
     uploads = {name for name, one in words["uploads"].items() for name in (name, *one["options"])}
-    assert FIELDS.keys() == words["fields"].keys() - uploads - {"as_observed", "change_band"} | {"star", "own_unknown"}
+    expected = words["fields"].keys() - uploads - {"as_observed", "change_band"} | {"star", "own_unknown"}
+    assert FIELDS.keys() == expected, "fields.toml has a key and a value of every field"
     for name, row in FIELDS.items():
         tab = row.get("tab") or next(tab for tab in SHOWN if name in SHOWN[tab])
         before = row.get("before", {})
