@@ -191,12 +191,14 @@ def alternate(
     """
     in_events, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
     for _ in range(ALTERNATIONS):
-        # Rounds may come back to the same frames.
         key = in_events.tobytes(), before
-        if key not in rounds:
-            fitted = _fit_processes(survey, ~in_events, before, steps)
-            rounds[key] = fitted, detect_events(fitted, PROVISIONAL, steps)[1]
-        fitted, detected = rounds[key]
+        if key in rounds:
+            # Rounds repeat from there on, and chance decides which comes last; flares are exceptions from the light.
+            repeated = list(rounds.values())[list(rounds).index(key) :]
+            return min(repeated, key=lambda state: int(state[1].sum()))
+        fitted = _fit_processes(survey, ~in_events, before, steps)
+        detected = detect_events(fitted, PROVISIONAL, steps)[1]
+        rounds[key] = fitted, detected
         changed = float((detected ^ in_events).mean())
         in_events = detected
         if changed <= SETTLED:

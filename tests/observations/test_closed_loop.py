@@ -107,12 +107,20 @@ def test_steps_single_frames_and_dips_are_no_flares_and_three_frames_are_one() -
     assert [str(one) for one in answer.events["kind"]] == ["flare"]
 
 
-def test_error_of_a_summed_duration_includes_that_of_its_level() -> None:
-    """A star whose level is known to 1.3 %: the level is that of all frames outside of the event."""
+@pytest.mark.parametrize("missing", [0, 40])
+def test_error_of_a_summed_duration_includes_that_of_its_level(missing: int) -> None:
+    """A star whose level is known to 1.3 %: the level is that of all frames outside of the event.
+
+    Frames next to missing ones in the tail stand for half of these.
+    """
     sd = 30.0
-    (event,) = analysed(noisy(299, TIME, 100.0 * (1 + 40.0 * flare(15_000, 300.0)), sd)).analysis.events
+    drawn = noisy(299, TIME, 100.0 * (1 + 40.0 * flare(15_000, 300.0)), sd)
+    kept = np.abs(TIME - 17_490.0) >= missing / 2 * CADENCE_S
+    frames = Frames.of(TIME[kept], drawn.flux[kept], np.full(int(kept.sum()), sd))
+    (event,) = analysed(frames).analysis.events
     inside = event.last - event.first + 1
-    error = np.sqrt(inside + (inside + event.summed_s / CADENCE_S) ** 2 / (FRAMES - inside))
+    squares = inside + 2 * ((1 + missing / 2) ** 2 - 1)
+    error = np.sqrt(squares + (inside + event.missing + event.summed_s / CADENCE_S) ** 2 / (kept.sum() - inside))
     expected = sd / 100.0 * CADENCE_S * error
     assert event.summed_error_s == pytest.approx(expected, rel=0.15)
 

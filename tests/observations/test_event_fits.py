@@ -46,12 +46,13 @@ def survey_of(n: int, model: processes.Process, second: float = 0.0) -> searches
     return replace(survey, processes=(model,), flux_process=model)
 
 
-def measured_event(survey: searches.SeriesSurvey) -> Any:
-    """Return the equivalent durations of the event in the middle."""
+def measured_event(survey: searches.SeriesSurvey, missing: int = 0) -> Any:
+    """Return the equivalent durations of the event in the middle, after which some frames are missing."""
     n = len(survey.stare.start_s)
     one = searches.DetectedEvent(100.0, 120.0, float(survey.stare.start_s[n // 2]), 0, 20.0, n // 2 - 8, n // 2 + 120)
-    taken = np.isin(np.arange(n), range(one.first, one.last + 1))
-    return events.measure_event(survey, taken, np.full(n, LEVEL / SD), one)
+    survey = survey.frames(~np.isin(np.arange(n), one.last + 1 + np.arange(missing)))
+    taken = np.isin(np.arange(n - missing), range(one.first, one.last + 1))
+    return events.measure_event(survey, taken, np.full(n - missing, LEVEL / SD), one)
 
 
 def watch(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, place: int, found: list[tuple[str, int]]) -> None:
@@ -96,6 +97,15 @@ def test_flares_that_may_be_one_or_two_are_measured_alike_at_any_time() -> None:
     early, late = (measured_event(survey_of(n, SMOOTH, second=0.005)) for n in (SHORT // 4, SHORT))
     for name in ("fitted_s", "low_s", "high_s"):
         assert getattr(late, name) == pytest.approx(getattr(early, name), rel=5e-4)
+
+
+def test_event_that_a_gap_cuts_may_be_a_limit_and_one_below_the_level_is_unclear() -> None:
+    whole, cut = (measured_event(survey_of(2000, SMOOTH), missing) for missing in (2, 3))
+    assert (whole.cut, cut.cut) == (False, True)
+    less = [replace(one, summed_s=share * one.fitted_s) for one in (whole, cut) for share in (0.94, 0.96)]
+    assert [one.is_limit for one in less] == [False, False, True, False]
+    below = [replace(cut, summed_s=-errors * cut.summed_error_s) for errors in (1.9, 2.1)]
+    assert [one.unclear for one in below] == [False, True]
 
 
 def test_search_solves_as_many_templates_around_an_event_in_a_longer_light_curve(monkeypatch: Any) -> None:

@@ -2,6 +2,8 @@
 
 import re
 import tracemalloc
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from marks import long_but
 from scenes import PER_MONTH, analysed, detected, flare, noisy
 
 from mauvecl import SHAPES, Frames, Study, analyse
-from mauvecl.observations import events
+from mauvecl.observations import events, light_curve
+from mauvecl.observations.search import SeriesSurvey
 
 DURATION = SHAPES["davenport2014"].equivalent_duration
 
@@ -44,6 +47,30 @@ def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
     assert sorted(one.peak_s for one in event.flares) == pytest.approx(peaks, abs=8.0)
     truth = DURATION * sum(size * width for size, width in zip(sizes, widths, strict=True))
     assert abs(event.fitted_s - truth) < 2.5 * (event.high_s[0] - event.low_s[0])
+
+
+def constant_star() -> SeriesSurvey:
+    """Return the survey of 400 frames of independent noise as stated."""
+    frames = noisy(521, np.arange(400) * 20.0, np.full(400, 1e3), 1.0)
+    every, shape = np.ones(400, np.bool_), SHAPES["davenport2014"]
+    return SeriesSurvey.of(frames, frames.flux, np.ones(400), every, level=1e3, photon=0.0, shape=shape)
+
+
+@pytest.mark.parametrize("longer", [False, True])
+def test_alternation_that_repeats_its_rounds_has_the_same_end_from_each(longer: bool, monkeypatch: Any) -> None:
+    """Which of them came last had depended on the first guess, and so on the last digits of the light."""
+    inside = [(np.arange(400) >= 200) & (np.arange(400) < last) for last in (210, 300)]
+
+    def detect(survey: SeriesSurvey, *_: Any) -> Any:
+        return [], inside[survey.level == 210]
+
+    def fit(survey: SeriesSurvey, quiet: Any, *_: Any) -> SeriesSurvey:
+        return replace(survey, level=float(400 - quiet.sum() + 200))
+
+    monkeypatch.setattr(light_curve, "detect_events", detect)
+    monkeypatch.setattr(light_curve, "_fit_processes", fit)
+    fitted, found = light_curve.alternate(constant_star(), inside[longer], None, light_curve.UNREPORTED)
+    assert (fitted.level, found.sum()) == (300, 10)
 
 
 @pytest.mark.long
