@@ -107,7 +107,7 @@ def _items(value: Any, size: int | None = None) -> Any:
     is_single = (
         isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0
     )
-    items = () if is_single else tuple(as_quantity(value) if is_quantity(value) else value)
+    items = () if is_single else tuple(as_quantity(value))
     if is_single or size not in (None, len(items)):
         raise PydanticCustomError("expected", f"Input should be a sequence{'' if size is None else f' of {size}'}")
     return items

@@ -30,7 +30,9 @@ def is_quantity(value: Any) -> bool:
 
 
 def as_quantity(value: Any) -> Any:
-    """Return a column that has a unit as a Quantity, and a Quantity unchanged; masked values are undefined (NaN)."""
+    """Return a column that has a unit as a Quantity, whose masked values are undefined (NaN), and others unchanged."""
+    if not is_quantity(value):
+        return value
     import astropy.units as u
 
     if hasattr(value, "filled"):

@@ -26,7 +26,7 @@ from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, NUISANCES, Processes
 from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, as_quantity, is_quantity, metadata_of
+from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, as_quantity, metadata_of
 from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
 from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -498,7 +498,7 @@ def values_of(values: Mapping[str, Any], keywords: Mapping[str, Keyword], where:
         if keywords[name].many and value is not None and not isinstance(value, Mapping):
             # Neither a sequence nor an array.
             is_single = isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")
-            by_name[name] = [value] if is_single else list(as_quantity(value) if is_quantity(value) else value)
+            by_name[name] = [value] if is_single else list(as_quantity(value))
     if values.get("ideal"):
         by_name["with_unknowns"] = False
     return by_name | {"paper": values.get("paper")}

@@ -74,6 +74,10 @@ def release_memory() -> None:
     getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: pad)(0)
 
 
+class Interruption(BaseException):
+    """Raised in a thread to end its work; no Exception, since libraries catch these."""
+
+
 @dataclass(eq=False)
 class Job:
     """Simulation for a visitor."""
@@ -104,6 +108,11 @@ class Job:
             if self._cancelled:
                 raise Stopped
             return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
+        except BaseException as error:
+            if self._cancelled:
+                # Some libraries turn an interruption into an error of their own.
+                raise Stopped from error
+            raise
         finally:
             # A pending interruption would otherwise reach the next work of this thread.
             with self._lock:
@@ -120,7 +129,7 @@ class Job:
         """Cancel the job: between two tiles if it draws, anywhere if it does not, or before it starts."""
         with self._lock:
             if self._thread is not None and not self._cancelled:
-                _set_pending(ctypes.c_ulong(self._thread), ctypes.py_object(Stopped))
+                _set_pending(ctypes.c_ulong(self._thread), ctypes.py_object(Interruption))
             self._cancelled = True
         # The exception does not reach fits in other threads, which end between two of their draws.
         if self._pool is not None:
@@ -414,7 +423,7 @@ class Visitor(WebSocketHandler):
                 self.send(n=n, progress=share, message=words)
             RESULTS.keep(self, "answers", key, answers.result(), MOST_ANSWERS)
             self.send(n=n, ended=f"Done: {job.progress[1]}.", kind=kind)
-        except (Stopped, CancelledError, asyncio.CancelledError):
+        except (Interruption, Stopped, CancelledError, asyncio.CancelledError):
             self.send(n=n, ended="Cancelled.")
         finally:
             self.job = None

@@ -5,6 +5,8 @@ import json
 import re
 import signal
 import socket
+import threading
+import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +16,8 @@ import pytest
 from refusals import says_what_is_accepted
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 
+from mauvecl.runs.checkpoint import Stopped
+from mauvecl.web.visitor import Job
 from tests.web.visits import Server, Talk, link
 
 ROOT = Path(__file__).parents[2]
@@ -196,6 +200,26 @@ async def test_first_load_is_small_and_compressed(talk: Talk, server: Server, wo
 
 
 KINDS = ("detection", "map", "limit", "measure", "change", "periods", "completeness", "visible", "plan")
+
+
+@pytest.mark.parametrize("caught", [Exception, BaseException])
+def test_cancel_ends_work_in_libraries_that_catch_exceptions(caught: type[BaseException]) -> None:
+    """Astropy turns every exception in a conversion into a TypeError, by chance the interruption as well."""
+    started = threading.Event()
+
+    def work(_: object) -> None:
+        started.set()
+        for _ in range(20_000):
+            try:
+                time.sleep(1e-3)
+            except caught as error:
+                raise TypeError from error
+
+    job = Job(work, drawing=False)
+    assert started.wait(10)
+    job.cancel()
+    with pytest.raises(Stopped):
+        job.future.result(10)
 
 
 @pytest.mark.long
