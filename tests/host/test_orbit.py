@@ -254,7 +254,7 @@ def test_simbad_is_asked_for_other_names(monkeypatch: pytest.MonkeyPatch) -> Non
         if "HD 0" in query:
             raise ConnectionError("no route to host")
         rows = [] if "HD 3" in query else [(10.5, -3.25, 50.0, " K2V ", 7.5)]
-        table = Table(rows=rows, names=names, masked=True, dtype=(*"fff", "O", "f"))
+        table = Table(rows=rows or None, names=names, masked=True, dtype=(*"fff", "O", "f"))
         for column in names[2:] if "HD 2" in query else ():
             table[column].mask = True
         return table
