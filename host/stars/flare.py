@@ -18,7 +18,7 @@ from astropy.constants import c, h, k_B
 from numpy.typing import ArrayLike
 
 from mauvecl.host.arrays import ContentEquality, Float, array_cache, set_read_only
-from mauvecl.host.stars.spectrum import ANGSTROM, NEEDED_NM, attached, check_points, photons, supplemented
+from mauvecl.host.stars.spectrum import ANGSTROM, FLUX_UNIT, NEEDED_NM, attached, check_points, photons, supplemented
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.schema import fields
 from mauvecl.schema.calls import checked, validated
@@ -349,7 +349,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     def from_arrays(
         cls,
         wavelength_nm: Annotated[ArrayLike, Unit("nm")],
-        flux_flam: Annotated[ArrayLike, Unit("erg / (s cm2 AA)")],
+        flux_flam: Annotated[ArrayLike, Unit(str(FLUX_UNIT))],
         *,
         name: str = "flare",
         continue_at_k: fields.Temperature | None = None,

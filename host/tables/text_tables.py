@@ -129,7 +129,7 @@ class NumberLines:
         return Values(name, (len(self.cells),), partial(self._numbers, place), unit)
 
     def _numbers(self, place: int, piece: slice) -> Any:
-        """Return the numbers of a column; raises InputError with the line of the first cell that is none."""
+        """Return the numbers of a column; an InputError names the line of the first cell without a number."""
         values: list[float] = []
         try:
             for cells in self.cells[piece]:

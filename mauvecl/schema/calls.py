@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, ValidationError, core_schema
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import as_quantity, is_quantity, is_truth, or_error, whole_number, without_unit
+from mauvecl.schema.fields import as_quantity, is_quantity, is_truth, or_error, whole_number, without_mask, without_unit
 
 #: Place of an error inside an alternative of a union.
 ALTERNATIVE = "|"
@@ -94,8 +94,7 @@ def _array(value: Any) -> Any:
     if is_quantity(value):
         return without_unit(value, "")
     _require(_kind(value) in tuple("iufb"))
-    # Masked values are undefined; NumPy would take what lies below the mask.
-    return value.astype(float).filled(float("nan")) if hasattr(value, "filled") else value
+    return without_mask(value)
 
 
 def _real_array(value: Any) -> Any:

@@ -29,15 +29,18 @@ def is_quantity(value: Any) -> bool:
     return getattr(value, "unit", None) is not None and (hasattr(value, "to_value") or hasattr(value, "quantity"))
 
 
+def without_mask(value: Any) -> Any:
+    """Return an array whose masked values are undefined (NaN); NumPy would take what lies below the mask."""
+    return value.astype(float).filled(math.nan) if hasattr(value, "filled") else value
+
+
 def as_quantity(value: Any) -> Any:
     """Return a column that has a unit as a Quantity, whose masked values are undefined (NaN), and others unchanged."""
     if not is_quantity(value):
         return value
     import astropy.units as u
 
-    if hasattr(value, "filled"):
-        value = value.astype(float).filled(math.nan)
-    return u.Quantity(value, subok=True)
+    return u.Quantity(without_mask(value), subok=True)
 
 
 def without_unit(value: Any, unit: str) -> Any:

@@ -556,7 +556,8 @@ def _stars(
     names, magnitudes = values["star"], values["magnitude"]
     for name in ("star", "magnitude"):
         if isinstance(values[name], Mapping):
-            raise InputError.of(name, values[name], "a value or a list, since `Study.build` takes stars with keys")
+            expected = "a value or a list of values (`Study.build` takes stars with their keys)"
+            raise InputError.of(name, values[name], expected)
     changes = {
         keywords[name].path.removeprefix("star."): values[name]
         for name in described
