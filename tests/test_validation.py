@@ -17,6 +17,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import Column, MaskedColumn
+from astropy.time import TimeDelta
 from astropy.utils.masked import Masked
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel
@@ -177,7 +178,9 @@ def test_quantities_are_plain_numbers(path: str, name: str) -> None:
     for other in (unit, *EQUIVALENT.get(unit, ())):
         equivalent = u.spectral() if unit == "nm" else u.temperature()
         given = (np.asarray(value) * u.Unit(unit)).to(u.Unit(other), equivalent)
-        for quantity in (given, Column(given.value, unit=given.unit)) if given.shape else (given,):
+        columns = (Column(given.value, unit=given.unit),) if given.shape else ()
+        durations = (TimeDelta(given),) if given.unit.is_equivalent(u.s) else ()
+        for quantity in (given, *columns, *durations):
             taken = np.asarray(check(quantity), float)
             np.testing.assert_allclose(taken, np.asarray(plain, float), rtol=1e-9, atol=1e-9)
         if holds_arrays(hint):

@@ -18,11 +18,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, join_names
 from mauvecl.host.arrays import Float
@@ -41,7 +41,7 @@ from mauvecl.host.stars.flare import (
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Distance, Radius, Temperature, Wavelength, range_of
+from mauvecl.schema.fields import Distance, Radius, Temperature, Unit, Wavelength, range_of
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 
+#: Raw counts of exposures, or of the frames of a stare.
+RawCounts = Annotated[ArrayLike, Unit("DN")]
 #: Range of fitted temperatures, K: that of flares, without cool ones that emit no ultraviolet light.
 TEMPERATURES_K = (3_000.0, float(range_of(Temperature).high))
 #: Number of temperatures at which spectra are computed, evenly spaced in log T; splines interpolate between them.

@@ -22,6 +22,7 @@ from mauvecl.fits.flare_model import (
     DerivedQuantity,
     FlareModel,
     Ranges,
+    RawCounts,
     ReducedSums,
     check_enough,
     derived_values,
@@ -176,7 +177,7 @@ class Measurement:
 
 @validated
 def fit(
-    frames: ArrayLike,
+    frames: RawCounts,
     expectation: Expectation,
     model: FlareModel,
     nuisances: Nuisances | None = None,
@@ -578,7 +579,7 @@ class TwoTemperatures:
 
 @validated
 def fit_two_temperatures(
-    frames: ArrayLike,
+    frames: RawCounts,
     expectation: Expectation,
     model: FlareModel,
     nuisances: Nuisances | None = None,

@@ -20,7 +20,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
-from mauvecl.fits.flare_model import EVERY, Ranges, ReducedSums
+from mauvecl.fits.flare_model import EVERY, Ranges, RawCounts, ReducedSums
 from mauvecl.fits.least_squares import interval_end
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares.frames import Components, known_strengths
@@ -108,7 +108,7 @@ def _columns_of(found: Measurement, q: int) -> list[Column]:
 
 @validated
 def measure_along(
-    frames: ArrayLike,
+    frames: RawCounts,
     quiet: Expectation,
     model: FlareModel,
     nuisances: Nuisances | None = None,
@@ -402,7 +402,7 @@ class CoolingCourse(NamedTuple):
 
 @validated
 def fit_cooling(
-    frames: ArrayLike,
+    frames: RawCounts,
     quiet: Expectation,
     model: FlareModel,
     nuisances: Nuisances | None = None,

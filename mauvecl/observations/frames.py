@@ -148,7 +148,7 @@ def _cadence_of(name: str, time: Float, light: Float) -> float:
         raise refused("flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
     if not np.isfinite(time).all():
         row = int(np.argmin(np.isfinite(time)))
-        raise refused("time", f"{time[row]} in row {row}", "finite times")
+        raise refused("time", f"{time[row]} in row {row}", "a finite number in each row")
     step = np.diff(np.sort(time))
     cadence = float(np.median(step))
     if not cadence > 0 or (step < MIN_STEP * cadence).any():
@@ -207,9 +207,9 @@ class Frames:
         Parameters
         ----------
         time_s : array_like, shape (n_frame,)
-            Middle of each frame.
+            Middle of each frame, also as a TimeDelta; `mauvecl.observations.frame_files.frames_of` reads dates.
         flux, error : array_like, shape (n_frame,) or (n_frame, n_pixel)
-            Plain numbers, or Quantities and columns in units that convert to each other.
+            Plain numbers, or Quantities and columns in units that convert to each other; one error applies to all.
         exposure_s : array_like, optional
             One exposure time, or one for each frame; by default the median time between frames.
         quality : array_like, shape (n_frame,), optional
@@ -237,8 +237,11 @@ class Frames:
         for key, column in by_frame.items():
             if column is not None:
                 values = np.asarray(column, np.int64 if key == "quality" else np.float64)
-                if values.shape != (shape := light.shape if key == "error" else (n,)):
-                    raise refused(key.removesuffix("_c"), values.shape, f"the shape {shape}")
+                shape = light.shape if key == "error" else (n,)
+                if key == "error" and values.ndim == 0:
+                    values = np.full(shape, values)
+                if values.shape != shape:
+                    raise refused(key.removesuffix("_c"), f"those of shape {values.shape}", f"values of shape {shape}")
                 by_frame[key] = values[order]
         nm = None if wavelength_nm is None else np.asarray(wavelength_nm, np.float64)
         frames = cls(time[order], exposure[order], light[order], wavelength_nm=nm, name=name, **by_frame, **how)

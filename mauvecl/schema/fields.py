@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
 
 def is_quantity(value: Any) -> bool:
-    """Return whether a value is an astropy Quantity, or a column of a table that has a unit."""
-    return getattr(value, "unit", None) is not None and (hasattr(value, "to_value") or hasattr(value, "quantity"))
+    """Return whether a value is an astropy Quantity or TimeDelta, or a column of a table that has a unit."""
+    has_unit = getattr(value, "unit", None) is not None or (hasattr(value, "to") and hasattr(value, "jd1"))
+    return has_unit and (hasattr(value, "to_value") or hasattr(value, "quantity"))
 
 
 def without_mask(value: Any) -> Any:
@@ -35,12 +36,12 @@ def without_mask(value: Any) -> Any:
 
 
 def as_quantity(value: Any) -> Any:
-    """Return a column that has a unit as a Quantity, whose masked values are undefined (NaN), and others unchanged."""
+    """Return durations and columns with a unit as a Quantity, masked values as NaN; return other values unchanged."""
     if not is_quantity(value):
         return value
     import astropy.units as u
 
-    return u.Quantity(without_mask(value), subok=True)
+    return u.Quantity(without_mask(value.to(u.s) if hasattr(value, "jd1") else value), subok=True)
 
 
 def without_unit(value: Any, unit: str) -> Any:

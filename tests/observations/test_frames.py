@@ -11,7 +11,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import InverseVariance, StdDevUncertainty
 from astropy.table import Column, Table
-from astropy.time import Time
+from astropy.time import Time, TimeDelta
 from astropy.timeseries import BinnedTimeSeries, TimeSeries
 from layouts import documented_files
 from scenes import paper
@@ -31,6 +31,7 @@ def test_arrays_may_have_units_of_their_own() -> None:
         frames = Frames.of(TIME / 60 * u.min, light, spread)
         assert frames.unit == "electron / s"
         np.testing.assert_allclose((frames.time_s, frames.flux, frames.error), (TIME, FLUX, np.full(100, 5.0)))
+    assert (Frames.of(TimeDelta(TIME * u.s), FLUX, 5.0).error == 5.0).all()
     how: dict[str, Any] = {"wavelength_nm": [300.0, 400.0], "temperature_c": np.full(100, 280.0) * u.K}
     placed = Frames.of(TIME, np.ones((100, 2)), direction_deg=(10.0 * u.deg, 600 * u.arcmin), **how)
     assert (placed.temperature_c[0], *placed.direction_deg) == pytest.approx((6.85, 10.0, 10.0))
