@@ -149,7 +149,7 @@ def _stare_points(star: StarStare, band: int) -> tuple[tuple[Float, Float], tupl
     counts = np.diff(np.append(starts, stare.n_frames))
     columns = stare.middle_s, light.flux[:, band], light.mean[:, band]
     time, flux, mean = (np.add.reduceat(values, starts) / counts for values in columns)
-    time, level = time / shown_time_unit(stare.duration_s)[0], np.median(light.mean[:, band])
+    time, level = time / shown_time_unit(stare.duration_s)[0], light.quiescent[band]
     at, is_gap = _with_gaps(np.arange(starts.size), np.searchsorted(starts, [run[0] for run in runs[1:]]))
     return (time, flux / level), (time[at], np.where(is_gap, np.nan, mean[at] / level))
 

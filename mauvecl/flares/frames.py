@@ -295,6 +295,7 @@ class LightCurves:
     flux: Float
     sd: Float  # shape (n_frame, n_band)
     mean: Float  # shape (n_frame, n_band)
+    quiescent: Float  # light of a frame without flares and changes, shape (n_band,)
     #: Shape (n_frame, n_element); the same in resolution elements.
     spectrum: NDArray[np.float32]
     spectrum_sd: NDArray[np.float32]  # shape (n_frame, n_element)
@@ -326,8 +327,9 @@ def draw_light_curves(
     flux, sd, mean = (np.column_stack(columns) for columns in zip(total, bands, strict=True))
     low, high = quiet.wavelength_nm[[0, -1]]
     names = (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm))
+    quiescent = np.array([used, *rows]) @ quiet.light_dn / quiet.frame_s
     element_nm = quiet.element_wavelength_nm[filled]
     return LightCurves(
-        names, flux=flux, sd=sd, mean=mean, spectrum=spectrum, spectrum_sd=spectrum_sd, spectrum_mean=spectrum_mean,
-        element_nm=element_nm,
+        names, flux=flux, sd=sd, mean=mean, quiescent=quiescent, spectrum=spectrum, spectrum_sd=spectrum_sd,
+        spectrum_mean=spectrum_mean, element_nm=element_nm,
     )  # fmt: skip
