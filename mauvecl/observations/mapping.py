@@ -72,6 +72,8 @@ class FrameMapping(Record):
         if sum(is_given) > 1:
             fault = "the exposure time is given twice; give only one of exposure, exposure_s and two columns of time"
             raise InputError(fault, key="exposure")
+        if self.time_at is not None and not isinstance(self.time, str):
+            raise InputError("time_at needs one column of times, not those of start and end", key="time_at")
         return self
 
     @classmethod
