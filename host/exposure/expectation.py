@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
 
+#: Kinds of remarks on the throughput: of an instrument as published or assumed, and of one that `calibrate` has fitted.
+THROUGHPUTS = ("nominal throughput", "calibrated throughput")
 #: Distance of a mean below saturation, in standard deviations of a frame, beyond which saturation is neglected.
 CUT_SIGMA = 8.0
 #: Largest number of frames of an exposure: a day of 5 ms each, a thousandth of the payload's.
@@ -110,6 +112,12 @@ class Expectation(Drawable, ContentEquality):
             mask=self.saturated,
             meta=dict(self.provenance),
         )
+
+    @property
+    def notice(self) -> Message:
+        """The instrument's remark on its throughput, of the kind "nominal throughput" or "calibrated throughput"."""
+        of_throughput = (text for text in self.messages if isinstance(text, Message) and text.kind in THROUGHPUTS)
+        return next(of_throughput, Message(""))
 
     def _line(self) -> str:
         exposure = f"{self.exposure_s:g} s in {self.n_frames} frames of {self.wavelength_nm.size} pixels"
@@ -497,7 +505,9 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
             f"{source.name} was dereddened by its archive: it is brighter in the ultraviolet than as observed, unless "
             "it is reddened again (ebv)."
         )
-    yield from filter(None, (instrument.notice, source.scale))
+    nominal, calibrated = THROUGHPUTS
+    notice = Message(instrument.notice, nominal if instrument.throughput_errors is None else calibrated)
+    yield from filter(None, (notice, source.scale))
 
 
 def continued_to_reach(source: Source, instrument: Instrument) -> Source:

@@ -54,7 +54,7 @@ class Exposure:
 EXPOSURE_COLUMNS = (
     star_column(),
     Column("wavelength", "wavelength_nm", "nm", "vacuum wavelength, the middle of the pixel or element"),
-    Column("per", description="pixel, or resolution element of 10.5 nm"),
+    Column("per", description="pixel, or element: a resolution element of the instrument"),
     Column("wanted", description="wanted S/N"),
     Column("exposure", "exposure_s", "s", "the fewest frames whose closed-form S/N reaches the wanted one",
            "exposure (s)", ".10g"),
@@ -142,7 +142,7 @@ def exposure_for(
 ) -> ExposureAnswer:
     """Compute `exposure` for another S/N or wavelength (nm or Quantity) than those of the study's ``signal``.
 
-    `per` is "element", a resolution element of 10.5 nm, or "pixel".
+    `per` is "element", a resolution element of the instrument, or "pixel".
     """
     study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
     return exposure(study)
@@ -181,7 +181,7 @@ def _best(title: str, x: Expectation, number: int) -> str:
     at = float(x.wavelength_nm[x.element == int(np.argmax(snr))].mean())
     saturated = int(x.saturated.sum())
     without = f"; {saturated} of {x.saturated.size} pixels saturate" if saturated else ""
-    best = f"{title} has an S/N of up to {snr.max():.3g} per element of 10.5 nm in {x.exposure_s:g} s, at {at:.0f} nm"
+    best = f"{title} has an S/N of up to {snr.max():.3g} per resolution element in {x.exposure_s:g} s, at {at:.0f} nm"
     return f"{best}{without}{first_of_several(number, 'cases')}."
 
 
@@ -296,7 +296,7 @@ class SnrAnswer(Answer):
     stars: list[StarSnr]  # one per star and cell of the sweep
     messages: list[str]
 
-    #: S/N per resolution element of 10.5 nm, one row per star, cell and element.
+    #: S/N per resolution element, one row per star, cell and element.
     element = TableOf("snr-element", (), "stars", of=lambda _, star: star.result.element, place=True,
                       key="snr-element", about=REALISATIONS)  # fmt: skip
     #: S/N per pixel, one row per star, cell and pixel.
@@ -306,7 +306,7 @@ class SnrAnswer(Answer):
                            place=True, key="noise-budget", about=REALISATIONS)  # fmt: skip
     _shown_elements = TableOf(
         "", COLUMNS, "stars", of=lambda answer, star: star.result.element[answer.places(star, "element")], place=True,
-        about=(), title="S/N per 10.5 nm element; all of them in the files",
+        about=(), title="S/N per resolution element; all of them in the files",
     )  # fmt: skip
     _shown_noise = TableOf(
         "", lambda answer: [column for column in BUDGET_COLUMNS if column.name in answer.noise_budget.colnames],

@@ -149,7 +149,7 @@ VERBS: dict[str, Verb] = {
             "snr",
             """Compute signal-to-noise ratios and noise budgets.
 
-    Of each pixel and of each resolution element (10.5 nm).
+    Of each pixel and of each resolution element (10.5 nm for Mauve).
 
     The signal is the star's alone: the sky is subtracted, and its photons are noise (`--signal paper`: signal as well).
 

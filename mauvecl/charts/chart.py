@@ -10,7 +10,10 @@ from importlib import import_module
 from operator import itemgetter
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
 
 #: Colours on light ground by name, after Okabe & Ito; `web.figures.INKS` has those on dark ground as well.
 INK = {
@@ -277,6 +280,11 @@ class PictureFunction:
     #: Arguments of `draw` for each of several numbered pictures of an object.
     each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
     when: Callable[[Any], object] = lambda instance: True  # whether an object has the picture
+
+
+def throughput_of(expectations: Iterable[Expectation]) -> str:
+    """Return whether the throughput of expectations is nominal or calibrated, for the notes of pictures."""
+    return " and ".join(dict.fromkeys(filter(None, (x.notice.kind for x in expectations))))
 
 
 #: Entries by class name, since importing the classes would import every answer.

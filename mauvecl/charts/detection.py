@@ -79,7 +79,7 @@ def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
     exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
     title = (
         f"Detection statistics without and with a flare, {exposures}, {first.realisations:,} realisations each; "
-        f"thresholds at a false-alarm probability of {fap:g} per test; nominal throughput"
+        f"thresholds at a false-alarm probability of {fap:g} per test"
     )
     return Picture(rows, (COLUMN * columns, 2.6 * len(rows) + 0.4), title, _notes(stars), below=True)
 
@@ -89,10 +89,11 @@ def _drawn_flares(names: Sequence[str]) -> list[int]:
     return [round(k) for k in np.linspace(0, len(names) - 1, min(len(names), MOST_FLARES))]
 
 
-def _notes(stars: Sequence[Shown]) -> tuple[str, str]:
-    """Return the notes on the numbers of drawn stars and flares; empty if all are drawn."""
+def _notes(stars: Sequence[Shown]) -> tuple[str, ...]:
+    """Return the notes on the throughput and on the numbers of drawn stars and flares, empty if all are drawn."""
     most = max(len(names) for *_, names in stars)
-    return note_of(stars), part_note(min(MOST_FLARES, most), most, "flares")
+    throughput = chart.throughput_of(outcome.quiet for _, outcome, _ in stars)
+    return throughput, note_of(stars), part_note(min(MOST_FLARES, most), most, "flares")
 
 
 def _distributions(title: str, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> Panel:
@@ -185,11 +186,10 @@ def spectra(stars: Sequence[Shown]) -> Picture:
         above.append(Panel(WAVELENGTH, y, series, f"{title}, {quiet.exposure_s:g} s"))
         risen = [(x.per_element(x.signal_dn - quiet.signal_dn) / sigma, colour) for _, x, colour in drawn[::-1]]
         lines = [Line("", colour, at=(quiet.element_wavelength_nm[complete], rise[complete])) for rise, colour in risen]
-        y = PlotAxis("flare less quiet\n(sigma per 10.5 nm)", log=True)
+        y = PlotAxis("flare less quiet\n(sigma per element)", log=True)
         below.append(Panel(WAVELENGTH, y, [*lines, Rule(along="y", at=1.0)], finish=finish))
-    title = "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration"
     size = COLUMN * len(stars), 5.0
-    return Picture([above, below], size, title, _notes(stars), below=True, share_x=True, heights=(3, 2))
+    return Picture([above, below], size, "Mean spectra", _notes(stars), below=True, share_x=True, heights=(3, 2))
 
 
 def _complete_elements(x: Expectation) -> NDArray[np.bool_]:
@@ -210,17 +210,15 @@ COMPONENTS = {
 }
 
 
-@picture_of(
-    "SimulateAnswer", "observation", each=lambda answer: [(title, table) for title, _, table in answer.observations]
-)
-def observation(title: str, table: QTable) -> Picture:
+@picture_of("SimulateAnswer", "observation", each=lambda answer: answer.observations)
+def observation(title: str, expectation: Expectation, table: QTable) -> Picture:
     """Plot a raw spectrum and its components, as the paper's figure of components."""
     nm, rows = table["wavelength"].to_value("nm"), list[list[Panel]]()
     for letter, (name, text), colour in zip("abcdefg", COMPONENTS.items(), COLOURS, strict=True):
         line = Line("", colour, width=0.9, at=(nm, table[name].value))
         rows.append([Panel(WAVELENGTH, PlotAxis("DN"), [line], f"({letter}) {text}")])
-    title = f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput"
-    return Picture(rows, (7.2, 9.5), title, share_x=True)
+    title = f"{title}: one observation of {table.meta['exposure_s']:g} s"
+    return Picture(rows, (7.2, 9.5), title, (chart.throughput_of([expectation]),), share_x=True)
 
 
 @picture_of(
@@ -237,9 +235,9 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult]]) -> Picture:
         title = title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s"
         nm, snr = x.element_wavelength_nm[complete], x.snr_per_element()[complete]
         rows.append([_snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), result.pixel),
-                     _snr_panel(title, "per 10.5 nm element", nm, snr, result.element[complete])])  # fmt: skip
-    title = "S/N of one exposure; nominal throughput, not a flight calibration"
-    return Picture(rows, (7.6, 2.6 * len(rows) + 0.4), title, (note_of(stars),), below=True, share_x=True)
+                     _snr_panel(title, "per resolution element", nm, snr, result.element[complete])])  # fmt: skip
+    notes = chart.throughput_of(result.expectation for _, result in stars), note_of(stars)
+    return Picture(rows, (7.6, 2.6 * len(rows) + 0.4), "S/N of one exposure", notes, below=True, share_x=True)
 
 
 def _snr_panel(title: str, per: str, nm: Any, expected: Any, table: QTable) -> Panel:
@@ -319,9 +317,10 @@ def detection_map(answer: MapAnswer) -> Picture:
     names = {axis.quantity for axis in question.axes}
     exposure = "" if "exposure" in names else f", {study.observation.exposure_s:g} s"
     flare = "" if "amplitude" in names else f", flare of {100 * study.flare.amplitudes[0]:g} %"
-    title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test; nominal throughput"
+    title = f"{answer.star}{exposure}{flare}, false-alarm probability {study.run.fap:g} per test"
     empty = "grey: no answer" if np.isnan(answer.probability).any() else ""
-    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, (empty,), below=contoured, share_y=True)
+    notes = chart.throughput_of(answer.inputs), empty
+    return Picture([row], (COLUMN * len(row) + 0.5, 3.4), title, notes, below=contoured, share_y=True)
 
 
 @picture_of("LimitAnswer", "limit")
@@ -347,13 +346,14 @@ def limits(answer: LimitAnswer) -> Picture:
     exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
     title = (
         f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
-        f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
+        f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise"
     )
     x, y = (
         quantity_axis(answer.study, of, log=of != "magnitude"),
         PlotAxis("detection probability", limits=(-0.02, 1.02)),
     )
-    return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, below=True)
+    notes = (chart.throughput_of(answer.inputs),)
+    return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, notes, below=True)
 
 
 #: Panels of noise budgets in a picture.
@@ -398,8 +398,8 @@ def noise_budgets(answer: SnrAnswer) -> Picture:
     across = len(observed) // number_of_cells if number_of_cells <= MAX_COLUMNS and len(shown) == len(observed) else 0
     rows = [panels[k::across] for k in range(across)] or in_rows(panels, MAX_COLUMNS)
     size = COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
-    title = "Noise budgets; nominal throughput, not a flight calibration"
-    return Picture(rows, size, title, (shown.note,), below=True, share_x=True, share_y="col" if across else True)
+    notes = chart.throughput_of(answer.inputs), shown.note
+    return Picture(rows, size, "Noise budgets", notes, below=True, share_x=True, share_y="col" if across else True)
 
 
 @picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
@@ -424,11 +424,11 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
             x, expected, low, high = zip(*(points if first == "star" else sorted(points)), strict=True)
             lengths = np.maximum(np.subtract(expected, low), 0), np.maximum(np.subtract(high, expected), 0)
             series += [Line(name, colour, at=(x, expected)), Dots("", colour, size=7, at=(x, expected, lengths))]
-        y_axis = PlotAxis("S/N per 10.5 nm element", log=True, limits=(0.1, None))
+        y_axis = PlotAxis("S/N per resolution element", log=True, limits=(0.1, None))
         x_axis = quantity_axis(answer.study, first, log=first == "exposure")
         row.append(Panel(x_axis, y_axis, series, f"{wavelength:g} nm"))
-    title = "S/N in closed form; bars: 95 % of realisations; nominal throughput"
-    return Picture([row], (COLUMN if len(row) == 1 else 2.6 * len(row), 3.2), title, below=True, share_y=True)
+    title, size = "S/N in closed form; bars: 95 % of realisations", (COLUMN if len(row) == 1 else 2.6 * len(row), 3.2)
+    return Picture([row], size, title, (chart.throughput_of(answer.inputs),), below=True, share_y=True)
 
 
 @picture_of("GaussianAnswer", "gaussian")
@@ -462,8 +462,9 @@ def gaussian(answer: GaussianAnswer) -> Picture:
         panel("5-sigma pixels\nover predicted", 1.0, 0.5, dots("five_sigma_above")),
         panel("false alarms\nover predicted", 1.0, 0.2, dots("fap_ratio")),
     ]
-    title = "Simulation and root-of-N formula; vertical lines: as the formula predicts; nominal throughput"
-    return Picture([row], (2 * COLUMN, 0.22 * len(cells) + 1.5), title, share_y=True)
+    title = "Simulation and root-of-N formula; vertical lines: as the formula predicts"
+    notes = (chart.throughput_of(answer.inputs),)
+    return Picture([row], (2 * COLUMN, 0.22 * len(cells) + 1.5), title, notes, share_y=True)
 
 
 @picture_of("ExposureAnswer", "exposure")
@@ -476,7 +477,7 @@ def exposures(answer: ExposureAnswer) -> Picture:
         series.append(Line(text, colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))))
         series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
     series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))
-    per = "10.5 nm element" if first.per == "element" else first.per
+    per = "resolution element" if first.per == "element" else first.per
     panel = Panel(PlotAxis("exposure (s)", log=True), PlotAxis(f"S/N per {per}", log=True), series)
-    title = f"S/N at {first.wavelength_nm:g} nm against exposure; nominal throughput"
-    return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.exposures)), title, below=True)
+    title, notes = f"S/N at {first.wavelength_nm:g} nm against exposure", (chart.throughput_of(answer.inputs),)
+    return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.exposures)), title, notes, below=True)

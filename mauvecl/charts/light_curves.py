@@ -44,8 +44,9 @@ def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, bel
     stars, study = FirstItems(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), figures.MAX_COLUMNS)
     rows = figures.in_rows([panel(star) for star in stars], columns)
-    title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}; nominal throughput"
-    return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, (stars.note, *notes), below)
+    title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}"
+    notes = chart.throughput_of(answer.inputs), stars.note, *notes
+    return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, notes, below)
 
 
 @picture_of("InjectAnswer", "completeness")
@@ -135,8 +136,8 @@ def light_curves(star: StarStare) -> Picture:
         x, y = PlotAxis(f"time from the start of the stare ({unit})"), PlotAxis("flux / quiescent")
         # Markers outside the axes that have no place would make matplotlib give up the layout of the figure.
         rows.append([Panel(x, y, series, band, finish if peaks else None)])
-    title = f"{star.title}: one simulated stare; nominal throughput"
-    return Picture(rows, (7.2, 1.5 * len(rows) + 0.9), title, below=True, share_x=True)
+    title, notes = f"{star.title}: one simulated stare", (chart.throughput_of([star.staring.quiet]),)
+    return Picture(rows, (7.2, 1.5 * len(rows) + 0.9), title, notes, below=True, share_x=True)
 
 
 def _stare_points(star: StarStare, band: int) -> tuple[tuple[Float, Float], tuple[Float, Float]]:

@@ -377,8 +377,8 @@ def temperatures(star: MeasuredStare) -> Picture:
         label = " ".join(name.split(" ")[::-1]) + unit
         y = PlotAxis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(PlotAxis("time from the start of the stare (s)"), y, series)])
-    title = f"{star.title}: one simulated stare; nominal throughput"
-    return Picture(rows, (7.2, 6.7), title, below=True, share_x=True)
+    title, notes = f"{star.title}: one simulated stare", (chart.throughput_of([star.staring.quiet]),)
+    return Picture(rows, (7.2, 6.7), title, notes, below=True, share_x=True)
 
 
 @picture_of("MeasureAnswer", "joint", each=lambda answer: [(star, star.joint) for star in answer.stares if star.joint])
@@ -400,5 +400,5 @@ def joint(star: MeasuredStare, fit: JointFit) -> Picture:
         [Panel(x, PlotAxis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],
         [Panel(x, kelvin, [Line("joint fit", "star", at=(time, fitted)), simulated])],
     ]
-    title = f"{star.title}: one simulated stare; nominal throughput"
-    return Picture(rows, (7.2, 6.7), title, below=True, share_x=True, heights=(2, 1, 1.5))
+    title, notes = f"{star.title}: one simulated stare", (chart.throughput_of([star.staring.quiet]),)
+    return Picture(rows, (7.2, 6.7), title, notes, below=True, share_x=True, heights=(2, 1, 1.5))

@@ -161,8 +161,8 @@ class Chi2Element(Chi2):
     """Sum over resolution elements of the squared difference divided by its variance."""
 
     name = "chi2_element"
-    definition: ClassVar[str] = "the same over sums of 10.5 nm resolution elements"
-    label: ClassVar[str] = "χ² over 10.5 nm elements"
+    definition: ClassVar[str] = "the same over sums of resolution elements"
+    label: ClassVar[str] = "χ² over resolution elements"
     by_element: ClassVar[bool] = True
 
     def dof(self, setting: Setting) -> int:

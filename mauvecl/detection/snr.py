@@ -210,7 +210,7 @@ class SnrResult(Drawable, ContentEquality):
 
     @cached_property
     def element(self) -> QTable:
-        """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
+        """S/N per resolution element, with the columns of `pixel` except clipped frames."""
         x, table = self.expectation, elements(self.expectation)
         step = np.divide(1.0, table["bins_per_unit"], out=np.zeros(len(table)), where=table["bins_per_unit"] > 0)
 

@@ -22,7 +22,7 @@ from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_folder, check_size, parsing, read_bytes, write_whole
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.pool import PREPARED, Pool
-from mauvecl.runs.store import CALIBRATION, REMARKS, Chunk, Store, StoredScene, digest, exposure_attributes, is_intact
+from mauvecl.runs.store import CALIBRATION, Chunk, Store, StoredScene, digest, exposure_attributes, is_intact
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, missing_package
@@ -317,13 +317,15 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
 
 #: Attributes of a star that stores of earlier versions do not have.
 LATER_ATTRIBUTES = ("instrument", "saturation_dn", "dark_unit", "temperature_c")
+#: Attributes that earlier versions word otherwise.
+WORDED = ("mauvecl", "draws", "throughput")
 #: Attributes in which stores of version 1 state the study and the instrument by other defaults and names.
 OTHERWISE_IN_VERSION_1 = ("study", "study_sha256", "instrument", "provenance")
 
 
 def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
     """Compare groups, descriptions of arrays and calibration with those of the study."""
-    ignored = ("mauvecl", *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
+    ignored = (*WORDED, *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
 
     def without(description: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
         attributes = description.get("attributes", {})
@@ -475,8 +477,8 @@ def _fits(selection: Selection) -> HDUList:
     primary.header["ORIGIN"] = (f"mauvecl {VERSION}", "simulated, not observed")
     primary.header["SEED"] = (str(store.study.run.seed), "of the random numbers")
     primary.header["FIRSTROW"] = (selection.first, "realisation of the first row of each image")
-    for line in REMARKS.values():
-        primary.header["COMMENT"] = f"{line[0].upper()}{line[1:]}."
+    for line in store.remarks.values():
+        primary.header["COMMENT"] = line
     primary.header["HISTORY"] = "The table STUDY holds the study that gives these spectra again."
     extensions: list[ImageHDU | BinTableHDU] = []
     for group in dict.fromkeys(scene.group for scene in selection.scenes):
@@ -541,7 +543,7 @@ def _hdf5(selection: Selection, content: io.BytesIO) -> None:
     store = selection.store
     with h5py.File(content, "w") as file:
         file.attrs.update({"mauvecl": VERSION, "study": store.study.toml(), "seed": str(store.study.run.seed)})
-        file.attrs.update({"first_row": selection.first} | REMARKS)
+        file.attrs.update({"first_row": selection.first} | store.remarks)
         for scene in selection.scenes:
             group = file.require_group(scene.group)
             if "wavelength_nm" not in group:

@@ -44,12 +44,11 @@ CALIBRATION = {
     "read_noise_dn": "DN",
     "gain_dn_per_electron": "DN / electron",
 }
-#: Attributes of every store and file.
-REMARKS = {
-    "draws": "row i of every array is drawn with the same random numbers, so that a flare is the only difference "
-    "between two arrays; rows of different number are independent",
-    "throughput": "the throughput is nominal, not a flight calibration",
-}
+#: How the rows of every store and file are drawn.
+DRAWS = (
+    "Row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
+    "arrays; rows of different number are independent."
+)
 
 
 def _describe(root: Any, scene: StoredScene, study: Study) -> None:
@@ -330,6 +329,14 @@ class Store:
                 key="run.realisations",
             )
 
+    @property
+    def remarks(self) -> dict[str, str]:
+        """Attributes of the store and of files: how rows are drawn, and the instrument's remark on its throughput."""
+        return {
+            "draws": DRAWS,
+            "throughput": " ".join(dict.fromkeys(scene.expectation.notice for scene in self.scenes)),
+        }
+
     def description(self) -> dict[str, bytes]:
         """Return the content of every file except spectra, by path."""
         import zarr
@@ -337,7 +344,7 @@ class Store:
         files: dict[str, Any] = {}
         root = zarr.open_group(zarr.storage.MemoryStore(files), mode="w", zarr_format=3)
         run: dict[str, Any] = signed(self.study.toml()) | {"seed": self.study.run.seed, "realisations": self.rows}
-        root.attrs.update(run | {"mauvecl": VERSION} | REMARKS)
+        root.attrs.update(run | {"mauvecl": VERSION} | self.remarks)
         for scene in self.scenes:
             _describe(root, scene, self.study)
         return {name: content.to_bytes() for name, content in files.items()}

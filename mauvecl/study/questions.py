@@ -71,7 +71,7 @@ class SignalQuestion(Section):
     snr: fields.Positive | None = setting(None, "Wanted signal-to-noise ratio", flag="--snr")
     wavelength_nm: fields.Wavelength | None = setting(None, "Wavelength", flag="--at")
     per: Literal["element", "pixel"] = setting(
-        "element", "Bin of the S/N", flag="--per", choices="element (10.5 nm) or pixel"
+        "element", "Bin of the S/N", flag="--per", choices="element (resolution element, 10.5 nm for Mauve) or pixel"
     )
 
 

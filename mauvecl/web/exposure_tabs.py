@@ -75,7 +75,7 @@ NOISE = Tab(
         Area("95 % of realisations, per element", name="spread", alpha=0.4),
         SATURATED,
         Line("per pixel", "sky", "pixel", tips=("S/N per pixel",)),
-        Line("per element of 10.5 nm", "star", "element", width=2, tips=("wavelength (nm)", "S/N per element")),
+        Line("per resolution element", "star", "element", width=2, tips=("wavelength (nm)", "S/N per element")),
     ),
     logs=("y",), pins="element",
 ).data()  # fmt: skip
@@ -93,7 +93,7 @@ def signal_to_noise(closed: ClosedForms, answers: Answers) -> ChartData:
         series["spread"] = table["wavelength"].to_value("nm"), np.asarray(table["q2.5"]), np.asarray(table["q97.5"])
     best = int(np.argmax(element))
     text = (
-        f"The S/N is at most {pixel.max():.3g} a pixel, and {element.max():.3g} an element of 10.5 nm, at "
+        f"The S/N is at most {pixel.max():.3g} a pixel, and {element.max():.3g} a resolution element, at "
         f"{x.element_wavelength_nm[best]:.0f} nm."
     )
     return ChartData(text, series)
@@ -193,7 +193,7 @@ SPECTRUM = Tab(
         SATURATED,
         Dots("drawn exposure", name="drawn"),
         Line("expected per pixel", "sky", "pixel", width=1.2),
-        Line("expected per element of 10.5 nm", "flare", "element", step=True, width=2.2,
+        Line("expected per resolution element", "flare", "element", step=True, width=2.2,
              tips=("wavelength (nm)", "sigma per element")),
     ),
     pins="element",
