@@ -38,6 +38,11 @@ class StarInCell:
         """Star and swept values, for pictures."""
         return full_label(self.label, self.at)
 
+    @property
+    def subject(self) -> str:
+        """Star and swept values, for sentences that state the exposure."""
+        return full_label(self.label, {name: value for name, value in self.at.items() if name != "exposure"})
+
 
 def name_of_instrument(study: Study) -> str:
     """Return the name of the instrument in sentences."""

@@ -64,7 +64,7 @@ class IndexRow(StarInCell):
     weights: NDArray[np.float64]  # shape (n_pixel,); the index, erg s-1 cm-2, for one DN of the exposure in each pixel
     value: float  # of the mean exposure; NaN, as its width, if a pixel saturates
     equivalent_width_nm: float  # positive in emission
-    captured: float  # share of a line's flux that the index holds at Mauve's resolution
+    captured: float  # share of a line's flux that the index holds at the instrument's resolution
     error: float
     error_known: float
     wavelength_nm: NDArray[np.float64]  # of the pixels
@@ -228,8 +228,8 @@ class ChangeAnswer(Answer):
         if missing:
             lines.append(f"The pixels do not cover the line indices {', '.join(missing)}.")
         lines.append(
-            "Bands of the line indices are wider than published ones, since Mauve resolves 13 nm: their widths are an "
-            "assumption; the table of indices names the published ones."
+            "Bands of the line indices are wider than published ones, for the 13 nm that Mauve resolves: their widths "
+            "are an assumption; the table of indices names the published ones."
         )
         return lines
 

@@ -138,7 +138,7 @@ class DetectAnswer(Answer):
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
         least = f", the least certain of {known} flares" if known > 1 else ""
         chance = f"{chance_text(row['probability'])} ({chance_range(row['low'], row['high'])}{ideal})"
-        sentence = chance_of_flare(self.study, star.title, row["amplitude"], star.detection.quiet, chance)
+        sentence = chance_of_flare(self.study, star.subject, row["amplitude"], star.detection.quiet, chance)
         return f"{sentence}{least}."
 
     @property

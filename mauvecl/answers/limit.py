@@ -505,7 +505,7 @@ class LimitAnswer(Answer):
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
         least = first_of_several(len(self.limits), "limits")
         return (
-            f"{self.instrument_name} would see {flare} on {limit.title}{within} with a "
+            f"{self.instrument_name} would see {flare} on {limit.subject}{within} with a "
             f"chance of {100 * question.power:g} % {before} {number(limit.value.value)} "
             f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
         )

@@ -491,7 +491,7 @@ class MeasureAnswer(Answer):
         ideal = "" if self.study.nuisances.none else f" ({known_error:.3g} {unit} {IF_KNOWN})"
         return (
             f"{self.instrument_name} would measure the {name.replace('_', ' ')} of a flare of "
-            f"{100 * flare.amplitude:g} % on {flare.title} in {flare.quiet.exposure_s:g} s with a standard error of "
+            f"{100 * flare.amplitude:g} % on {flare.subject} in {flare.quiet.exposure_s:g} s with a standard error of "
             f"{error:.3g} {unit}{ideal}."
         )
 

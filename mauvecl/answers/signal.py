@@ -317,7 +317,7 @@ class SnrAnswer(Answer):
     @property
     def headline(self) -> str:
         """The best S/N of the first star."""
-        return _best(self.stars[0].title, self.stars[0].result.expectation, len(self.stars))
+        return _best(self.stars[0].subject, self.stars[0].result.expectation, len(self.stars))
 
     @property
     def shown_nm(self) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
@@ -24,6 +24,7 @@ from mauvecl.charts.matplotlib import (
     written,
 )
 from mauvecl.detection import NoThresholdError
+from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.schema.columns import FirstItems, note_of, part_note
@@ -76,12 +77,17 @@ def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
     columns = min(len(first.statistics), MAX_COLUMNS)
     for star in stars:
         rows += in_rows([_distributions(*star, statistic, fap) for statistic in first.statistics], columns)
-    exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
+    exposures = _exposures(outcome.quiet for _, outcome, _ in stars)
     title = (
         f"Detection statistics without and with a flare, {exposures}, {first.realisations:,} realisations each; "
         f"thresholds at a false-alarm probability of {fap:g} per test"
     )
     return Picture(rows, (COLUMN * columns, 2.6 * len(rows) + 0.4), title, _notes(stars), below=True)
+
+
+def _exposures(expectations: Iterable[Expectation]) -> str:
+    """Return the exposure times of expectations for a title, each once and in order."""
+    return join_names([f"{exposure_s:g}{UNBROKEN}s" for exposure_s in sorted({x.exposure_s for x in expectations})])
 
 
 def _drawn_flares(names: Sequence[str]) -> list[int]:
@@ -335,7 +341,7 @@ def limits(answer: LimitAnswer) -> Picture:
         flare = "" if np.isnan(limit.amplitude) else f", flare {100 * limit.amplitude:g} %"
         statistic = f", {limit.statistic}" if several else ""
         value = f"{limit.value.value:.2f}" if of == "magnitude" else written(float(f"{limit.value.value:.3g}"))
-        text = f"{limit.label}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
+        text = f"{limit.title}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
         at = [point.value for point in points], p, (p - low, high - p)
         series += [
             Dots(text, colour, marker=marker, size=6, at=at),
@@ -343,7 +349,7 @@ def limits(answer: LimitAnswer) -> Picture:
             Strips("", colour, alpha=0.25, at=([limit.value.low], [limit.value.high])),
         ]
     series.append(Rule(colour="text", along="y", at=power))
-    exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
+    exposure = "" if of == "exposure" else f", {_exposures(answer.inputs)}"
     title = (
         f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
         f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise"

@@ -187,19 +187,18 @@ def shown_name(change: str) -> str:
 def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
     titles = FirstItems(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
-    (title,), star, row = titles, answer.study.star[0], []
+    (title,), magnitude, row = titles, answer.changes[0].magnitude, []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
-        rules = [] if star.magnitude is None else [Rule("this star", dash="dotted", at=star.magnitude)]
+        rules = [] if magnitude is None else [Rule("this star", dash="dotted", at=magnitude)]
         # Without a pixel that does not saturate there is nothing to show.
         values, limits = [value for _, _, column in lines for value in column], None
         if lines:
             # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
             limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
         y = PlotAxis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
-        row.append(Panel(PlotAxis(f"magnitude ({star.band})"), y, [chart.Targets(at=lines), *rules]))
-    visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
-    title = f"{title}: smallest change between {visits} visits of {exposure:g} s"
+        row.append(Panel(PlotAxis(f"magnitude ({answer.study.star[0].band})"), y, [chart.Targets(at=lines), *rules]))
+    title = f"{title}: smallest change between {answer.visits}"
     return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
 
 
