@@ -273,8 +273,8 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[ReportPart]]:
     fits, text = height < PAGE[1] - 2 * MARGIN, "flares expected and energies of all targets"
     parts = [
         ReportPart(
-            "Mauve: yields of a campaign", [f"{answer.heading}; mauvecl {VERSION}."], headings, rows, SUMMARY_AT, 2,
-            LEGEND, all_targets, text, height if fits else 0.0,
+            f"{answer.instrument_name}: yields of a campaign", [f"{answer.heading}; mauvecl {VERSION}."],
+            headings, rows, SUMMARY_AT, 2, LEGEND, all_targets, text, height if fits else 0.0,
         ),
         ReportPart(lines=answer.messages),
     ]  # fmt: skip
@@ -288,7 +288,7 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[ReportPart]]:
     assumed = answer.assumptions
     note = "Rows of assumptions.ecsv."
     parts.append(ReportPart("What is assumed", [note], assumed.colnames, list(assumed), ASSUMED_AT, new_page=True))
-    return f"Mauve: {answer.heading}", parts
+    return f"{answer.instrument_name}: {answer.heading}", parts
 
 
 #: Explanation of the columns.
