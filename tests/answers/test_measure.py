@@ -98,7 +98,8 @@ def test_second_temperature_is_the_hotter_and_of_the_fits_that_have_one(engine: 
     assert row["median"] == pytest.approx(np.median(kelvin[~np.isnan(kelvin)]))
     assert row["scatter"] > 0
     spectrum = {"second_temperature_k": 8000.0, "second_area": 20.0}
-    answer = measure(study_of(*settings, "flare.amplitudes=[3]", temperature_k=30_000.0, spectrum=spectrum), engine)
+    settings = ["measure.fits=20", "flare.amplitudes=[3]", "nuisances={usual=false}"]
+    answer = measure(study_of(*settings, temperature_k=30_000.0, spectrum=spectrum), engine)
     assert [one.model for one in answer.flares] == ["blackbody", "two-temperatures"]
     rows = {row["quantity"]: row for row in answer.flares[1].rows()}
     truth = [rows[name]["truth"] for name in ("temperature", "second temperature", "second area")]

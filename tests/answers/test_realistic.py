@@ -11,11 +11,10 @@ from astropy.table import Table
 import mauvecl
 from mauvecl import Engine, Instrument, Study, detect, limit, plan
 
-SETTINGS = [
+ASKED = Study().with_settings([
     "star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.02, 0.1]", "run.realisations=20000", "run.fap=0.01",
     "map.x={quantity='magnitude', values=[8, 10]}", "map.y={quantity='amplitude', values=[0.02, 0.2]}",
-]  # fmt: skip
-ASKED = Study().with_settings(SETTINGS)
+])  # fmt: skip
 
 
 def test_defaults_are_realistic_unlike_those_of_the_paper() -> None:

@@ -80,9 +80,6 @@ def test_every_listed_star_is_found_with_its_light_and_place() -> None:
     assert target("19h22m00s -11d12m00s").ra_deg == pytest.approx(290.5)
 
 
-FAR = "D,47.47,1.0,A0V"
-
-
 def seen(folder: Path, *rows: str, share: float = 1.0, **changes: Any) -> Expectation:
     (folder / "near.csv").write_text("\n".join(("name,separation,V,sptype", *rows)) + "\n")
     star = {"library": "G2V", "magnitude": 7.4, "neighbours": str(folder / "near.csv"), "neighbour_share": share}
@@ -91,7 +88,8 @@ def seen(folder: Path, *rows: str, share: float = 1.0, **changes: Any) -> Expect
 
 
 def test_light_noise_and_messages_of_neighbours_follow_from_magnitude_share_and_place(tmp_path: Path) -> None:
-    x, lone = seen(tmp_path, "twin,1.0,8.4,G2V", "faint,1.0,9.9,G2V", share=0.5), quiescent("G2V", 7.4)
+    far, lone = "D,47.47,1.0,A0V", quiescent("G2V", 7.4)
+    x = seen(tmp_path, "twin,1.0,8.4,G2V", "faint,1.0,9.9,G2V", share=0.5)
     assert x.target_share == pytest.approx(1 / (1 + 0.5 * (10**-0.4 + 10**-1.0)), rel=1e-9)
     # The light of a twin falls on the same uneven pixels.
     PixelMap(response=np.linspace(0.5, 1.5, 2048)).write(tmp_path / "map.ecsv")
@@ -99,11 +97,11 @@ def test_light_noise_and_messages_of_neighbours_follow_from_magnitude_share_and_
     np.testing.assert_allclose(twin.neighbour_electrons, twin.source_electrons, rtol=1e-12)
     # A star beyond the fibre needs neither magnitude nor type.
     assert "neighbour_photon" not in lone.noise_budget().colnames
-    for x in (seen(tmp_path, FAR), seen(tmp_path, "x,50,,"), seen(tmp_path, "B,12.5,6.9,K5V", share=0.0)):
+    for x in (seen(tmp_path, far), seen(tmp_path, "x,50,,"), seen(tmp_path, "B,12.5,6.9,K5V", share=0.0)):
         np.testing.assert_array_equal(x.variance_dn2, lone.variance_dn2)
         assert x.target_share == 1.0
     for row, said in (
-        (FAR, "none within 47.46 arcsec; 1 star beyond does not enter"),
+        (far, "none within 47.46 arcsec; 1 star beyond does not enter"),
         ("c,1,9,M2V", "of type M2V: M1V, the nearest type"),
         ("c,1,9,K", "of type K: K5V"),
         ("A,0.3,7.2,G2V", "neighbours_of"),

@@ -22,6 +22,7 @@ PAPER = (DATA / "zodiacal-light.txt").read_text(encoding="utf-8").splitlines()
 CELLS = {
     (180 - 15 * row, 15 * column): cell for row, line in enumerate(PAPER) for column, cell in enumerate(line.split())
 }
+DATE = "2026-03-01T12:00:00"
 
 
 def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, float]:
@@ -38,9 +39,6 @@ def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, floa
     folded = abs((longitude - sun + 180) % 360 - 180)
     separation = np.degrees(np.arccos(np.cos(np.radians(latitude)) * np.cos(np.radians(folded))))
     return folded, abs(latitude), separation
-
-
-DATE = "2026-03-01T12:00:00"
 
 
 def beside_the_sun(longitude: float, latitude: float, lookup: Any = "bilinear") -> float:
