@@ -60,7 +60,7 @@ MUTATIONS: dict[str, Mutation] = {
         ('        by_name["with_unknowns"] = False', "        pass"),
     ),
     "pairs of values without their units": (
-        "test_studies_are_built_from_the_same_keywords",
+        "test_studies_are_built_from_and_changed_by_the_same_keywords",
         (
             '((word, fields.with_unit(word, unit)) for word in text.split(":"))',
             '((word, fields.with_unit(word, "s")) for word in text.split(":"))',

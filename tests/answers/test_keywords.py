@@ -29,22 +29,18 @@ def test_keywords_ask_what_flags_ask(name: str, tmp_path: Path) -> None:
     assert answer.tables.keys() <= {path.stem for path in (tmp_path / "answer").glob("*.ecsv")}
 
 
-def test_keywords_change_a_study() -> None:
+def test_studies_are_built_from_and_changed_by_the_same_keywords() -> None:
     study = Study().with_settings(["star=[{library='G2V', magnitude=7}, {library='K3V', magnitude=4}]"])
     changed = mauvecl.simulate(study, exposure=600, magnitude=6).study
     settings = ["observation.exposure_s=600", "star.0.magnitude=6", "star.1.magnitude=6"]
     assert changed.toml() == study.ideal().with_settings(settings).toml()
     assert mauvecl.simulate(study).study == study.ideal()
-
-
-def test_studies_are_built_from_the_same_keywords() -> None:
     asked = {"star": "G2V", "magnitude": 7, "exposure": 60, "distance": 5, "duration": 3600, "look_at": "eps Eri"}
-    study = Study.of(**asked, paper=True, ideal=True)
     settings = [
         "star=[{library='G2V', magnitude=7, distance_pc=5}]", "observation.exposure_s=60", "stare.duration_s=3600",
         "orbit.targets=['eps Eri']",
     ]  # fmt: skip
-    assert study.toml() == paper(*settings).toml()
+    assert Study.of(**asked, paper=True, ideal=True).toml() == paper(*settings).toml()
     by_name = Study.of(targets=["AU Mic", {"name": "eps Eri", "age_myr": 400, "mass_msun": 0.8}]).plan.targets
     assert [target.name for target in by_name] == ["AU Mic", "eps Eri"]
     pairs = Study.of(gap="10 min:0.5 h", skip=["322:3680 Angstrom"], declination="-30 deg:1800 arcmin")
@@ -63,13 +59,6 @@ def test_too_few_realisations_are_warned_of() -> None:
         with pytest.warns(UserWarning, match="10 realisations are too few .* so 1000 are drawn"):
             answer = verb(star="G2V", **asked, realisations=10, fap=0.1, ideal=True)
         assert answer.study.run.realisations == 1000
-
-
-def test_expectations_and_draws_have_the_defaults_of_the_command_line(engine: Engine) -> None:
-    quiet = expect("AU Mic", exposure=50)
-    assert quiet == expect("AU Mic", "mauve", exposure=50)
-    drawn = engine.realise(quiet, count=2)
-    np.testing.assert_array_equal(drawn, engine.realise(quiet, count=2, seed=Study().run.seed))
 
 
 def test_printed_answers_hold_the_sentence_and_the_table(engine: Engine) -> None:
@@ -91,10 +80,13 @@ def test_printed_answers_hold_the_sentence_and_the_table(engine: Engine) -> None
     assert "probability" in str(answer.stars[0].detection.table(fap=0.1)).splitlines()[0]
 
 
-def test_engine_and_measurement_have_short_reprs(engine: Engine) -> None:
+def test_classes_have_short_reprs_and_the_defaults_of_the_command_line(engine: Engine) -> None:
     assert repr(engine) == f"<Engine on {engine.device_name}>"
     assert repr(mauvecl.Stares(engine.open_device)) == f"<Stares on {engine.device_name}>"
     star, quiet = Source.from_library("AU Mic").at_magnitude(8.81), expect("AU Mic", exposure=50)
+    assert quiet == expect("AU Mic", "mauve", exposure=50)
+    drawn = engine.realise(quiet, count=2)
+    np.testing.assert_array_equal(drawn, engine.realise(quiet, count=2, seed=Study().run.seed))
     model = FlareModel.of(star, Instrument.load("mauve"), quiet)
     measured = fit(engine.realise(expect(star.flaring(1.0), exposure=50), count=3), quiet, model)
     ahead = mauvecl.forecast(quiet, model, 10_000, [1.0])

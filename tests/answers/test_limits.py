@@ -23,9 +23,6 @@ def study(**changes: Any) -> Study:
     return study_of_g2v(run=run, **changes).paper()
 
 
-FEW = {"statistics": ("matched",), "realisations": 20_000}
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("power", [0.5, 0.9])
 def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float) -> None:
@@ -63,20 +60,9 @@ def test_limit_inverts_detect(engine: Engine) -> None:
         assert [replace(x, check=check).verdict for x in (limit, shortest)] == verdicts
 
 
-@pytest.mark.long
-def test_shortest_exposures_are_one_frame_or_several_days(engine: Engine) -> None:
-    """Search some 1e5 frames by bisection."""
-    asked = study(run=FEW, star=[{"library": "G2V", "magnitude": magnitude} for magnitude in (16.0, 5.0)])
-    faint, bright = shortest_exposure(asked, engine).limits
-    assert faint.value.value > 86_400.0
-    assert faint.verdict != "DIFFERS"
-    assert len(faint.points) < 100
-    assert (bright.value.value, bright.verdict) == (5.0, "exceeds it")
-
-
 def test_assumptions_move_the_limit_as_predicted(engine: Engine) -> None:
     """Compare an end with the limit of a changed instrument; `test_golden_python.py` has the values of all."""
-    asked = study(run=FEW)
+    asked = study(run={"statistics": ("matched",), "realisations": 20_000})
     rows = {row["assumption"]: row for row in mauvecl.what_matters(asked)}
     lossy = asked.with_instrument({"light_loss": 0.44})
     assert lossy.observation.load_instrument().light_loss == 0.44

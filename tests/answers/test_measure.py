@@ -63,24 +63,16 @@ def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> No
 
 @pytest.mark.long
 def test_flares_are_measured_along_a_stare(engine: Engine) -> None:
-    """Measure a cooling flare in bins and by a joint fit; pulls beyond chi-squared's 1e-9 quantiles fail."""
+    """Measure a cooling flare in bins and by a joint fit, whose errors are those of `test_measured.py`."""
     events = [{"peak_s": 100.0, "amplitude": 2.0, "half_width_s": 40.0, "cooling": {"end_k": 7000.0, "fold_s": 80.0}}]
     settings = ("measure.fits=20", "measure.snr_per_bin=20", "measure.joint_fit=true", "stare.duration_s=400",
                 "stare.number=3", "nuisances={usual=false}")  # fmt: skip
-    study = study_of(*settings, temperature_k=14_000.0)
-    study = Study.build(study.model_dump() | {"events": events}, "test")
+    study = Study.build(study_of(*settings, temperature_k=14_000.0).model_dump() | {"events": events}, "test")
     answer = measure(study, engine)
     table = answer.tables["temperatures"]
     kelvin = np.array(table["temperature_without_noise"].value)
-    pulls = (np.array(table["temperature"].value) - kelvin) / np.array(table["temperature_error"].value)
-    assert stats.chi2.ppf(1e-9, len(table)) < np.sum(pulls**2) < stats.chi2.isf(1e-9, len(table))
     assert kelvin.max() > 12_500 > 9000 > kelvin[-1]
-    assert (np.array(table["p_value"]) > 1e-6).all()
     np.testing.assert_allclose(answer.tables["joint"]["truth"][:6], [100.0, 40.0, 2.0, 14_000.0, 7000.0, 80.0])
-    fit = answer.stares[0].joint
-    away = (fit.found.estimates[0] - fit.truth)[:6]
-    distance = away @ np.linalg.solve(fit.found.covariance[0, :6, :6], away)
-    assert stats.chi2.ppf(1e-9, 6) < distance < stats.chi2.isf(1e-9, 6)
     assert {"temperatures-1", "joint-1"} <= answer.pictures.keys()
     study = study.with_settings(["measure.joint_fit=false"])
     # A pool draws the same stare; a flare that is too faint is reported.
@@ -94,38 +86,28 @@ def test_flares_are_measured_along_a_stare(engine: Engine) -> None:
     assert any(name.startswith("line_") for name in two.tables["temperatures"].colnames)
 
 
-def test_second_temperature_is_that_of_the_fits_that_have_one(engine: Engine) -> None:
-    """Fit two blackbodies to a flare of one, which some exposures show."""
+def test_second_temperature_is_the_hotter_and_of_the_fits_that_have_one(engine: Engine) -> None:
+    """Fit two blackbodies to a flare of one, which some exposures show, and to one whose hotter part comes first."""
     settings = ["measure.fits=20", "flare.amplitudes=[0.3]", "nuisances.usual=false"]
-    (flare,) = measure(study_of(*settings, 'measure.models=["two-temperatures"]'), engine).flares
+    answer = measure(study_of(*settings, 'measure.models=["two-temperatures"]'), engine)
+    assert list(answer.pictures) == ["fit", "pulls", "errors"]
+    (flare,) = answer.flares
     kelvin = flare.found.estimates[:, list(flare.found.names).index("second temperature")]
     assert 0 < np.isnan(kelvin).sum() < 19
     (row,) = (row for row in flare.rows() if row["quantity"] == "second temperature")
     assert row["median"] == pytest.approx(np.median(kelvin[~np.isnan(kelvin)]))
     assert row["scatter"] > 0
-
-
-@pytest.mark.long
-def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine) -> None:
-    """Check that the hotter blackbody is always the second, and that pictures have a column per model."""
     spectrum = {"second_temperature_k": 8000.0, "second_area": 20.0}
-    settings = "measure.fits=20", "flare.amplitudes=[3.0]", "nuisances={usual=false}"
+    settings = ["measure.fits=20", "flare.amplitudes=[3]", "nuisances={usual=false}"]
     answer = measure(study_of(*settings, temperature_k=30_000.0, spectrum=spectrum), engine)
     assert [one.model for one in answer.flares] == ["blackbody", "two-temperatures"]
     rows = {row["quantity"]: row for row in answer.flares[1].rows()}
-    for name, value in (("temperature", 8000.0), ("second temperature", 30_000.0), ("second area", 0.05)):
-        assert rows[name]["truth"] == pytest.approx(value)
-        # Second temperatures are tried 0.6 % apart.
-        assert rows[name]["perfect"] == pytest.approx(value, rel=0.02)
+    truth = [rows[name]["truth"] for name in ("temperature", "second temperature", "second area")]
+    assert truth == pytest.approx([8000.0, 30_000.0, 0.05])
     assert rows["amplitude"]["truth"] == pytest.approx(3.0, rel=1e-3)
-    assert any("rejects it in 100 %" in text for text in answer.messages)
-    assert all(draw() for draw in answer.pictures.values())
-    alone = measure(study_of(*settings, 'measure.models=["two-temperatures"]', spectrum=spectrum), engine)
-    assert [one.model for one in alone.flares] == ["two-temperatures"]
-    assert list(alone.pictures) == ["fit", "pulls", "errors"]
 
 
-def test_lines_and_absolute_fluxes_are_measured(engine: Engine) -> None:
+def test_lines_absolute_fluxes_and_hottest_flares_are_measured(engine: Engine) -> None:
     spectrum = {"balmer_jump": 2.0, "lines": {"H alpha": 0.05}, "line_fluxes": {"Mg II": 2e-11}}
     answer = measure(study_of("measure.fits=50", "nuisances={usual=false}", spectrum=spectrum), engine)
     assert [one.model for one in answer.flares] == ["blackbody", "balmer", "lines"]
@@ -133,6 +115,9 @@ def test_lines_and_absolute_fluxes_are_measured(engine: Engine) -> None:
     assert rows["line Mg II"]["truth"] == 2e-11
     assert rows["line Mg II"]["perfect"] == pytest.approx(2e-11, rel=0.02)
     assert rows["line H alpha"]["perfect"] == pytest.approx(rows["line H alpha"]["truth"], rel=0.02)
+    hot = measure(study_of("measure.fits=20", "flare.amplitudes=[0.1]", temperature_k=2e5), engine).flares[0].rows()
+    assert hot["truth"][0] == 2e5
+    assert hot["perfect"][0] == pytest.approx(2e5, rel=1e-3)
 
 
 def test_expected_regions_close_and_intervals_beside_the_truth_do_not_cover(jump: Any) -> None:
@@ -152,14 +137,11 @@ def drawn_study(*settings: str, star: str = "M3V", magnitude: float = 7.0, fits:
     return paper(chosen, f"measure.fits={fits}", "run.seed=42", *settings)
 
 
-DRAWN = toml("studies/measured.toml")
-
-
-@pytest.mark.parametrize("case", DRAWN)
-def test_intervals_cover_with_unknowns_drawn(case: str, engine: Engine) -> None:
+@pytest.mark.parametrize("case", toml("studies/measured.toml").values(), ids=toml("studies/measured.toml"))
+def test_intervals_cover_with_unknowns_drawn(case: dict[str, Any], engine: Engine) -> None:
     """Count 400 fits: 5 or 6 quantities may have a coverage of 93 to 97 %; each fails in 2e-6 of seeds."""
-    settings, star, magnitude = (DRAWN[case][name] for name in ("settings", "star", "magnitude"))
-    answer = measure(drawn_study("nuisances.usual=true", *settings, star=star, magnitude=magnitude), engine)
+    asked = drawn_study("nuisances.usual=true", *case["settings"], star=case["star"], magnitude=case["magnitude"])
+    answer = measure(asked, engine)
     rows = answer.flares[-1].rows()
     covered = np.rint(400 * np.array(rows["coverage_95"])).astype(int)
     assert_covered(covered, 400, 0.93, 0.97)
@@ -189,12 +171,6 @@ def test_fits_take_the_factor_on_light_as_it_is_drawn(engine: Engine) -> None:
     np.testing.assert_allclose(widths / 0.05 * 0.975, [0.6827, 0.95], rtol=0.005)
 
 
-def test_hottest_flares_are_measured(engine: Engine) -> None:
-    rows = measure(drawn_study("flare.amplitudes=[0.1]", "flare.temperature_k=2e5", fits=20), engine).flares[0].rows()
-    assert rows["truth"][0] == 2e5
-    assert rows["perfect"][0] == pytest.approx(2e5, rel=1e-3)
-
-
 @pytest.mark.parametrize("usual", ["true", "false"])
 def test_flares_that_saturate_most_pixels_are_measured(usual: str, engine: Engine) -> None:
     """Measure a flare that leaves 60 pixels, with their errors in advance; ten times the flare leaves none.
@@ -212,19 +188,15 @@ def test_flares_that_saturate_most_pixels_are_measured(usual: str, engine: Engin
     assert np.isnan(own.forecasts(np.array([1000.0]), own.unknown)[0].errors).all()
 
 
-@pytest.mark.parametrize(("magnitude", "exposure"), [(9, 5), (9, None), (None, 5), (9, 50)])
-def test_gaussian_answers_for_what_is_stated(magnitude: float | None, exposure: float | None, engine: Engine) -> None:
-    table = gaussian(
-        engine=engine, star="G2V", magnitude=magnitude, exposure=exposure, realisations=10_000, fap=0.01
-    ).cells
-    magnitudes = [4, 6, 8, 10, 12] if magnitude is None else [magnitude]
-    assert set(table["star"]) == {f"G2V V = {v:g}" for v in magnitudes}
-    assert ("magnitude" in table.colnames) == (magnitude is None)
-    assert sorted(set(table["exposure"].value.tolist())) == ([5, 50, 600] if exposure is None else [exposure])
-
-
-def test_gaussian_asks_a_study_as_it_is(engine: Engine) -> None:
-    """Sweep nothing that a study does not: only the verb's own question has a default sweep."""
+def test_gaussian_sweeps_what_neither_keywords_nor_a_study_state(engine: Engine) -> None:
+    """Only the verb's own question has a default sweep."""
+    for magnitude, exposure in ((9, 5), (9, None), (None, 5), (9, 50)):
+        asked: Any = {"magnitude": magnitude, "exposure": exposure, "realisations": 10_000, "fap": 0.01}
+        table = gaussian(engine=engine, star="G2V", **asked).cells
+        magnitudes = [4, 6, 8, 10, 12] if magnitude is None else [magnitude]
+        assert set(table["star"]) == {f"G2V V = {v:g}" for v in magnitudes}
+        assert ("magnitude" in table.colnames) == (magnitude is None)
+        assert sorted(set(table["exposure"].value.tolist())) == ([5, 50, 600] if exposure is None else [exposure])
     few = ("run.realisations=10_000", "run.fap=0.01")
     one, two = (gaussian(study, engine).cells for study in (drawn_study(*few), Study().with_settings(few)))
     assert (one["star"].tolist(), len(two)) == (["M3V V = 7"], 2)

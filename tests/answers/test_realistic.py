@@ -11,11 +11,10 @@ from astropy.table import Table
 import mauvecl
 from mauvecl import Engine, Instrument, Study, detect, limit, plan
 
-SETTINGS = [
+ASKED = Study().with_settings([
     "star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.02, 0.1]", "run.realisations=20000", "run.fap=0.01",
     "map.x={quantity='magnitude', values=[8, 10]}", "map.y={quantity='amplitude', values=[0.02, 0.2]}",
-]  # fmt: skip
-ASKED = Study().with_settings(SETTINGS)
+])  # fmt: skip
 
 
 def test_defaults_are_realistic_unlike_those_of_the_paper() -> None:
@@ -83,9 +82,7 @@ def test_headline_has_the_numbers_of_the_table(engine: Engine) -> None:
     numbers = [f"{found.table[name].value[0]:.2f}" for name in ("magnitude", "low", "high", "ideal")]
     assert re.findall(r"\d+\.\d\d", found.headline) == numbers
     assert "if everything but the noise were known" not in limit(ASKED.ideal(), engine).headline
-
-
-def test_saturated_star_says_so_in_the_headline(engine: Engine) -> None:
+    # It says what saturates.
     bright = detect(ASKED.with_settings(["star.0.magnitude=1"]), engine)
     saturated = int(bright.stars[0].detection.quiet.saturated.sum())
     assert f"without the {saturated} of 1643 pixels that saturate in a frame of more than " in bright.headline
@@ -115,31 +112,27 @@ def test_study_of_version_1_is_read_as_it_was(text: str, instrument: str, tmp_pa
     new = tomllib.loads(study.toml())
     assert new.keys() - tomllib.loads(Study().toml()).keys() == {"nuisances"}, "no section that says nothing"
     assert new["nuisances"] == {"usual": False, "own": {}}
-    (tmp_path / "plan.toml").write_text(OLD + "[plan]\nhours = 10\n")
-    with pytest.warns(UserWarning, match="no version"):
-        assert Study.read(tmp_path / "plan.toml").plan.completeness == "injections"
-    (tmp_path / "usual.toml").write_text(OLD + "[nuisances]\nusual = true\n")
-    with pytest.warns(UserWarning, match="the usual unknowns drawn"):
-        assert Study.read(tmp_path / "usual.toml").nuisances.usual
+    (tmp_path / "more.toml").write_text(OLD + "[plan]\nhours = 10\n[nuisances]\nusual = true\n")
+    with pytest.warns(UserWarning, match="no version.*the usual unknowns drawn"):
+        more = Study.read(tmp_path / "more.toml")
+    assert (more.plan.completeness, more.nuisances.usual) == ("injections", True)
 
 
-def test_study_of_version_2_needs_no_note(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    (tmp_path / "new.toml").write_text("version = 2\n" + OLD)
-    study = Study.read(tmp_path / "new.toml")
+def test_files_of_version_2_need_no_note_and_instruments_of_version_1_one(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    (tmp_path / "study.toml").write_text("version = 2\n" + OLD)
+    study = Study.read(tmp_path / "study.toml")
     assert (study.observation.instrument, study.nuisances.usual) == ("mauve", True)
     (tmp_path / "again.toml").write_text(study.toml())
     assert Study.read(tmp_path / "again.toml") == study
     assert study.toml().startswith("version = 2\n")
-    assert not recwarn.list
-
-
-def test_instrument_files_of_version_1_are_read_as_they_were(tmp_path: Path) -> None:
     (tmp_path / "old.toml").write_text("extends = 'mauve'\nname = 'old'\nlight_loss = 0.2\n")
     (tmp_path / "new.toml").write_text("version = 2\nextends = 'mauve'\nname = 'new'\nlight_loss = 0.2\n")
-    with pytest.warns(UserWarning, match="old.toml is read as in version 1"):
-        old = Instrument.load(tmp_path / "old.toml")
-    assert old == Instrument.load("mauvesim").with_(light_loss=0.2)
     assert Instrument.load(tmp_path / "new.toml") == Instrument.load("mauve").with_(light_loss=0.2)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="old.toml is read as in version 1"):
+        assert Instrument.load(tmp_path / "old.toml") == Instrument.load("mauvesim").with_(light_loss=0.2)
     with pytest.warns(UserWarning, match="is called mauve since version 2"):
         assert Instrument.load("mauve-electrons") == Instrument.load("mauve")
     with pytest.warns(UserWarning, match="is called mauve since version 2"):

@@ -4,7 +4,6 @@ import io
 import shutil
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +19,6 @@ SHORT = paper(
     "stare.gaps=[[100, 150]]", "stare.half_width_s=20", "stare.search=false",
     "stare.thermal.amplitude=2.0", "stare.thermal.period_s=600",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def found(stares) -> Any:
-    return stare(SHORT, stares)
 
 
 def test_spectra_summed_over_frames_equal_exposures_of_the_engine(stares):
@@ -44,7 +38,9 @@ def test_spectra_summed_over_frames_equal_exposures_of_the_engine(stares):
     assert 5.0 * one.light.flux[:, 2].sum() == pytest.approx(net[band].sum(), abs=0.1)
 
 
-def test_light_scatters_about_its_mean_by_its_standard_deviation(found):
+def test_light_scatters_by_its_standard_deviation_in_bands_of_a_sweep_and_files(stares):
+    """Files have the columns of lightkurve; a sweep goes over magnitude and temperature, in bands that overlap."""
+    found = stare(SHORT, stares)
     light = found.stares[0].light
     z = (light.flux - light.mean) / light.sd
     spectrum = (light.spectrum - light.spectrum_mean) / light.spectrum_sd
@@ -53,22 +49,6 @@ def test_light_scatters_about_its_mean_by_its_standard_deviation(found):
     assert abs((spectrum**2).mean() - 1) < 4.9 * np.sqrt(2 / spectrum.size) + 0.01
     # The dark follows 2 deg C up and down, hundreds of standard deviations that are known and taken off.
     assert abs(spectrum.mean()) < 4.9 / np.sqrt(spectrum.size)
-
-
-def test_sweep_over_magnitude_and_temperature_is_answered_in_bands_that_overlap(stares, found):
-    bands = [[200, 300], [200, 300], [250, 450], *([300 + 10 * k, 400 + 10 * k] for k in range(9))]
-    axes = '{quantity="magnitude", values=[7.4, 9]}, {quantity="flare_temperature", values=[10000, 20000]}'
-    swept = stare(SHORT.with_settings([f"stare.bands_nm={bands}", f"sweep.axes=[{axes}]"]), stares)
-    assert swept.table["magnitude"].value.tolist() == [7.4, 7.4, 9.0, 9.0]
-    assert swept.table["frame_noise"][2] > 2 * swept.table["frame_noise"][0]
-    assert [one.flares[0].event.hottest_k for one in swept.stares] == [10_000.0, 20_000.0] * 2
-    light = swept.stares[0].light
-    assert light.flux.shape == (50, 13)
-    np.testing.assert_array_equal(light.flux[:, 1], light.flux[:, 2])
-    np.testing.assert_allclose(light.flux[:, [1, 4]], found.stares[0].light.flux[:, [1, 2]], atol=0.01)
-
-
-def test_fits_file_has_the_columns_of_lightkurve(found):
     with fits.open(io.BytesIO(found.documents["light-curve-1.fits"]())) as hdus:
         hdus.verify("exception")
         table, gti = hdus[1], hdus["GTI"]
@@ -80,13 +60,22 @@ def test_fits_file_has_the_columns_of_lightkurve(found):
         assert hdus[0].header["CCD-TEMP"] == 21.0
         assert table.columns.names[:6] == ["TIME", "CADENCENO", "QUALITY", "FLUX", "FLUX_ERR", "MEAN"]
         assert table.columns["TIME"].unit == "d"
-        light = found.stares[0].light
         np.testing.assert_allclose(table.data["FLUX"], light.flux[:, 0], rtol=1e-6)
         np.testing.assert_allclose(table.data["FLUX_ERR_300_400"], light.sd[:, 2], rtol=1e-6)
         assert table.data["CADENCENO"].tolist() == [*range(20), *range(30, 60)]
         np.testing.assert_allclose(gti.data["START"] * 86_400, [0.0, 150.0])
         np.testing.assert_allclose(gti.data["STOP"] * 86_400, [100.0, 300.0])
         assert hdus[0].header["OBJECT"] == "G2V V = 7.4"
+    bands = [[200, 300], [200, 300], [250, 450], *([300 + 10 * k, 400 + 10 * k] for k in range(9))]
+    axes = '{quantity="magnitude", values=[7.4, 9]}, {quantity="flare_temperature", values=[10000, 20000]}'
+    swept = stare(SHORT.with_settings([f"stare.bands_nm={bands}", f"sweep.axes=[{axes}]"]), stares)
+    assert swept.table["magnitude"].value.tolist() == [7.4, 7.4, 9.0, 9.0]
+    assert swept.table["frame_noise"][2] > 2 * swept.table["frame_noise"][0]
+    assert [one.flares[0].event.hottest_k for one in swept.stares] == [10_000.0, 20_000.0] * 2
+    flux = swept.stares[0].light.flux
+    assert flux.shape == (50, 13)
+    np.testing.assert_array_equal(flux[:, 1], flux[:, 2])
+    np.testing.assert_allclose(flux[:, [1, 4]], light.flux[:, [1, 2]], atol=0.01)
 
 
 def test_one_sum_finds_flares_of_the_temperature_of_the_study(stares):

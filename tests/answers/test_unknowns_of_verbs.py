@@ -105,15 +105,9 @@ def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
 @EACH
 def test_neighbours_change_every_verb(verb: str) -> None:
     """Answers change and list the neighbours; a verb that observes no star names them as not used."""
-    study = asked(verb, {})
-    near = {"neighbours": DATA / "studies" / "neighbours.csv", "neighbour_share": 0.5}
-    if verb == "plan":
-        (target,) = study.plan.targets
-        plan = study.plan.model_copy(update={"targets": (target.model_copy(update=near),)})
-        study = study.model_copy(update={"plan": plan})
-    else:
-        study = study.model_copy(update={"star": (study.star[0].model_copy(update=near),)})
-    found = getattr(mauvecl, verb)(study, engine_of(verb))
+    star = "plan.targets.0" if verb == "plan" else "star.0"
+    near = [f"{star}.neighbours='{DATA / 'studies' / 'neighbours.csv'}'", f"{star}.neighbour_share=0.5"]
+    found = getattr(mauvecl, verb)(asked(verb, {}).with_settings(near), engine_of(verb))
     if verb == "visible":
         assert found.assumed.endswith("not used: star.neighbours.")
         assert found.neighbours is None

@@ -12,6 +12,7 @@ import pytest
 from astropy.modeling.physical_models import BlackBody
 from refusals import refused
 from scenes import BANDS, instrument, source
+from tables import DATA
 
 from mauvecl import BalmerFlare, Blackbody, FlareWithLines, ObservedFlare, Source, TwoBlackbodies, expect
 
@@ -57,6 +58,12 @@ def test_vega_has_its_catalogued_magnitude_and_ten_is_fainter() -> None:
     for band in ("Kepler", "GALEX NUV"):
         assert vega.magnitude(band) == vega.magnitude(band, "ab")
     np.testing.assert_allclose(SUN.at_magnitude(9.9).flux_flam, 0.1 * SUN.at_magnitude(7.4).flux_flam, rtol=1e-9)
+    # Flares do not depend on the system.
+    for system, wanted in {"catalogue": "as in catalogues: AB", "vega": "have Vega at 0", "ab": "are AB"}.items():
+        star = SUN.at_magnitude(7.4, "Kepler", system)
+        assert wanted in star.scale
+        flare = star.flaring(0.24).flux_flam * (SUN.flux_flam[0] / star.flux_flam[0])
+        np.testing.assert_allclose(flare, SUN.flaring(0.24).flux_flam)
 
 
 def test_spectra_are_released_after_their_magnitude_is_computed() -> None:
@@ -68,14 +75,6 @@ def test_spectra_are_released_after_their_magnitude_is_computed() -> None:
     held = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert held < n, "bytes, of which the spectrum has 16 a point"
-
-
-def test_flares_do_not_depend_on_the_system_of_magnitudes() -> None:
-    for system, wanted in {"catalogue": "as in catalogues: AB", "vega": "have Vega at 0", "ab": "are AB"}.items():
-        star = SUN.at_magnitude(7.4, "Kepler", system)
-        assert wanted in star.scale
-        flare = star.flaring(0.24).flux_flam * (SUN.flux_flam[0] / star.flux_flam[0])
-        np.testing.assert_allclose(flare, SUN.flaring(0.24).flux_flam)
 
 
 def test_replacing_flare_hides_photosphere() -> None:
@@ -163,7 +162,6 @@ def test_stated_error_of_a_mean_equals_the_scatter_of_means() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.3)
 
 
-DATA = Path(__file__).parent.parent / "data"
 FLARE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
 
 
@@ -192,13 +190,9 @@ def test_total_equals_the_integral_on_a_grid_with_lines_and_edges(spectrum: Any)
     assert spectrum.bolometric_flux() == pytest.approx(total, rel=2e-5)
 
 
-def test_blackbody_equals_astropy_to_the_last_bit() -> None:
-    nm = np.arange(170.0, 1100.0)
+def test_blackbody_equals_astropy_to_the_last_bit_and_balmer_flare_its_formula() -> None:
     for kelvin in (3000.0, 5772.0, 10_000.0, 50_000.0):
-        np.testing.assert_array_equal(Blackbody(kelvin).flux(nm), blackbody(nm, kelvin))
-
-
-def test_balmer_flare_follows_its_formula() -> None:
+        np.testing.assert_array_equal(Blackbody(kelvin).flux(NM), blackbody(NM, kelvin))
     nm, flare = np.array([200.0, 300.0, 364.5, 364.7, 500.0]), BalmerFlare(9500.0, 2.5, 8000.0)
     edge = blackbody(np.array([364.6]), 9500.0)[0]
     # h, c and k of CODATA 2018, SI.
@@ -210,7 +204,8 @@ def test_balmer_flare_follows_its_formula() -> None:
     assert BalmerFlare(9500.0, 1.0).flux(nm) == pytest.approx(blackbody(nm, 9500.0), rel=1e-15)
 
 
-def test_relative_lines_carry_their_fraction_and_absolute_ones_their_flux() -> None:
+def test_lines_have_their_share_or_flux_at_the_wavelengths_of_their_atoms() -> None:
+    """Compare with the Rydberg constant of hydrogen, 1.09677583e7 m-1 (CODATA), and NIST's lines of Ca II and Mg II."""
     plain, nm = Blackbody(10_000.0), np.linspace(200.0, 700.0, 50_001)
     lined = FlareWithLines(plain, {"Mg II": 0.05}, {"H beta": 2e-13})
     grid = lined.grid(nm)
@@ -220,36 +215,19 @@ def test_relative_lines_carry_their_fraction_and_absolute_ones_their_flux() -> N
     assert lined.fixed_lines
     assert not FlareWithLines(plain, {"Mg II": 0.05}).fixed_lines
 
-
-def test_lines_have_the_wavelengths_of_their_atoms() -> None:
-    """Compare with the Rydberg constant of hydrogen, 1.09677583e7 m-1 (CODATA), and NIST's lines of Ca II and Mg II."""
-
     def centre(*lines: str) -> float:
         flare = FlareWithLines(Blackbody(), {}, dict.fromkeys(lines, 1e-13))
-        nm = flare.grid(np.linspace(200.0, 700.0, 50_001))
-        return float(np.average(nm, weights=flare.flux_at_telescope(nm) * np.gradient(nm)))
+        at = flare.grid(nm)
+        return float(np.average(at, weights=flare.flux_at_telescope(at) * np.gradient(at)))
 
     for n, name in enumerate(("h_ALPHA", "H beta", "H gamma", "H delta", "H epsilon", "H8"), 3):
         assert centre(name) == pytest.approx(1e9 / (1.09677583e7 * (0.25 - 1 / n**2)), abs=0.02)
-    for name, nm in (("Ca II K", 393.478), ("Ca II H", 396.959), ("Mg II k", 279.635), ("Mg II h", 280.353)):
-        assert centre(name) == pytest.approx(nm, abs=0.002)
+    for name, at in (("Ca II K", 393.478), ("Ca II H", 396.959), ("Mg II k", 279.635), ("Mg II h", 280.353)):
+        assert centre(name) == pytest.approx(at, abs=0.002)
     assert centre("Ca II") == pytest.approx(centre("Ca II K", "Ca II H"), abs=1e-6)
 
 
-def test_coarse_spectrum_is_continued_from_its_last_point_if_asked() -> None:
-    flare = ObservedFlare.from_arrays([150.0, 300.0, 500.0], [1.0, 2.0, 3.0], continue_at_k=8000.0)
-    assert flare.measured_nm == (150.0, 500.0)
-    assert "8000 K continues it" in flare.messages[-1]
-    far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
-    assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
-    # A finer one is continued from the mean of its last 20 nm.
-    nm = np.arange(200.0, 801.0)
-    flare, last = ObservedFlare.from_arrays(nm, nm**4, continue_at_k=8000.0), nm >= 780.0
-    level = np.trapezoid(nm[last] ** 4) / np.trapezoid(blackbody(nm[last], 8000.0))
-    assert flare.flux_flam[-1] == pytest.approx(level * blackbody(flare.wavelength_nm[-1:], 8000.0)[0])
-
-
-def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
+def test_observed_flare_lacks_the_quiescent_star_and_is_continued_if_asked(tmp_path: Path) -> None:
     nm, other = np.linspace(150.0, 800.0, 1301), np.linspace(190.0, 820.0, 2001)
     for name, at, flux in (("both", nm, 3e-14 * nm), ("star", other, 1e-14 * other)):
         np.savetxt(tmp_path / f"{name}.txt", np.column_stack([at, flux]))
@@ -266,3 +244,13 @@ def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
     kept = (nm < 330.0) | (nm > 356.0)
     gap = ObservedFlare.from_arrays(nm[kept], 1e-14 * nm[kept])
     assert any("its gap at 329.5-356.5 nm" in text for text in gap.messages)
+    flare = ObservedFlare.from_arrays([150.0, 300.0, 500.0], [1.0, 2.0, 3.0], continue_at_k=8000.0)
+    assert flare.measured_nm == (150.0, 500.0)
+    assert "8000 K continues it" in flare.messages[-1]
+    far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
+    assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
+    # A finer one is continued from the mean of its last 20 nm.
+    nm = np.arange(200.0, 801.0)
+    flare, last = ObservedFlare.from_arrays(nm, nm**4, continue_at_k=8000.0), nm >= 780.0
+    level = np.trapezoid(nm[last] ** 4) / np.trapezoid(blackbody(nm[last], 8000.0))
+    assert flare.flux_flam[-1] == pytest.approx(level * blackbody(flare.wavelength_nm[-1:], 8000.0)[0])

@@ -1,11 +1,10 @@
-"""Spectra of tables at random, of archives, and of files that are damaged, too large or none: right or refused."""
+"""Spectra of tables at random, of archives, and of files that are too large or none: right or refused."""
 
 import bz2
 import csv
 import gzip
 import lzma
 import os
-import tomllib
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from corpus import CORPUS, FLUX, NM, cases, value, written
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from refusals import refused
+from tables import DATA, toml
 
 from mauvecl import InputError, Instrument, Source, expect
 
@@ -55,7 +55,7 @@ def test_units_may_be_those_of_astropy_and_frequencies_may_rise_or_fall(tmp_path
     np.testing.assert_allclose((star.wavelength_nm, star.flux_flam), (NM[NM > 175.0], FLUX[NM > 175.0]), rtol=1e-6)
 
 
-RANDOM = tomllib.loads((CORPUS / "spectrum_files.toml").read_text(encoding="utf-8"))["random"]
+RANDOM = toml("corpus/spectrum_files.toml")["random"]
 WAVES, FLUXES = ({name: value(text) for name, text in RANDOM[key].items()} for key in ("waves", "fluxes"))
 #: Columns that are not taken for the flux.
 NOT_FLUX = [case["head"].split(",")[0] for name, case in CASES.items() if " a column that is no flux " in name]
@@ -144,28 +144,7 @@ def test_only_regular_files_of_limited_size_are_read(tmp_path: Path, monkeypatch
             Source.read(large)
 
 
-@pytest.mark.parametrize(
-    "name", ["FITS table plain fits", "FITS image linear fits", "FITS table start and step fits",
-             "content instead of a name text txt", "content instead of a name fits.gz"]
-)  # fmt: skip
-def test_damaged_files_raise_or_are_read(name: str, tmp_path: Path) -> None:
-    """Change random bytes of whole files with a fixed seed; only InputError may be raised."""
-    rng = np.random.default_rng(14)
-    path = written(CASES[f"spectrum_files {name}"], tmp_path)
-    content = np.fromfile(path, np.uint8)
-    for _ in range(60):
-        damaged = content.copy()
-        # Headers stand at the front.
-        damaged[rng.integers(0, min(content.size, 6000), 6)] = rng.integers(32, 127, 6)
-        damaged.tofile(path)
-        try:
-            Source.read(path)
-        except InputError as error:
-            assert "\n" not in str(error)  # noqa: PT017
-
-
-HERE = Path(__file__).parents[1] / "data" / "spectra"
-ENTRIES = tomllib.loads((CORPUS / "archive_files.toml").read_text(encoding="utf-8"))
+HERE, ENTRIES = DATA / "spectra", toml("corpus/archive_files.toml")
 RIGHT, SHORT = ([pytest.param(one, id=one["file"]) for one in ENTRIES[key]] for key in ("right", "short"))
 
 
@@ -230,9 +209,6 @@ def test_messages_of_the_star_that_continues_a_spectrum() -> None:
     dark = Source.from_arrays(wavelength, np.where(wavelength < 300.0, 0.0, 1e-12), extend="M4V")
     for star in (Source.read(HERE / "vb8_stiswfcnic_004.fits", extend="M4V"), dark):
         assert f"in M4V, {noisy}" in star.messages
-    star = Source.from_library("G2V")
-    whole = Source.from_arrays(star.wavelength_nm, star.flux_flam, extend=star)
-    assert "reaches no farther and is not used" in whole.messages[-1]
 
 
 def test_surface_or_relative_fluxes_need_a_magnitude(tmp_path: Path) -> None:
