@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scripts import ROOT
 
 import mauvecl
 from mauvecl import Engine
 from mauvecl.runs import checkpoint
 
-ROOT = Path(__file__).parent.parent
 FORBIDDEN = tomllib.loads((ROOT / "tests" / "data" / "forbidden_imports.toml").read_text(encoding="utf-8"))
 
 

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scripts import tool
+from scripts import ROOT, tool
 
-ROOT = Path(__file__).parent.parent
 check = tool("mutation_check")
 
 
@@ -20,18 +19,10 @@ def dies_at_start(model: Any) -> Any:
 
 
 def dies_in_a_run(model: Any) -> Any:
-    """Return a peer that dies at its second run."""
+    """Return a peer that dies when its time is taken, after the check of its mean."""
     from peers import Peer
 
-    runs: list[int] = []
-
-    def chi2(n: int) -> Any:
-        runs.append(n)
-        if len(runs) > 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return np.full(n, 10.0)
-
-    return Peer("mortal", "1", 10, chi2)
+    return Peer("mortal", "1", 10, lambda n: dies_at_start(model) if n == 10 else np.full(n, 10.0))
 
 
 @pytest.mark.long
