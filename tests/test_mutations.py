@@ -52,15 +52,12 @@ def test_every_mutation_has_its_texts_and_its_test() -> None:
                 # A mutant that cannot be imported proves nothing.
                 compile(sources[place].replace(text, changed), name, "exec")
         check.node_of(test, tests)
-
-
-def test_texts_and_tests_that_are_missing_or_occur_twice_are_refused() -> None:
+    # Texts and tests that are missing or occur twice are refused.
     files = {Path("a.py"): "def test_a(\nx = 1\n", Path("b.py"): "def test_b(\ny = 1\nx = 1\n\ndef test_a(\n"}
-    assert check.place_of("y = 1", files) == Path("b.py")
     assert check.node_of("test_b[0.1]", files) == "b.py::test_b[0.1]"
-    for text, words in (("z = 1", "occurs 0 times"), ("x = 1", r"occurs 2 times \(a.py, b.py\)")):
+    for find, one, words in (
+        (check.place_of, "z = 1", "occurs 0 times"), (check.place_of, "x = 1", r"occurs 2 times \(a.py, b.py\)"),
+        (check.node_of, "test_c", "in 0 files"), (check.node_of, "test_a", "in 2 files"),
+    ):  # fmt: skip
         with pytest.raises(SystemExit, match=words):
-            check.place_of(text, files)
-    for test, number in (("test_c", 0), ("test_a", 2)):
-        with pytest.raises(SystemExit, match=f"in {number} files"):
-            check.node_of(test, files)
+            find(one, files)
