@@ -23,14 +23,12 @@ CHANGES = tomllib.loads((ROOT / "tests" / "data" / "brought" / "changes.toml").r
 REDUCED, INSTEAD, FEWER, NOT_RUN, NOT_EXECUTED = CHANGES.values()
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SNIPPET = re.compile(r"^```(python|toml)\n(.*?)^```$|^    (mauvecl [^\n]*)$", re.DOTALL | re.MULTILINE)
-#: What a process prints, not what a reader types.
-OUTPUT = re.compile(r"mauvecl: ")
 
 
 def snippets(page: Path) -> Iterator[tuple[str, str]]:
     """Yield kind and text of every snippet of a page, in its order."""
     for kind, block, command in SNIPPET.findall(page.read_text(encoding="utf-8")):
-        if command and OUTPUT.match(command) is None:
+        if command:
             yield "command", command
         elif kind == "python" or (kind == "toml" and re.match(r"# [\w.-]+\.toml\n", block)):
             yield kind, block

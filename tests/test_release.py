@@ -75,13 +75,6 @@ def test_paper_cites_its_references_and_has_the_form_that_the_journal_asks_for()
     ]  # fmt: skip
 
 
-def test_page_lists_every_dependency_and_its_purpose() -> None:
-    listed = re.findall(r"^\| ([\w-]+) \|", text_of("docs/dependencies.md"), re.MULTILINE)
-    assert [one.requirement.name for one in tool("audit_dependencies").dependencies()] == [
-        name for name in listed if name != "package"
-    ]
-
-
 #: Packages whose names on conda-forge differ from those on PyPI; these bring no more than what is imported.
 ON_CONDA = {"astropy": "astropy-base", "matplotlib": "matplotlib-base"}
 
@@ -92,7 +85,9 @@ def bounds(requirements: list[str]) -> dict[str, str]:
     return {ON_CONDA.get(one[1], one[1]): one[2] or "" for one in found if one}
 
 
-def test_recipe_environment_and_container_need_what_the_package_needs() -> None:
+def test_page_recipe_environment_and_container_list_what_the_package_needs() -> None:
+    listed = re.findall(r"^\| (?!package)([\w-]+) \|", text_of("docs/dependencies.md"), re.MULTILINE)
+    assert [one.requirement.name for one in tool("audit_dependencies").dependencies()] == listed
     # With its pictures and the driver, which on PyPI is an extra of pyopencl.
     expected = bounds([*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["plot"], "pocl"])
     recipe = loaded("recipe/recipe.yaml")
