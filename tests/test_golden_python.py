@@ -40,7 +40,6 @@ ITERATED = ("fits", "fits_in_time", "answers_in_python")
 
 
 def golden(function: Callable[[Path], Answer]) -> Callable[[Path], Answer]:
-    """Register a function whose answer is compared."""
     ANSWERS[function.__name__] = function
     return function
 

@@ -27,7 +27,6 @@ MADE = {"Detection", "Expectation", "Frames", "Instrument", "Source", "Study"}
 
 
 def commands(command: Any, path: str = "mauvecl") -> Iterator[str]:
-    """Yield each verb and each of its flags and arguments."""
     yield f"command {path}"
     for one in command.params:
         if one.param_type_name == "argument":
@@ -39,7 +38,6 @@ def commands(command: Any, path: str = "mauvecl") -> Iterator[str]:
 
 
 def keys(section: Any, kind: str) -> Iterator[str]:
-    """Yield each key of a file, with its unit."""
     for path, field in fields(section):
         unit = metadata(field, "Unit")
         yield f"{kind} {'.'.join(path)}" + (f" [{unit.name}]" if unit and unit.name else "")
@@ -103,7 +101,6 @@ def python() -> Iterator[str]:
 
 
 def public_interface() -> list[str]:
-    """Return every line, each once, sorted."""
     lines = {*commands(get_command(app.app)), *keys(Study, "study"), *keys(Instrument, "instrument")}
     mapping, *_ = get_args(get_type_hints(mauvecl.read_frames)["mapping"])
     lines |= {*keys(mapping, "mapping"), *columns(), *python()}
@@ -111,7 +108,6 @@ def public_interface() -> list[str]:
 
 
 def test_nothing_public_is_gone_and_additions_are_listed() -> None:
-    """Compare with the list; `python tests/test_public_interface.py` accepts additions."""
     promised, lines = FILE.read_text(encoding="utf-8").splitlines(), public_interface()
     gone = {*promised} - {*lines, *(f"{line[:-1]}, required)" for line in lines)}
     assert gone == set(), "public names are gone or have changed: deprecate them instead (docs/stability.md)"

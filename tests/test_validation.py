@@ -90,7 +90,6 @@ def parts(hint: Any) -> Iterator[Any]:
 
 
 def named(kind: str, hint: Any) -> list[Any]:
-    """Return the metadata of one kind in an annotation."""
     return [part for part in parts(hint) if type(part).__name__ == kind]
 
 
@@ -107,7 +106,6 @@ def holds_arrays(hint: Any) -> bool:
 
 
 def having(condition: Callable[[Any], bool]) -> list[tuple[str, str]]:
-    """Return the parameters whose annotations meet a condition."""
     return [(path, name) for path, name in PARAMETERS if condition(annotation(path, name))]
 
 
