@@ -17,7 +17,7 @@ SMALL_SHARDS = [
     sys.executable,
     "-c",
     "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
-    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()",
+    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli import app; app.main()",
 ]
 
 
