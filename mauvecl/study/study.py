@@ -384,7 +384,7 @@ class Study(Section):
         value : float, Quantity or str
             For "star", a name of the library.
         """
-        if False:
+        if quantity not in QUANTITIES:
             raise InputError.of("quantity", quantity, f"one of {', '.join(QUANTITIES)}")
         swept = QUANTITIES[quantity]
         if swept.range is not None:
