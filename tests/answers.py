@@ -35,7 +35,6 @@ QUICK: dict[str, list[str]] = {
 
 
 def detected(engine: Any, scene: list[Expectation], n: int = N, **how: Any) -> Detection:
-    """Ask an engine or a pool for the detection of the flares of a star."""
     return engine.detect(scene[0], scene[1:], realisations=n, **{"seed": 5} | how)
 
 

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from unittest import mock
 
+from processes import python
+
 from mauvecl.cli import app
 
 #: The command line with small shards, so that a run of a second has several; shards change no answer.
@@ -15,7 +17,7 @@ SMALL_SHARDS = [
     sys.executable,
     "-c",
     "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
-    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli.app import main; main()",
+    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli import app; app.main()",
 ]
 
 
@@ -49,13 +51,5 @@ def ended(*words: str | Path, folder: Path, columns: int = 200) -> tuple[int, st
 
 def started(*words: str | Path, folder: Path, code: int = 0, **environment: str) -> Done:
     """Run a command in another process, as from a shell."""
-    done = subprocess.run(
-        [sys.executable, "-m", "mauvecl", *map(str, words)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        env=os.environ | {"COLUMNS": "200"} | environment,
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+    module = "import runpy; runpy.run_module('mauvecl', run_name='__main__')"
+    return python(module, *words, folder=folder, ends=code, **{"COLUMNS": "200"} | environment)

@@ -152,7 +152,7 @@ def _ecsv(case: Case) -> bytes:
 def _votable(case: Case) -> bytes:
     out, table = io.BytesIO(), _table(case)
     for name in table.colnames:
-        # Units that are those of the standard; others are put in afterwards.
+        # Units that are not those of the standard are put in afterwards.
         table[name].unit = None
     table.write(out, format="votable", tabledata_format=case.get("tabledata", "tabledata"))
     content = out.getvalue().decode()

@@ -47,12 +47,9 @@ def write_inputs(folder: Path, question: str) -> None:
     """Write the files that a question names, and those that these name."""
     if "standards.toml" in question:
         question += " raw.toml " + " ".join(FRAMES)
-    for path in INPUTS.iterdir():
-        if path.name in question:
-            shutil.copy(path, folder)
-    for name, source in COPIED.items():
+    for name, path in ({path.name: path for path in INPUTS.iterdir()} | COPIED).items():
         if name in question:
-            shutil.copy(DATA / source, folder / name)
+            shutil.copy(DATA / path, folder / name)
     for name, drawn in FRAMES.items():
         if name in question:
             frames(folder / name, *drawn)

@@ -1,5 +1,6 @@
 """The files of the page about mappings; others are in the corpus."""
 
+import shutil
 from pathlib import Path
 
 import astropy.units as u
@@ -25,14 +26,13 @@ def documented_files(folder: Path) -> None:
     fits.HDUList([fits.PrimaryHDU(), *images, times]).writeto(folder / "images.fits")
     air = u.Quantity(nm, "nm").to_value("AA") / 1.00028
     Table({"wavelength": air}).write(folder / "wavelengths.csv")
-    for name in ("spectra", "logged"):
-        (folder / name).mkdir()
+    (folder / "spectra").mkdir()
     starts = Time(61_100 + (time - 2.5) / 86_400, format="mjd").isot
     for k in range(30):
         rows = "".join(f"{w},{c},{s}\n" for w, c, s in zip(nm, counts[k], sigma[k], strict=True))
         text = f"# DATE-OBS = {starts[k]}\n# EXPTIME = 5\nlambda,counts,sigma\n{rows}"
         (folder / "spectra" / f"{k:02d}.csv").write_text(text)
-        (folder / "logged" / f"{k:02d}.csv").write_text(text)
+    shutil.copytree(folder / "spectra", folder / "logged")
     Table({"name": [f"{k:02d}.csv" for k in range(30)], "mjd": mjd}).write(folder / "logged" / "log.csv")
     Table({"mjd": np.repeat(mjd, 4), "lambda": np.tile(nm, 30), "counts": counts.ravel(),
            "sigma": sigma.ravel()}).write(folder / "long.csv")  # fmt: skip

@@ -22,13 +22,7 @@ class Probes:
         self.program = build.build(self.context, build.render(("probes",), variant))
 
     def run(
-        self,
-        name: str,
-        items: int,
-        out: NDArray[Any],
-        *inputs: Any,
-        out_first: NDArray[Any] | None = None,
-        start: NDArray[Any] | None = None,
+        self, name: str, items: int, out: NDArray[Any], *inputs: Any, out_first: Any = None, start: Any = None
     ) -> NDArray[Any]:
         """Launch a probe kernel and return `out`, its last argument.
 

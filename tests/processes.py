@@ -16,9 +16,10 @@ def python(
     typed: str | None = None,
     cache: Path | str | None = None,
     folder: Path | None = None,
+    ends: int = 0,
     **environment: str,
 ) -> subprocess.CompletedProcess[str]:
-    """Run code, as an argument or typed, which must end without an error; its kernels may have a cache of its own."""
+    """Run code, as an argument or typed, which must end with an exit code; its kernels may have a cache of its own."""
     more = environment | ({} if cache is None else {"MAUVECL_CACHE_DIR": str(cache)})
     done = subprocess.run(
         [sys.executable, *(["-c", code] if typed is None else []), *map(str, words)],
@@ -30,7 +31,7 @@ def python(
         timeout=300,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == ends, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     return done
 

@@ -9,7 +9,6 @@ ROOT = Path(__file__).parent.parent
 
 
 def loaded(path: Path) -> Any:
-    """Load a script as a module."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

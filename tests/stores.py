@@ -86,7 +86,6 @@ def killed_at(step: int, work: Callable[[], object], *calls: tuple[Any, str]) ->
 
 
 def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Simulate a disk with limited free space."""
     left, real = n_bytes, os.fsync
 
     def fsync(handle: int) -> None:

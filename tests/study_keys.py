@@ -14,29 +14,23 @@ def fields(model: type[BaseModel] = Study, above: tuple[str, ...] = ()) -> Itera
     for name, field in model.model_fields.items():
         path = (*above, name)
         yield path, field
-        for inner in models_in(field.annotation):
-            yield from fields(inner, path)
-
-
-def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the sections that a value may hold."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for part in get_args(annotation):
-        yield from models_in(part)
+        for inner in _parts(field.annotation):
+            if isinstance(inner, type) and issubclass(inner, BaseModel):
+                yield from fields(inner, path)
 
 
 def metadata(field: FieldInfo, kind: str, *, every: bool = False) -> Any:
     """Return the first piece of metadata of a kind, by the name of its class, or all of them."""
-    found = [one for one in (*field.metadata, *_within(field.annotation)) if type(one).__name__ == kind]
+    found = [one for one in (*field.metadata, *_parts(field.annotation)) if type(one).__name__ == kind]
     return found if every else next(iter(found), None)
 
 
-def _within(annotation: Any) -> Iterator[Any]:
-    """Yield the metadata of parts of an annotation, such as of the values of a tuple."""
-    yield from getattr(annotation, "__metadata__", ())
-    for part in get_args(annotation):
-        yield from _within(part)
+def _parts(annotation: Any) -> Iterator[Any]:
+    """Yield the parts of an annotation, such as sections, or the metadata of the values of a tuple."""
+    metadata = getattr(annotation, "__metadata__", ())
+    yield from (annotation, *metadata)
+    for part in get_args(annotation)[: 1 if metadata else None]:
+        yield from _parts(part)
 
 
 #: Paths of the quantities that sweeps, maps and limits vary, except names.

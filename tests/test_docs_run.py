@@ -16,21 +16,19 @@ from pathlib import Path
 import pytest
 from commands import run
 from layouts import documented_files
+from scripts import ROOT
 
-ROOT = Path(__file__).parent.parent
 #: What is appended to a verb's flags, or instead to some commands; what Python draws fewer; what does not run, and why.
 CHANGES = tomllib.loads((ROOT / "tests" / "data" / "brought" / "changes.toml").read_text(encoding="utf-8"))
 REDUCED, INSTEAD, FEWER, NOT_RUN, NOT_EXECUTED = CHANGES.values()
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SNIPPET = re.compile(r"^```(python|toml)\n(.*?)^```$|^    (mauvecl [^\n]*)$", re.DOTALL | re.MULTILINE)
-#: What a process prints, not what a reader types.
-OUTPUT = re.compile(r"mauvecl: ")
 
 
 def snippets(page: Path) -> Iterator[tuple[str, str]]:
     """Yield kind and text of every snippet of a page, in its order."""
     for kind, block, command in SNIPPET.findall(page.read_text(encoding="utf-8")):
-        if command and OUTPUT.match(command) is None:
+        if command:
             yield "command", command
         elif kind == "python" or (kind == "toml" and re.match(r"# [\w.-]+\.toml\n", block)):
             yield kind, block
@@ -74,15 +72,12 @@ BROUGHT: dict[str, tuple[str | tuple[str, str, str] | Callable[[], object], ...]
 
 
 def reduced(command: str) -> list[str]:
-    """Return the words of a command after `mauvecl`, with the flags that make it short."""
+    """Return the words of a command after `mauvecl`, with the flags that make it short; none if it does not run."""
     words = shlex.split(command, comments=True)[1:]
+    if any(re.match(pattern, shlex.join(words)) for pattern in NOT_RUN):
+        return []
     own = next((flags for begin, flags in INSTEAD.items() if shlex.join(words).startswith(begin)), None)
     return words + shlex.split(REDUCED.get(words[0], "") if own is None else own)
-
-
-def not_run(command: str) -> bool:
-    words = command.removeprefix("mauvecl ")
-    return any(re.match(pattern, words) for pattern in NOT_RUN)
 
 
 @pytest.mark.long
@@ -94,11 +89,10 @@ def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         bring(brought)
     names: dict[str, object] = {}
     for kind, snippet in snippets(page):
-        if kind == "command":
-            if not not_run(snippet):
-                run(*reduced(snippet), folder=tmp_path)
-        else:
+        if kind != "command":
             read_snippet(kind, snippet, names)
+        elif words := reduced(snippet):
+            run(*words, folder=tmp_path)
 
 
 def read_snippet(kind: str, snippet: str, names: dict[str, object]) -> None:
@@ -123,5 +117,4 @@ def test_skipped_snippets_exist_on_pages() -> None:
     for word in (*FEWER, *NOT_EXECUTED):
         assert word in python, word
     assert set(BROUGHT) <= {name for name, *_ in every}
-    ran = [one for one in commands if not not_run(f"mauvecl {one}")]
-    assert len(ran) > 0.85 * len(commands)
+    assert sum(1 for one in commands if reduced(f"mauvecl {one}")) > 0.85 * len(commands)

@@ -114,7 +114,6 @@ def thinned(path: Path) -> Table:
 
 
 def tolerances(question: str, column: str) -> tuple[float, float]:
-    """Return relative and absolute tolerance of a column."""
     return next(row[2:] for row in TOLERANCES if question.startswith(row[0]) and re.search(row[1], column))
 
 

@@ -9,7 +9,7 @@ import hashlib
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,6 @@ ITERATED = ("fits", "fits_in_time", "answers_in_python")
 
 
 def golden(function: Callable[[Path], Answer]) -> Callable[[Path], Answer]:
-    """Register a function whose answer is compared."""
     ANSWERS[function.__name__] = function
     return function
 
@@ -53,7 +52,7 @@ def plain(value: Any) -> Any:
         return [plain(one) for one in value]
     if isinstance(value, str | bool | int | None):
         return value
-    array = np.ma.filled(np.ma.asarray(getattr(value, "value", value)), np.nan) if not isinstance(value, bytes) else 0
+    array = np.ma.filled(np.ma.asarray(getattr(value, "value", value)), np.nan)
     if array.dtype.kind in "OSU":
         return [str(one) for one in array.ravel()[:MAX_VALUES]]
     if array.dtype.kind in "iub" and array.size > MAX_VALUES:
@@ -62,32 +61,27 @@ def plain(value: Any) -> Any:
     return values[0] if array.ndim == 0 else values
 
 
-def table(of: Any, *columns: str) -> Answer:
-    return {name: of[name] for name in columns or of.colnames}
+def table(of: Any) -> Answer:
+    return {name: of[name] for name in of.colnames}
 
 
-def leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each number or text, and each list of numbers, with its place."""
-    if isinstance(value, dict):
-        for key, one in value.items():
-            yield from leaves(one, f"{where}/{key}")
-    elif isinstance(value, list) and not all(isinstance(one, int | float) for one in value):
-        yield from leaves(dict(enumerate(value)), where)
-    else:
-        yield where, value
+def parts(of: Any, *names: str) -> Answer:
+    return {name: getattr(of, name) for name in names}
 
 
-def assert_same(ours: Answer, theirs: Answer, tolerance: float) -> None:
+def assert_same(ours: Any, theirs: Any, tolerance: float, where: str = "") -> None:
     """Compare numbers to a relative tolerance, all else exactly."""
-    found, expected = dict(leaves(ours)), dict(leaves(theirs))
-    assert list(found) == list(expected)
-    for where, value in expected.items():
-        if np.asarray(value).dtype.kind == "f":
-            end = tolerance > TOLERANCE and where.rpartition("/")[2].startswith(("low", "high"))
-            rtol = INTERVALS if end else tolerance
-            np.testing.assert_allclose(found[where], value, rtol=rtol, atol=1e-300, err_msg=where)
-        else:
-            assert found[where] == value, where
+    if isinstance(theirs, list) and not all(isinstance(one, int | float) for one in theirs):
+        ours, theirs = dict(enumerate(ours)), dict(enumerate(theirs))
+    if isinstance(theirs, dict):
+        assert list(ours) == list(theirs), where
+        for key, one in theirs.items():
+            assert_same(ours[key], one, tolerance, f"{where}/{key}")
+    elif np.asarray(theirs).dtype.kind == "f":
+        end = tolerance > TOLERANCE and where.rpartition("/")[2].startswith(("low", "high"))
+        np.testing.assert_allclose(ours, theirs, rtol=INTERVALS if end else tolerance, atol=1e-300, err_msg=where)
+    else:
+        assert ours == theirs, where
 
 
 NM, SEEN_NM = np.linspace(150.0, 1100.0, 39), np.linspace(200.0, 700.0, 26)
@@ -306,8 +300,7 @@ def fits(folder: Path) -> Answer:
         "two": mauvecl.fit_two_temperatures(frames[:1], quiet, FlareModel.of(dwarf, mauve, quiet, distance_pc=5.0)),
     }  # fmt: skip
     for name, one in fitted.items():
-        found[name] = {"estimates": one.estimates, "errors": one.errors, "low": one.low, "high": one.high,
-                       "chi2": one.chi2, "p_value": one.p_value}  # fmt: skip
+        found[name] = parts(one, "estimates", "errors", "low", "high", "chi2", "p_value")
     return found
 
 
@@ -364,10 +357,8 @@ def lines_and_periods(folder: Path) -> Answer:
         found[path.stem] = [one.flux, one.error]
     time_d = np.sort(np.random.Generator(np.random.PCG64(1)).uniform(0, 60, 30))
     periods = visits.recover_periods(time_d, np.array([2.0, 10.0]), np.array([1.0, 3.0]), fap=0.05)
-    found["periods"] = {
-        "threshold": periods.threshold, "recovered": [[cell.value for cell in row] for row in periods.recovered]
-    }  # fmt: skip
-    return found
+    recovered = [[cell.value for cell in row] for row in periods.recovered]
+    return found | {"periods": {"threshold": periods.threshold, "recovered": recovered}}
 
 
 @pytest.mark.parametrize("name", ANSWERS)

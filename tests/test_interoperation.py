@@ -13,7 +13,7 @@ from mauvecl import Blackbody, Frames, Source, Study
 SUN = source("G2V", 7.4)
 
 
-def test_synphot_spectrum_round_trips() -> None:
+def test_synphot_spectrum_round_trips_and_one_of_stsynphot_is_read(recwarn: pytest.WarningsRecorder) -> None:
     from synphot import SourceSpectrum
     from synphot.models import Empirical1D
 
@@ -25,10 +25,7 @@ def test_synphot_spectrum_round_trips() -> None:
     nm = np.arange(200.0, 700.0, 7.3)
     light = nm * np.interp(nm, flat.wavelength_nm, flat.flux_flam)
     np.testing.assert_allclose(light, light[0], rtol=1e-5)
-
-
-def test_stsynphot_spectrum_is_read(recwarn: pytest.WarningsRecorder) -> None:
-    """Read the result of its parser for expressions that need no data files."""
+    # What stsynphot's parser makes of expressions that need no data files.
     parser = pytest.importorskip("stsynphot.spparser")
     found = Source.from_synphot(parser.parse_spec("rn(bb(9000),box(5500,100),15,abmag)"))
     assert found.at_magnitude(8.0).magnitude("V") == pytest.approx(8.0, abs=1e-6)

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scripts import tool
+from scripts import ROOT, tool
 
-ROOT = Path(__file__).parent.parent
 check = tool("mutation_check")
 
 
@@ -20,18 +19,10 @@ def dies_at_start(model: Any) -> Any:
 
 
 def dies_in_a_run(model: Any) -> Any:
-    """Return a peer that dies at its second run."""
+    """Return a peer that dies when its time is taken, after the check of its mean."""
     from peers import Peer
 
-    runs: list[int] = []
-
-    def chi2(n: int) -> Any:
-        runs.append(n)
-        if len(runs) > 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return np.full(n, 10.0)
-
-    return Peer("mortal", "1", 10, chi2)
+    return Peer("mortal", "1", 10, lambda n: dies_at_start(model) if n == 10 else np.full(n, 10.0))
 
 
 @pytest.mark.long
@@ -61,15 +52,12 @@ def test_every_mutation_has_its_texts_and_its_test() -> None:
                 # A mutant that cannot be imported proves nothing.
                 compile(sources[place].replace(text, changed), name, "exec")
         check.node_of(test, tests)
-
-
-def test_texts_and_tests_that_are_missing_or_occur_twice_are_refused() -> None:
+    # Texts and tests that are missing or occur twice are refused.
     files = {Path("a.py"): "def test_a(\nx = 1\n", Path("b.py"): "def test_b(\ny = 1\nx = 1\n\ndef test_a(\n"}
-    assert check.place_of("y = 1", files) == Path("b.py")
     assert check.node_of("test_b[0.1]", files) == "b.py::test_b[0.1]"
-    for text, words in (("z = 1", "occurs 0 times"), ("x = 1", r"occurs 2 times \(a.py, b.py\)")):
+    for find, one, words in (
+        (check.place_of, "z = 1", "occurs 0 times"), (check.place_of, "x = 1", r"occurs 2 times \(a.py, b.py\)"),
+        (check.node_of, "test_c", "in 0 files"), (check.node_of, "test_a", "in 2 files"),
+    ):  # fmt: skip
         with pytest.raises(SystemExit, match=words):
-            check.place_of(text, files)
-    for test, number in (("test_c", 0), ("test_a", 2)):
-        with pytest.raises(SystemExit, match=f"in {number} files"):
-            check.node_of(test, files)
+            find(one, files)

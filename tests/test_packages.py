@@ -10,12 +10,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from scripts import ROOT
 
 import mauvecl
 
-pytestmark = pytest.mark.long
-
-ROOT = Path(__file__).parent.parent
 #: What a checkout has, or an unpacked sdist; a working copy has much more beside it.
 FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "paper", "recipe", "tests", "tools")
 FILES = (
@@ -59,44 +57,28 @@ def files_below(tree: Path) -> set[str]:
     }
 
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return copied(tmp_path_factory.mktemp("checkout"))
-
-
-@pytest.fixture(scope="module")
-def packages(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, bytes]:
-    return built(tree, tmp_path_factory.mktemp("built"))
-
-
-def test_same_files_give_the_same_packages(packages: tuple[bytes, bytes], tmp_path: Path) -> None:
-    """Build in another folder, with other times and permissions of the files."""
-    tree = copied(tmp_path / "elsewhere")
-    for number, path in enumerate(sorted(tree.rglob("*"))):
-        if not path.is_symlink():
-            os.utime(path, (1_000_000_000 + number, 1_000_000_000 + number))
-            path.chmod(path.stat().st_mode & 0o750)
-    assert built(tree, tmp_path / "out") == packages
-
-
-def test_sdist_holds_every_file_no_link_and_the_same_wheel(
-    tree: Path, packages: tuple[bytes, bytes], tmp_path: Path
-) -> None:
-    wheel, sdist = packages
+@pytest.mark.long
+def test_packages_are_the_same_for_the_same_files_complete_and_licensed(tmp_path: Path) -> None:
+    tree = copied(tmp_path / "checkout")
+    packages = wheel, sdist = built(tree, tmp_path / "built")
     with tarfile.open(fileobj=io.BytesIO(sdist)) as archive:
         archive.extractall(tmp_path, filter="data")
     unpacked = tmp_path / f"mauvecl-{VERSION}"
     assert files_below(unpacked) - {"PKG-INFO"} == files_below(tree)
     assert not [path for path in unpacked.rglob("*") if path.is_symlink()]
     assert built(unpacked, tmp_path)[0] == wheel
-
-
-def test_wheel_holds_the_package_and_the_licences(tree: Path, packages: tuple[bytes, bytes]) -> None:
-    """Check that it holds nothing else; the sdist, from which the same wheel is built, has the licences as well."""
-    wheel = zipfile.ZipFile(io.BytesIO(packages[0]))
+    # The wheel holds nothing else; the sdist, from which the same wheel is built, has the licences as well.
+    held = zipfile.ZipFile(io.BytesIO(wheel))
     package = {f"mauvecl/{name}" for name in files_below(tree / "mauvecl")}
-    assert {name for name in wheel.namelist() if ".dist-info/" not in name} == package
+    assert {name for name in held.namelist() if ".dist-info/" not in name} == package
     texts = [ROOT / "LICENSE", *(ROOT / "host" / "stars" / "library" / "licenses").iterdir()]
     assert len(texts) == 4
     for text in texts:
-        assert wheel.read(f"mauvecl-{VERSION}.dist-info/licenses/{text.relative_to(ROOT)}") == text.read_bytes()
+        assert held.read(f"mauvecl-{VERSION}.dist-info/licenses/{text.relative_to(ROOT)}") == text.read_bytes()
+    # In another folder, with other times and permissions of the files.
+    elsewhere = copied(tmp_path / "elsewhere")
+    for number, path in enumerate(sorted(elsewhere.rglob("*"))):
+        if not path.is_symlink():
+            os.utime(path, (1_000_000_000 + number, 1_000_000_000 + number))
+            path.chmod(path.stat().st_mode & 0o750)
+    assert built(elsewhere, tmp_path / "again") == packages

@@ -8,11 +8,9 @@ from typing import Any
 import yaml
 from astropy.table import Table
 from commands import run
-from scripts import tool
+from scripts import ROOT, tool
 
 from mauvecl import __version__
-
-ROOT = Path(__file__).parent.parent
 
 
 def text_of(path: str) -> str:
@@ -77,48 +75,34 @@ def test_paper_cites_its_references_and_has_the_form_that_the_journal_asks_for()
     ]  # fmt: skip
 
 
-def test_page_lists_every_dependency_and_its_purpose() -> None:
-    listed = re.findall(r"^\| ([\w-]+) \|", text_of("docs/dependencies.md"), re.MULTILINE)
-    assert [one.requirement.name for one in tool("audit_dependencies").dependencies()] == [
-        name for name in listed if name != "package"
-    ]
-
-
 #: Packages whose names on conda-forge differ from those on PyPI; these bring no more than what is imported.
 ON_CONDA = {"astropy": "astropy-base", "matplotlib": "matplotlib-base"}
-#: The driver, which on PyPI is an extra of pyopencl.
-DRIVER = "pocl"
 
 
 def bounds(requirements: list[str]) -> dict[str, str]:
-    """Return names with their lower bounds."""
+    """Return names, as conda-forge has them, with their lower bounds."""
     found = [re.match(r"([\w-]+)(?:\[\w+\])?\s*(?:>=\s*([\d.]+))?", one) for one in requirements]
-    return {one[1]: one[2] or "" for one in found if one}
+    return {ON_CONDA.get(one[1], one[1]): one[2] or "" for one in found if one}
 
 
-def expected() -> dict[str, str]:
-    """Return what mauvecl and its pictures need, by names of conda-forge."""
-    needed = bounds([*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["plot"]])
-    return {ON_CONDA.get(name, name): bound for name, bound in needed.items()} | {DRIVER: ""}
-
-
-def test_recipe_needs_what_the_package_needs() -> None:
+def test_page_recipe_environment_and_container_list_what_the_package_needs() -> None:
+    listed = re.findall(r"^\| (?!package)([\w-]+) \|", text_of("docs/dependencies.md"), re.MULTILINE)
+    assert [one.requirement.name for one in tool("audit_dependencies").dependencies()] == listed
+    # With its pictures and the driver, which on PyPI is an extra of pyopencl.
+    expected = bounds([*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["plot"], "pocl"])
     recipe = loaded("recipe/recipe.yaml")
     run = [one for one in recipe["requirements"]["run"] if not one.startswith("python ")]
-    assert bounds(run) == expected()
+    assert bounds(run) == expected
     backend = bounds(PYPROJECT["build-system"]["requires"])
     assert backend.items() <= bounds(recipe["requirements"]["host"]).items()
     scripts = [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]
     assert recipe["build"]["python"]["entry_points"] == scripts
     licences = {str(path.relative_to(ROOT)) for one in PROJECT["license-files"] for path in ROOT.glob(one)}
     assert set(recipe["about"]["license_file"]) == licences
-
-
-def test_environment_and_container_need_what_the_package_needs() -> None:
     versions = bounds([one for one in loaded("environment.yml")["dependencies"] if isinstance(one, str)])
     assert versions.pop("python") == PROJECT["requires-python"].removeprefix(">=")
     assert versions.pop("pip") == ""
-    assert versions == expected()
+    assert versions == expected
     lines = text_of("Dockerfile").splitlines()
     assert lines[-2:] == ["RUN mauvecl selftest", 'ENTRYPOINT ["mauvecl"]']
 

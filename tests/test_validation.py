@@ -91,7 +91,6 @@ def parts(hint: Any) -> Iterator[Any]:
 
 
 def named(kind: str, hint: Any) -> list[Any]:
-    """Return the metadata of one kind in an annotation."""
     return [part for part in parts(hint) if type(part).__name__ == kind]
 
 
@@ -108,34 +107,33 @@ def holds_arrays(hint: Any) -> bool:
 
 
 def having(condition: Callable[[Any], bool]) -> list[tuple[str, str]]:
-    """Return the parameters whose annotations meet a condition."""
     return [(path, name) for path, name in PARAMETERS if condition(annotation(path, name))]
 
 
-def wrong_values(path: str, name: str) -> Iterator[tuple[str, Any]]:
+def wrong_values(path: str, name: str) -> Iterator[Any]:
     """Yield values that a parameter must refuse, by its annotation."""
     hint, arrays = annotation(path, name), holds_arrays(annotation(path, name))
     if anything(hint):
         return
-    yield "an object", object()
-    yield "a list of two kinds", [1, object()]
+    yield from (object(), [1, object()])
     if not named("AnyUnit", hint):
-        yield "a mass", 3 * u.kg
+        yield 3 * u.kg
     if not accepted(hint, str, Path):
-        yield "text", "no such thing"
-    if not accepted(hint, bool) and not arrays:
-        yield "a truth", True
+        yield "no such thing"
     if not arrays:
-        yield "NaN", np.nan
+        yield from (np.nan, np.ones((2, 3)))
+        if not accepted(hint, bool):
+            yield True
         if not accepted(hint, int):
-            yield "a number beyond the largest float", 10**400
-        yield "an array", np.ones((2, 3))
+            # A number beyond the largest float.
+            yield 10**400
     # Verbs have a default study, which their own code does not see.
     if not accepted(hint, type(None)) and inspect.signature(FUNCTIONS[path]).parameters[name].default is not None:
-        yield "nothing", None
+        yield None
     for part in parts(hint):
         if inspect.isclass(part) and part.__module__.startswith("mauvecl"):
-            yield "a class of the same name", type(part.__name__, (), {})()
+            # A class of the same name.
+            yield type(part.__name__, (), {})()
 
 
 def test_every_public_function_is_validated() -> None:
@@ -149,12 +147,9 @@ def test_wrong_arguments_raise(path: str) -> None:
     function = FUNCTIONS[path]
     own = [None] if next(iter(inspect.signature(function).parameters)) in ("self", "cls") else []
     for name in (name for there, name in PARAMETERS if there == path):
-        for kind, value in wrong_values(path, name):
-            with pytest.raises(InputError) as error:
+        for value in wrong_values(path, name):
+            with refused(name):
                 function(*own, **{name: value})
-            assert error.value.key == name, kind
-            assert says_what_is_accepted(str(error.value)), (name, kind)
-            assert "\n" not in str(error.value)
 
 
 def example(hint: Any) -> Any:
@@ -213,9 +208,8 @@ def test_instruments_take_quantities(name: str) -> None:
     unit = metadata(mauvecl.Instrument.model_fields[name], "Unit")
     quantity = value * (u.one if unit is None else u.Unit(unit.name))
     assert getattr(mauve.with_(**{name: quantity}), name) == pytest.approx(value)
-    with pytest.raises(InputError) as error:
+    with refused(name):
         mauve.with_(**{name: 3 * u.kg})
-    assert error.value.key == name
 
 
 @pytest.mark.parametrize(("quantity", "value", "plain"), [
@@ -230,11 +224,8 @@ def test_studies_take_quantities(quantity: str, value: Any, plain: float) -> Non
             study.at(quantity, wrong)
 
 
-def test_columns_of_amplitudes_keep_their_unit() -> None:
+def test_columns_of_amplitudes_and_temperatures_of_priors_keep_their_unit() -> None:
     assert mauvecl.Study.of(star="G2V", amplitude=Column([10.0, 20.0], unit="percent")).flare.amplitudes == (0.1, 0.2)
-
-
-def test_priors_take_temperatures_on_any_scale() -> None:
     prior = mauvecl.Normal(20 * u.deg_C, 1.0, 283.15 * u.K, 30 * u.deg_C)
     assert (prior.mean, prior.low, prior.high) == pytest.approx((20.0, 10.0, 30.0))
     with refused("high"):
@@ -287,8 +278,8 @@ def test_missing_and_surplus_arguments_are_refused() -> None:
 
 #: Values of required parameters that are text, by name of the parameter.
 WORDS = {
-    "band": "Kepler", "kind": "band", "quantity": "magnitude", "statistic": "matched", "target": "290.0 -11.2",
-    "time": "2027-01-01", "shape": "fiducial", "instrument": "mauvesim", "path": "no such file", "file": "x.fits",
+    "band": "Kepler", "quantity": "magnitude", "statistic": "matched", "target": "290.0 -11.2",
+    "time": "2027-01-01", "instrument": "mauvesim", "path": "no such file", "file": "x.fits",
 }  # fmt: skip
 #: What the package calls with arrays that it has made, which nothing checks again in a loop.
 IN_LOOPS = (
@@ -305,19 +296,12 @@ def instances() -> dict[type, Any]:
     part = mauvecl.Instrument.load("mauvesim").with_(output_min_nm=300.0, output_max_nm=306.0)
     quiet, flare = (mauvecl.expect(one, part, exposure=5) for one in (star, star.flaring(0.5)))
     study = study_of_g2v(observation={"changes": {"output_min_nm": 300.0, "output_max_nm": 306.0}})
-    time = 5.0 * np.arange(30)
-    model = mauvecl.FlareModel.of(star, part, quiet)
     made = (
-        star, part, quiet, study, model, mauvecl.Engine(), mauvecl.EnergyScale.of_blackbody(1.0, 5772.0),
+        star, part, quiet, study, mauvecl.FlareModel.of(star, part, quiet), mauvecl.Engine(),
         mauvecl.Engine().detect(quiet, [flare], realisations=500, seed=1), mauvecl.Cooling(1e4, 5000.0, 300.0),
-        mauvecl.Event(0.0, 60.0, 0.1), mauvecl.Nuisances.of(quiet, {"dark": 0.1}), mauvecl.Pool(), mauvecl.Processes(),
-        mauvecl.PixelMap.made_up(5, seed=1), mauvecl.Sky.of_brightness(22.0), mauvecl.Stare.of(60.0),
-        mauvecl.Comparison(), mauvecl.BalmerFlare(9000.0), mauvecl.Normal(0.0, 1.0, -5.0, 5.0), mauvecl.Sinusoid(0.1),
-        mauvecl.Blackbody(9000.0), mauvecl.TwoBlackbodies(9000.0, 5000.0, 1.0), mauvecl.Uniform(0.0, 1.0),
-        mauvecl.FlareWithLines(mauvecl.Blackbody(9000.0), {"Mg II": 0.05}), mauvecl.Stares(),
-        mauvecl.ObservedFlare.from_arrays(np.linspace(170, 1200, 1200), np.ones(1200)),
-        mauvecl.TableShape(np.array([-1.0, 0.0, 1.0, 4.0]), np.array([0.0, 3.0, 1.0, 0.0])),
-        mauvecl.Frames.of(time, np.ones(30)), mauvecl.SHAPES["fiducial"],
+        mauvecl.Event(0.0, 60.0, 0.1), mauvecl.Nuisances.of(quiet, {"dark": 0.1}), mauvecl.Stare.of(60.0),
+        mauvecl.PixelMap.made_up(5, seed=1), mauvecl.BalmerFlare(9000.0), mauvecl.Sinusoid(0.1),
+        mauvecl.EnergyScale.of_blackbody(1.0, 5772.0), mauvecl.Frames.of(5.0 * np.arange(30), np.ones(30)),
     )  # fmt: skip
     return {type(one): one for one in made}
 
@@ -331,8 +315,6 @@ def fitting(path: str, name: str) -> Any:
     if accepted(hint, str, Path):
         word = WORDS.get(name, "x")
         return (word,) if accepted(hint, tuple) else word
-    if accepted(hint, dict, Mapping):
-        return {}
     if holds_arrays(hint) or accepted(hint, float):
         value = example(hint)
         return (value,) if accepted(hint, tuple, Sequence) else value

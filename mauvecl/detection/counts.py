@@ -49,6 +49,15 @@ class RowCounts:
         self._waiting: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
         self._waits = 0
 
+    def __eq__(self, other: object) -> bool:
+        """Compare counts, merged or not."""
+        if not isinstance(other, RowCounts):
+            return NotImplemented
+        pairs = ((self._span, other._span), (self.keys, other.keys), (self.counts, other.counts))
+        return all(np.array_equal(*pair) for pair in pairs)
+
+    __hash__ = None  # type: ignore[assignment]
+
     @property
     def keys(self) -> NDArray[np.int64]:
         """Keys with counts, ascending."""

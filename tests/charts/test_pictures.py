@@ -86,14 +86,26 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
             assert any(f"{value} s" in words or "exposure (s)" in words for value in exposures), (name, words)
 
 
-def test_detected_flare_is_visible(engine: Engine) -> None:
-    """Check that the 5 % flare, hidden in pixel noise, reaches four sigma of an element in the lower panel."""
+def test_detected_flare_is_visible_and_a_curve_is_listed_by_its_name(engine: Engine) -> None:
     answer = detect(paper(*FEW, *ONE, "flare.amplitudes=[0.05]", *ONLY), engine)
+    detection = answer.stars[0].detection
+    # The 5 % flare, hidden in pixel noise, reaches four sigma of an element in the lower panel.
     figure = answer.pictures["spectra"]()
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
     # The last element of the spectrum is a part of one, and is left out.
-    assert line.get_xdata()[-1] < answer.stars[0].detection.quiet.element_wavelength_nm[-1]
+    assert line.get_xdata()[-1] < detection.quiet.element_wavelength_nm[-1]
+    for name, start in (("", "area "), ("own words", "own words: area ")):
+        (entry,) = detection.roc("matched").plot(name=name).axes[0].get_legend().get_texts()
+        assert entry.get_text().startswith(start)
+
+
+def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
+    """Compare all bytes with those of savefig, which draws the picture twice."""
+    for name, draw in detect(paper(*FEW), engine).pictures.items():
+        twice = io.BytesIO()
+        draw().savefig(twice, format="png", dpi=160)
+        assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()
 
 
 @pytest.mark.parametrize("case", long_but(QUESTIONS["parts"], "detect", "detect, all"))
@@ -103,14 +115,6 @@ def test_pictures_of_a_part_say_so(case: str, engine: Engine) -> None:
         title = draw()._suptitle
         written = title.get_text().replace("\n", " ") if title else ""
         assert (question["note"] in written) == (name not in question["whole"]), (name, written)
-
-
-def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
-    """Compare all bytes with those of savefig, which draws the picture twice."""
-    for name, draw in detect(paper(*FEW), engine).pictures.items():
-        twice = io.BytesIO()
-        draw().savefig(twice, format="png", dpi=160)
-        assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()
 
 
 def labelled(figure: Any, label: str) -> list[np.ndarray]:
@@ -181,13 +185,6 @@ def test_report_has_every_table_remark_and_picture_and_no_level_is_drawn_in_long
     path, hours = area.get_paths()[0].vertices, (time - time[0]) / 3600
     # Both ends of the range and, once more, the level between them.
     assert [np.unique(path[path[:, 0] == hour][:, 1]).size for hour in hours[96:100]] == [2, 3, 3, 2]
-
-
-def test_a_curve_is_listed_by_its_name(engine: Engine) -> None:
-    curve = detect(paper(*FEW, *ONE, *ONLY), engine).stars[0].detection.roc("matched")
-    for name, start in (("", "area "), ("own words", "own words: area ")):
-        (entry,) = curve.plot(name=name).axes[0].get_legend().get_texts()
-        assert entry.get_text().startswith(start)
 
 
 COMMAND = ("exposure", "--star", "G2V", "-m", "7.4", "--snr", "10", "--at", "300", "--output", "out")
