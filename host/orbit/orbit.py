@@ -215,6 +215,10 @@ class Elements:
             raise InputError(fault, key="elements")
         return max((cls(first, second, source) for first, second in sets), key=lambda elements: elements.epoch_jd)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes without the record of `sgp4`, which cannot be pickled."""
+        return {name: value for name, value in vars(self).items() if name != "satellite"}
+
     @cached_property
     def satellite(self) -> Any:
         """Satellite record of `sgp4`."""

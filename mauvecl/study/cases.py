@@ -185,10 +185,15 @@ class Loader:
     """
 
     def __init__(self, source: Callable[[Star], Source] | None = None) -> None:
+        self._given = source
         self.source: Callable[[Star], Source] = lru_cache(MAX_SOURCES)(source or (lambda star: star.source()))
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
         self.near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
         self._instruments: dict[str, Instrument] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle no caches, which are filled again."""
+        return Loader, (self._given,)
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
