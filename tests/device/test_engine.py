@@ -49,8 +49,6 @@ CASES = {
     "priors, electrons, frames": {"processes": PRIORS, "name": "mauve", "mode": "frames", "exposure": 25.0},
     "jitter, one frame, rays": {"processes": Processes(cosmic_rays=RAYS, jitter=Uniform(0.0, 0.05)), "exposure": 5.0},
 }  # fmt: skip
-#: Cases of raw spectra in `make test`: a joint draw, and separate draws frame by frame.
-SHORT = ("stack", "apart, electrons, frames")
 #: Cases and further options of the statistics: comparisons with noisy exposures and estimated variances, and
 #: marginalised unknowns, of which the last is in `make test`.
 COMPARED: list[tuple[str, dict[str, Any]]] = [
@@ -93,8 +91,9 @@ def _reference_raw(name: str) -> tuple[np.ndarray, np.ndarray]:
     return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
 
 
-@pytest.mark.parametrize("name", long_but(CASES, *SHORT))
+@pytest.mark.parametrize("name", long_but(CASES, "stack", "apart, electrons, frames"))
 def test_raw_spectra_equal_reference(any_width: Engine, name: str) -> None:
+    """`make test` has a joint draw, and separate draws frame by frame."""
     (quiet, *_), how = case(name)
     raw, clipped = any_width.realise_and_count(quiet, start=START, count=INDEX.size, seed=SEED, **how)
     for ours, expected in zip((raw, clipped), _reference_raw(name), strict=True):
@@ -159,11 +158,20 @@ def test_tally_counts_values_at_the_ends_of_its_bins(any_width: Engine) -> None:
     assert (*sums[0], outside[0]) == (*found.sums[:2], values.size - inside.size)
 
 
-@pytest.mark.parametrize("tile", [16, 64, 4096])
+@pytest.mark.parametrize("tile", [16, 64, 1024, 4096])
 def test_tile_size_does_not_affect_results(engine: Engine, tile: int) -> None:
+    """Progress is reported before the first tile and after each, and may stop the work, after which others work."""
     (quiet, *flares), _ = case("stack")
     how = {"realisations": 3001, "start": 77, "seed": 6, "statistics": tuple(requests.STATISTICS)}
-    same(Engine(tile=tile).detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
+    tiled = Engine(tile=tile, progress=(seen := Mock()))
+    same(tiled.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
+    assert (seen.call_args_list[0], seen.call_args) == (call(0, 3001), call(3001, 3001))
+    # Tiles end at multiples of their size, which is at least 64.
+    assert seen.call_count == 2 + 3077 // max(tile, 64) - 77 // max(tile, 64)
+    seen.side_effect = [KeyboardInterrupt, None, None]
+    with pytest.raises(KeyboardInterrupt):
+        tiled.realise(quiet, count=5000, seed=1)
+    assert tiled.realise(quiet, count=3, seed=1).shape[0] == 3
 
 
 @pytest.mark.long
@@ -185,15 +193,3 @@ def test_flares_in_batches_equal_single_flares(engine: Engine) -> None:
                 wanted = alone.distribution(statistic, flare)
                 ours = together.distribution(statistic, None if flare is None else k, template=k)
                 np.testing.assert_array_equal(ours.counts, wanted.counts)
-
-
-def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
-    (quiet, *flares), _ = case("stack")
-    seen = Mock()
-    Engine(tile=1024, progress=seen).detect(quiet, flares, realisations=5000, seed=1)
-    assert (seen.call_args_list[0], seen.call_args) == (call(0, 5000), call(5000, 5000))
-    assert seen.call_count == 6
-    stopping = Engine(tile=1024, progress=Mock(side_effect=[KeyboardInterrupt, None, None]))
-    with pytest.raises(KeyboardInterrupt):
-        stopping.realise(quiet, count=5000, seed=1)
-    assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3, "the engine works on"

@@ -1,11 +1,13 @@
-"""Cache of compiled kernels: damage causes a new build, but never a failure or a different result."""
+"""Compiled kernels: damaged stores, failing compilers and linkers cause a new build or one sentence, never a crash."""
 
 import errno
 import os
+import re
 import shutil
 import sys
 import time
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import pytest
@@ -15,41 +17,53 @@ from stores import flip
 from mauvecl import Engine
 from mauvecl.device import build, drivers
 
-#: Script that runs two kernels on the toy scene and prints whether they came from the store.
+#: Script that runs two kernels on the toy scene, and prints digest and level, and what came from the store, or the
+#: error. PoCL's compiler would write the number of warnings to file descriptor 2.
 RUN = """
 import hashlib, sys
-from mauvecl.device import build, drivers
-from mauvecl.device.selftest import toy
+from mauvecl.device import build, drivers, selftest
 def digest(engine):
-    x = toy(frames=1)
+    x = selftest.toy(frames=1)
+    build.build(engine.open_device.context, "#warning one\\nkernel void f(global int *a) {{ int unused; a[0] = 1; }}")
     raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
     return hashlib.sha256(raw.tobytes() + seen.counts.dense("pixel").tobytes()).hexdigest()
 {before}
-from mauvecl import Engine
+from mauvecl import Engine, InputError
 restore, restored = drivers.KernelCache.restore, []
 drivers.KernelCache.restore = lambda cache, key: restored.append(restore(cache, key)) or restored[-1]
 try:
-    print("digest", digest(Engine()))
+    print("drawn", digest(Engine()), *drivers.settled.values())
     print("restored", sum(restored), "of", len(restored))
     print("work", drivers.kernel_cache().work)
-except drivers.DeviceError as error:
-    print("sentence", error)
+except (drivers.DeviceError, InputError) as error:
+    print("sentence", str(error).count(chr(10)), error)
 """
 
 
-def run(cache: Path | str, before: str = "") -> dict[str, str]:
+def run(cache: Path | str, before: str = "", *, typed: str | None = None, **environment: str) -> dict[str, str]:
     """Run a separate process, which PoCL may abort, and return what it prints."""
-    done = python(RUN.format(before=before), cache=cache)
-    assert done.stderr == ""
+    code = RUN.format(before=before)
+    done = python(code, typed=None if typed is None else typed.format(code=code), cache=cache, **environment)
+    assert done.stderr == "" or "The next lower level" in done.stderr
     return printed(done.stdout)
 
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Return a filled cache, and what was drawn."""
     cache = tmp_path_factory.mktemp("filled")
     first = run(cache)
     assert first["restored"].startswith("0 of")
-    return cache, first["digest"]
+    return cache, first["drawn"]
+
+
+@pytest.fixture
+def best(filled: tuple[Path, str]) -> str:
+    """Return the level for which the default device compiles."""
+    level = filled[1].split()[1]
+    if level == "None":
+        pytest.skip("the default device chooses what it compiles for by itself")
+    return level
 
 
 def files_of(cache: Path) -> list[Path]:
@@ -81,17 +95,26 @@ def test_damaged_program_is_not_restored(filled: tuple[Path, str], tmp_path: Pat
 
 @pytest.mark.long
 def test_second_process_builds_nothing_unless_the_store_is_damaged(filled: tuple[Path, str], tmp_path: Path) -> None:
-    source, digest = filled
+    """Neither does it try a level again, and the store may be read-only.
+
+    A second engine keeps the files of loaded kernels, since a process crashes if they are written again.
+    """
+    source, drawn = filled
     cache = tmp_path / "cache"
     shutil.copytree(source, cache)
-    for is_damaged in (False, True, False):
-        if is_damaged:
+    folders = [cache, *(path for path in cache.rglob("*") if path.is_dir())]
+    untried = "drivers._try = lambda *a: print('tried', a[0])"
+    twice = "from mauvecl import Engine as E; one = E(); assert digest(one) == digest(E()) == digest(one)"
+    for state, before in (("intact", untried), ("damaged", ""), ("read-only", untried), ("used twice", twice)):
+        if state == "damaged":
             for path in files_of(cache):
                 DAMAGE["a flipped bit"](path)
-        again = run(cache)
+        for path in folders:
+            path.chmod(0o555 if state == "read-only" else 0o755)
+        again = run(cache, before)
         restored, _, wanted = again["restored"].partition(" of ")
-        assert again["digest"] == digest
-        assert restored == ("0" if is_damaged else wanted)
+        assert (again["drawn"], "tried" in again) == (drawn, False)
+        assert restored == ("0" if state == "damaged" else wanted)
         assert wanted != "0"
         # Only the store remains after a process ends.
         assert not Path(again["work"]).exists()
@@ -105,8 +128,8 @@ def build_in(cache: drivers.KernelCache, number: int, size: int = 100) -> Path:
     return folder
 
 
-def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
-    """Store a program at the next build, not only at the end of the process."""
+def test_concurrent_processes_share_programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Store a program at the next build, not only at the end of the process, and remove the oldest of too many."""
     one = drivers.KernelCache(tmp_path / "store", tmp_path / "work-1")
     # The first launch completes the program.
     (build_in(one, 0) / "kernel.so").write_bytes(bytes(100))
@@ -114,16 +137,23 @@ def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
     other = drivers.KernelCache(tmp_path / "store", tmp_path / "work-2")
     assert other.restore("key0")
     assert [path.name for path in files_of(other.work)] == ["kernel.so", "program.bc"]
+    monkeypatch.setattr(drivers, "MAX_STORED", 25_000)
+    for number in range(4):
+        cache = drivers.KernelCache(tmp_path / "limited", tmp_path / f"own{number}")
+        build_in(cache, number, 10_000)
+        cache.store_programs()
+        then = time.time() - 100 + number
+        os.utime(cache.store / f"key{number}.zip", (then, then))
+    assert sorted(path.name for path in cache.store.iterdir()) == ["key2.zip", "key3.zip"]
+    assert ZipFile(cache.store / "key3.zip").namelist() == ["AA/program3/program.bc"]
 
 
 @pytest.mark.long
-def test_run_succeeds_on_full_disk(filled: tuple[Path, str], tmp_path: Path) -> None:
+def test_run_succeeds_where_nothing_can_be_stored(filled: tuple[Path, str], tmp_path: Path) -> None:
     """Run while the disk fills: results are unchanged, and no incomplete file is read."""
     # The first build's own process is left out, since its disk is not full.
     before = f"""
-import os
 from pathlib import Path
-os.environ["MAUVECL_BUILD_LIMIT_S"] = "0"
 opened = Path.open
 def full(path, mode="r", *rest, **more):
     if "store" in path.parts and "w" in mode:
@@ -131,16 +161,11 @@ def full(path, mode="r", *rest, **more):
     return opened(path, mode, *rest, **more)
 Path.open = full
 """
-    assert run(tmp_path, before)["digest"] == filled[1]
+    assert run(tmp_path, before, MAUVECL_BUILD_LIMIT_S="0")["drawn"] == filled[1]
     assert files_of(tmp_path) == []
-
-
-@pytest.mark.long
-def test_unusable_cache_folder_is_replaced_and_an_error_without_free_space_names_a_remedy(
-    filled: tuple[Path, str], tmp_path: Path
-) -> None:
+    # A folder that cannot be used is replaced, and without free space a remedy is named.
     found = run("/dev/null/mauvecl")
-    assert (found["digest"], found["work"].startswith("/dev/null")) == (filled[1], False)
+    assert (found["drawn"], found["work"].startswith("/dev/null")) == (filled[1], False)
     said = run(tmp_path, "drivers.MIN_FREE_BYTES = 2**60")["sentence"]
     assert all(words in said for words in ("no folder for compiled kernels", "MAUVECL_CACHE_DIR"))
 
@@ -157,31 +182,6 @@ def test_working_folder_of_killed_process_is_removed_after_90_days(tmp_path: Pat
     assert folder.exists() == (days < 90)
 
 
-@pytest.mark.long
-def test_second_engine_does_not_rewrite_loaded_kernels(filled: tuple[Path, str]) -> None:
-    """Keep the files of loaded kernels, since a process crashes if they are written again."""
-    before = """
-from mauvecl import Engine as E
-one = E()
-first = digest(one)
-two = E()
-assert first == digest(two) == digest(one)
-"""
-    assert run(filled[0], before)["digest"] == filled[1]
-
-
-def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drivers, "MAX_STORED", 25_000)
-    for number in range(4):
-        cache = drivers.KernelCache(tmp_path / "store", tmp_path / f"work{number}")
-        build_in(cache, number, 10_000)
-        cache.store_programs()
-        then = time.time() - 100 + number
-        os.utime(cache.store / f"key{number}.zip", (then, then))
-    assert sorted(path.name for path in cache.store.iterdir()) == ["key2.zip", "key3.zip"]
-    assert ZipFile(cache.store / "key3.zip").namelist() == ["AA/program3/program.bc"]
-
-
 def test_installations_do_not_share_programs(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
     """Use different keys, since PoCL compiles a program of another installation again at every start."""
     keys: list[str] = []
@@ -191,3 +191,102 @@ def test_installations_do_not_share_programs(monkeypatch: pytest.MonkeyPatch, en
         monkeypatch.setattr(sys, "prefix", place)
         build.build(engine.open_device.context, "kernel void f(global int *a) { a[0] = 1; }")
     assert keys[0] == keys[2] != keys[1]
+
+
+#: Child that fails when it compiles for the first name, and does nothing otherwise.
+CHILD = """
+import json, sys, os, ctypes, time; asked = json.loads(sys.argv[1]); sys.path[:] = asked["path"]
+from mauvecl.device import selftest
+selftest.limit(asked)
+if asked["name"] == "bad" or asked["name"] is None:
+    {act}
+"""
+#: Failures of a first build and the messages that report them.
+ACTS = {
+    "ctypes.string_at(0)": "ended by a signal (segmentation fault",
+    "\n    while True: pass": "of processor time",
+    "print('no kernels today'); sys.exit(1)": "failed (no kernels today)",
+    "os.write(2, b'error: linker command failed'); os.abort()": "(aborted: error: linker command failed)",
+    "bytearray(6 * 2**30)": "failed (MemoryError)",
+    "time.sleep(60)": "not finished after",
+    "os.kill(os.getpid(), 9)": "ended by a signal (killed",
+}
+
+
+def misbehaving(act: str, names: str) -> str:
+    # A wall-clock limit of two seconds per second of processor time ends sleeping children soon.
+    clock = "drivers.CLOCK = 2.0; " if "sleep" in act else ""
+    return f"{clock}drivers.CHILD = {CHILD.format(act=act)!r}; drivers.names = lambda device: {names}"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("act", ["ctypes.string_at(0)", "bytearray(6 * 2**30)", "os.kill(os.getpid(), 9)", "znver3"])
+def test_next_level_is_tried_after_compiler_failure(act: str, tmp_path: Path, filled: Any, best: str) -> None:
+    """PoCL 3.0 with AVX-512 crashes for the name znver3 after minutes and gigabytes, if its child is not stopped."""
+    before, start = misbehaving(act, f"('bad', {best!r})"), time.monotonic()
+    if act == "znver3":
+        if "avx512f" not in drivers.flags():
+            pytest.skip("this processor has no AVX-512")
+        before = f"drivers.names = lambda device: ('znver3', {best!r})"
+    assert run(tmp_path, before, MAUVECL_BUILD_LIMIT_S="4")["drawn"] == filled[1]
+    assert time.monotonic() - start < 100
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("act", ACTS)
+def test_failure_at_every_level_is_one_sentence(act: str, tmp_path: Path, filled: tuple[Path, str]) -> None:
+    """The next run tries again."""
+    found = run(tmp_path, misbehaving(act, "(None,)"), MAUVECL_BUILD_LIMIT_S="2")
+    assert found.keys() == {"sentence"}
+    assert found["sentence"].startswith("0 ")
+    assert all(word in found["sentence"] for word in ("driver", ACTS[act], "conda-forge", "MAUVECL_BUILD_LIMIT_S"))
+    if act == "ctypes.string_at(0)":
+        assert run(tmp_path)["drawn"] == filled[1]
+
+
+#: Linkers, each a script in front of the usual one: one that fails, and one that knows none of the folders where
+#: compilers install their libraries.
+LINKERS = {
+    "fails": "#!/bin/sh\nexit 1\n",
+    "no folders": f"""#!{sys.executable}
+import os, sys
+words = [w for w in sys.argv[1:] if not w.startswith("-L") or "libraries" in w]
+open(__file__ + ".log", "a").write(" ".join(words) + chr(10))
+os.execv({shutil.which("ld")!r}, ["ld", "-nostdlib", *words])
+""",
+}
+
+
+@pytest.mark.long
+def test_linkers(tmp_path: Path, filled: tuple[Path, str]) -> None:
+    """A missing or failing linker is reported, where PoCL would abort Python; no compiler is needed to link."""
+    said = run(tmp_path / "cache", PATH=str(tmp_path))["sentence"]
+    assert all(words in said for words in ("no linker `ld`", "binutils"))
+    for name, script in LINKERS.items():
+        linker = tmp_path / name / "ld"
+        linker.parent.mkdir()
+        linker.write_text(script, encoding="utf-8")
+        linker.chmod(0o755)
+        path = f"{linker.parent}{os.pathsep}{os.environ['PATH']}"
+        found = run(tmp_path / "cache", PATH=path, LIBRARY_PATH="")
+        if name == "fails":
+            assert "linker" in found["sentence"]
+        else:
+            assert found["drawn"] == filled[1]
+            assert "-lgcc" in linker.with_suffix(".log").read_text(encoding="utf-8")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["typed, in a thread", "no executable"])
+def test_first_build_works_for_every_way_to_start_python(how: str, tmp_path: Path, filled: Any) -> None:
+    typed = "import threading\nt = threading.Thread(target=exec, args=({code!r}, {{}}))\nt.start(); t.join()\n"
+    before, how_typed = ("sys.executable = None", None) if how == "no executable" else ("", typed)
+    assert run(tmp_path, before, typed=how_typed)["drawn"] == filled[1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("wrong", ["-1", "nan", "x"])
+def test_invalid_build_limit_is_refused(wrong: str, filled: tuple[Path, str]) -> None:
+    found = run(filled[0], MAUVECL_BUILD_LIMIT_S=wrong)
+    said = f"0 MAUVECL_BUILD_LIMIT_S must be between 1 and 86400 seconds.* not '{wrong}'"
+    assert re.fullmatch(said, found["sentence"])

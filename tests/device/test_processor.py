@@ -66,12 +66,11 @@ def with_library(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Pa
     if spec is None or spec.origin is None or not drivers.flags():
         pytest.skip("PoCL is not from a wheel")
     top, wheels = tmp_path_factory.mktemp("pocl"), Path(spec.origin).parents[1]
-    (driver,) = (wheels / "pyopencl" / ".libs").glob("libpocl*.so")
-    for folder in ("pyopencl/.libs", "vendors"):
-        (top / folder).mkdir(parents=True)
-    shutil.copy(driver, top / "pyopencl/.libs/libpocl.so")
-    shutil.copytree(wheels / "pocl_binary_distribution", top / "pocl_binary_distribution")
-    (top / "vendors/pocl.icd").write_text(f"{top}/pyopencl/.libs/libpocl.so\n")
+    for folder in ("pyopencl/.libs", "pocl_binary_distribution"):
+        shutil.copytree(wheels / folder, top / folder)
+    (driver,) = (top / "pyopencl/.libs").glob("libpocl*.so")
+    (top / "vendors").mkdir()
+    (top / "vendors/pocl.icd").write_text(f"{driver}\n")
     (loaded,) = top.rglob(f"kernel-*-{library(set(drivers.flags()))}.bc")
 
     def use(name: str) -> Path:
@@ -104,7 +103,7 @@ def test_every_offered_level_builds_and_draws(name: str, level: str, with_librar
         pytest.skip("this processor lacks instructions of the level")
     vendors = with_library(name)
     done = python(BUILD, level, cache=tmp_path, OCL_ICD_VENDORS=str(vendors))
-    assert done.stdout.splitlines() == ["None", str({f"{vendors.parent}/pyopencl/.libs/libpocl.so"})]
+    assert done.stdout.splitlines() == ["None", str({(vendors / "pocl.icd").read_text().strip()})]
 
 
 class Record:
@@ -129,42 +128,23 @@ class Record:
 
 @pytest.mark.parametrize("own", ["generic", "znver3", "znver4", "skylake-avx512", "haswell", "x86-64"])
 def test_processor_is_named_after_level(own: str) -> None:
-    device = Record(own)
-    before = device.words.copy()
-    for name in ("x86-64-v4", "x86-64-v3", "x86-64-v3"):
-        assert drivers.set_processor_name(device, name)
-        assert device.cpu.decode() == name
-    # The rest of the record is unchanged.
-    assert np.flatnonzero(device.words != before).tolist() == [5]
-
-
-@pytest.mark.parametrize(
-    "device",
-    [
-        Record("generic", "aarch64-unknown-linux-gnu"),
-        Record("generic", known_form=False),
-        Record("znver3", chooses=False),
-        # PoCL 6.0, which keeps the library's name between the two.
-        Record("skylake-avx512", known_form=False),
-    ],
-)
-def test_other_devices_are_unchanged(device: Record) -> None:
-    before = device.words.copy()
-    assert drivers.names(device) == (None,)
-    assert not drivers.set_processor_name(device, "x86-64-v3")
-    assert (device.words == before).all()
-    # Nothing is read at an invalid address.
-    device.int_ptr = 2**46
-    assert not drivers.set_processor_name(device, "x86-64-v3")
-
-
-@pytest.mark.long
-def test_compiler_prints_nothing(tmp_path: Path) -> None:
-    """Check file descriptor 2, to which PoCL's compiler writes the number of its warnings."""
-    source = "#warning one\nkernel void f(global int *a) { int unused; a[0] = 1; }"
-    code = "from mauvecl.device import build; handle, _ = build.choose_device(None)\n"
-    code += f"build.build(build.load_opencl().Context([handle]), {source!r})"
-    assert python(code, cache=tmp_path).stderr == ""
+    """Keep the record of an unknown form, such as that of PoCL 6.0, and that of a device that chooses well."""
+    for device, is_named in (
+        (Record(own), True),
+        (Record(own, known_form=False), False),
+        (Record("znver3", chooses=False), False),
+        (Record("generic", "aarch64-unknown-linux-gnu"), False),
+    ):
+        before = device.words.copy()
+        for name in ("x86-64-v4", "x86-64-v3", "x86-64-v3"):
+            assert drivers.set_processor_name(device, name) == is_named
+            assert not is_named or device.cpu.decode() == name
+        # The rest of the record is unchanged.
+        assert np.flatnonzero(device.words != before).tolist() == ([5] if is_named else [])
+        assert (drivers.names(device) == (None,)) != is_named
+        # Nothing is read at an invalid address.
+        device.int_ptr = 2**46
+        assert not drivers.set_processor_name(device, "x86-64-v3")
 
 
 def test_error_names_processor_unknown_to_compiler(engine: Engine, monkeypatch: Any) -> None:

@@ -294,7 +294,7 @@ class Bursts(additive.AdditiveProcess):
 
 additive.ADDITIVE["bursts"] = Bursts
 from mauvecl import Engine, Processes, Stare, Stares, Study, simulate
-from mauvecl.device.selftest import toy
+from mauvecl.device import selftest
 from mauvecl.flares.frames import Components
 from mauvecl.flares.stare_scene import Flares, StareScene
 from reference import stares as twin
@@ -305,7 +305,7 @@ N = 4000
 sections = {"bursts": {"per_s": 0.02}, "cosmic_rays": {"rate_per_cm2_s": 300.0}}
 study = Study.build({"star": [{"library": "G2V", "magnitude": 7.4}], "processes": sections}, "t")
 both = study.processes
-quiet, engine, index = toy(64, 3), Engine(), np.arange(N, dtype=np.uint64)
+quiet, engine, index = selftest.toy(64, 3), Engine(), np.arange(N, dtype=np.uint64)
 bursts = Processes(bursts=both.bursts)
 clean, hit, all_ = (engine.realise(quiet, count=N, seed=2, processes=p) for p in (Processes(), bursts, both))
 few = index[:8]
@@ -313,7 +313,7 @@ charge = both.bursts.charge(15.0)
 electrons = np.arange(charge.size)
 mean = float(charge @ electrons)
 gain = quiet.gain_dn_per_electron
-one = toy(64, 1)
+one = selftest.toy(64, 1)
 c, stare = Components.of(one, [], np.ones((1, 64))), Stare.of(50.0)
 frames = Stares(engine.open_device).frames(c, stare, count=8, seed=2, processes=both)
 scene = StareScene.of(c, stare, both)

@@ -45,16 +45,16 @@ def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return tree(path)
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory, engine: Engine) -> Path:
-    path = tmp_path_factory.mktemp("drawn") / "frames.zarr"
-    bulk.realise(study(), path, engine)
-    return path
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    bulk.realise(study(), tmp_path / "frames.zarr", PAINTER)
+    return tmp_path / "frames.zarr"
 
 
 @pytest.fixture
-def path(tmp_path: Path, original: Path) -> Path:
-    return Path(shutil.copytree(original, tmp_path / "frames.zarr"))
+def other(tmp_path: Path) -> Path:
+    bulk.realise(study(run={"seed": 31}), tmp_path / "other.zarr", PAINTER)
+    return tmp_path / "other.zarr"
 
 
 def test_rows_of_every_star_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
@@ -121,35 +121,32 @@ FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("fault", long_but(FAULTS, "flipped byte", "flipped byte in the study", "missing"))
-def test_damage_is_found_and_repaired_to_the_bit(path: Path, engine: Engine, fault: str) -> None:
+def test_damage_is_found_and_repaired_to_the_bit(made: Path, fault: str) -> None:
     break_it, expected = FAULTS[fault]
-    assert bulk.verify(path) == []
-    before = tree(path)
-    break_it(path)
-    found = {one.key: one.state for one in bulk.verify(path)}
+    assert bulk.verify(made) == []
+    before = tree(made)
+    break_it(made)
+    found = {one.key: one.state for one in bulk.verify(made)}
     assert found.keys() == expected.keys()
     assert all(state in (found[key], "?") for key, state in expected.items())
-    assert all(one.mended for one in bulk.verify(path, engine, repair=True))
+    assert all(one.mended for one in bulk.verify(made, PAINTER, repair=True))
     # A list of digests keeps the line that could not be read.
-    after, before = ({k: v for k, v in one.items() if "digests" not in k} for one in (tree(path), before))
+    after, before = ({k: v for k, v in one.items() if "digests" not in k} for one in (tree(made), before))
     assert after == before
-    assert bulk.verify(path, engine, redraw=True) == []
+    assert bulk.verify(made, PAINTER, redraw=True) == []
 
 
-@pytest.mark.long
-def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, path: Path, engine: Engine) -> None:
+def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, made: Path, other: Path) -> None:
     """Insert chunk and digest of another seed's store, which are consistent with each other."""
-    other = tmp_path / "other.zarr"
-    bulk.realise(study(run={"seed": 12}), other, engine)
     for name in (CHUNK, LISTED):
-        shutil.copy(other / name, path / name)
-    assert {f.state for f in bulk.verify(path)} == {"foreign"}, "the other chunks do not have the copied digests"
-    (path / "star-1/quiescent/c").rename(tmp_path / "c")
-    shutil.copytree(other / "star-1/quiescent/c", path / "star-1/quiescent/c")
-    assert bulk.verify(path) == []
-    assert {f.state for f in bulk.verify(path, engine, redraw=True, rows=(60, 70))} == {"differs"}
-    bulk.verify(path, engine, redraw=True, repair=True)
-    assert bulk.verify(path, engine, redraw=True) == []
+        shutil.copy(other / name, made / name)
+    assert {f.state for f in bulk.verify(made)} == {"foreign"}, "the other chunks do not have the copied digests"
+    (made / "star-1/quiescent/c").rename(tmp_path / "c")
+    shutil.copytree(other / "star-1/quiescent/c", made / "star-1/quiescent/c")
+    assert bulk.verify(made) == []
+    assert {f.state for f in bulk.verify(made, PAINTER, redraw=True, rows=(60, 70))} == {"differs"}
+    bulk.verify(made, PAINTER, redraw=True, repair=True)
+    assert bulk.verify(made, PAINTER, redraw=True) == []
 
 
 @pytest.mark.long
@@ -174,32 +171,28 @@ def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, monkeypatch
     assert step > 30
 
 
-def test_full_disk_raises_and_is_resumed(tmp_path: Path, painted: dict[str, bytes], monkeypatch: Any) -> None:
-    path = tmp_path / "frames.zarr"
-    with monkeypatch.context() as patch:
-        full_after(300_000, patch)
-        with refused("file", "No space left on device"):
-            bulk.realise(study(1000), path, PAINTER)
+@pytest.mark.parametrize("disk", ["simulated", "mounted"])
+def test_full_disk_raises_and_is_resumed(
+    disk: str, tmp_path: Path, painted: dict[str, bytes], request: pytest.FixtureRequest, monkeypatch: Any
+) -> None:
+    folder = tmp_path if disk == "simulated" else request.getfixturevalue("small_disk")
+    path, filler = folder / "frames.zarr", folder / "filler"
+    with monkeypatch.context() as patch, refused("file", "No space left on device"):
+        if disk == "simulated":
+            full_after(300_000, patch)
+        else:
+            filler.write_bytes(bytes(1_400_000))
+        bulk.realise(study(1000), path, PAINTER)
+    filler.unlink(missing_ok=True)
     kept = {str(chunk.relative_to(path)) for chunk in path.glob("star-1/*/c/*/0")}
     assert len(kept) > 5, "what was written before is kept"
     assert kept == stored.Store.open(path).digests.keys(), "a chunk that could not be written has no file"
-    bulk.realise(study(1000), path, PAINTER)
-    assert tree(path) == painted
-
-
-def test_full_or_read_only_file_system_raises(small_disk: Path, painted: dict[str, bytes]) -> None:
-    path = small_disk / "frames.zarr"
-    filler = small_disk / "filler"
-    filler.write_bytes(bytes(1_400_000))
-    with refused("file", "No space left on device"):
-        bulk.realise(study(1000), path, PAINTER)
-    filler.unlink()
-    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
-    with refused("file", "Read-only file system"):
-        bulk.realise(study(1000), path, PAINTER)
-    with refused("store", "Read-only file system"):
-        bulk.realise(study(1000), small_disk / "other.zarr", PAINTER)
-    subprocess.run(["mount", "-o", "remount,rw", small_disk], check=True)
+    if disk == "mounted":
+        subprocess.run(["mount", "-o", "remount,ro", folder], check=True)
+        for name, key in (("frames.zarr", "file"), ("other.zarr", "store")):
+            with refused(key, "Read-only file system"):
+                bulk.realise(study(1000), folder / name, PAINTER)
+        subprocess.run(["mount", "-o", "remount,rw", folder], check=True)
     bulk.realise(study(1000), path, PAINTER)
     assert tree(path) == painted
 
@@ -284,7 +277,13 @@ def test_commands_of_stores_work(tmp_path: Path) -> None:
     assert exported.read_bytes() == written
     said("export", "f.zarr", "f.h5", "--rows", "0:5", "--replace")
     assert exported.read_bytes() != written
-    said("realise", "study.toml", "--output", "f.fits", "--quiet")
+    for name in ("f.fits", "f.h5"):
+        (tmp_path / name).write_text("mine")
+        for more in ([], ["--resume"]):
+            assert "--restart" in said("realise", "study.toml", "--output", name, *more, code=2)
+        assert (tmp_path / name).read_text() == "mine"
+        said("realise", "study.toml", "--output", name, "--restart", "--quiet")
+        assert (tmp_path / name).stat().st_size > 2 * 2 * 100 * 197
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.fits", "f.h5", "f.zarr", "study.toml"]
     chunk.unlink()
     assert "star-1/quiescent/c/0/0" in said("export", "f.zarr", "g.fits", code=2)
@@ -332,18 +331,6 @@ def test_stores_are_read_back_with_their_metadata(
 
 
 #: Stores under attack: wrong studies, other people's files, two processes, absurd sizes.
-@pytest.fixture
-def made(tmp_path: Path) -> Path:
-    bulk.realise(study(), tmp_path / "frames.zarr", PAINTER)
-    return tmp_path / "frames.zarr"
-
-
-@pytest.fixture
-def other(tmp_path: Path) -> Path:
-    bulk.realise(study(run={"seed": 31}), tmp_path / "other.zarr", PAINTER)
-    return tmp_path / "other.zarr"
-
-
 def relabelled(place: Path, change: Callable[[str], str]) -> None:
     content = json.loads(place.read_text())
     content["attributes"]["study"] = change(content["attributes"]["study"])
@@ -362,24 +349,20 @@ FOREIGN = ["mine.txt", "star-1/mine.txt", "star-1/quiescent/c/mine", "star-1/qui
 
 
 @pytest.mark.parametrize("copy", COPIES)
-def test_changed_byte_of_a_study_is_found(made: Path, copy: str) -> None:
-    """Change any byte: the store keeps its study, and repair restores the file."""
+def test_changed_copy_of_a_study_is_found(made: Path, other: Path, copy: str) -> None:
+    """Change any byte: the store keeps its study, and repair restores the file; valid copies may not differ."""
     before = tree(made)
     text = study().toml()
     # A sample of the bytes, and the seed's.
     for place in [*range(3, len(text), len(text) // 6), text.index("seed = 11") + 7]:
-        other = "3" if text[place] != "3" else "4"
-        relabelled(made / copy, lambda text, place=place, other=other: text[:place] + other + text[place + 1 :])
+        digit = "3" if text[place] != "3" else "4"
+        relabelled(made / copy, lambda text, place=place, digit=digit: text[:place] + digit + text[place + 1 :])
         assert [fault.key for fault in bulk.verify(made)] == [copy]
         (made / copy).write_bytes(before[copy])
     relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
     assert [(f.key, f.mended) for f in bulk.verify(made, PAINTER, repair=True)] == [(copy, True)]
     assert tree(made) == before
-
-
-@pytest.mark.parametrize("copy", COPIES)
-def test_contradicting_studies_raise(made: Path, other: Path, copy: str) -> None:
-    """Give two studies with valid digests; nothing is read or written, since either could be the drawn one."""
+    # Of two studies with valid digests either could be the drawn one, so that nothing is read or written.
     shutil.copy(other / copy, made / copy)
     before = tree(made)
     for ask in (*WRITES, bulk.read, partial(bulk.verify, engine=PAINTER, repair=True, redraw=True)):
@@ -475,16 +458,3 @@ def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.M
         bulk.realise(asked, path, PAINTER)
     bulk.forget(path)
     assert not path.exists()
-
-
-@pytest.mark.parametrize("name", ["f.fits", "f.h5"])
-def test_existing_file_is_not_overwritten(name: str, tmp_path: Path) -> None:
-    (tmp_path / "study.toml").write_text(study(20).toml())
-    (tmp_path / name).write_text("mine")
-    words = ("realise", "study.toml", "--output", name)
-    for more in ([], ["--resume"]):
-        assert "--restart" in run(*words, *more, folder=tmp_path, code=2).stderr
-    assert (tmp_path / name).read_text() == "mine"
-    run(*words, "--restart", folder=tmp_path)
-    assert (tmp_path / name).stat().st_size > 2 * 2 * 20 * 197
-    assert sorted(p.name for p in tmp_path.iterdir()) == [name, "study.toml"]

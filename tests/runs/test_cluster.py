@@ -7,7 +7,6 @@ import socket
 import ssl
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -59,6 +58,11 @@ def test_two_processes_give_the_answers_of_one(
     assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
     study = paper("star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40")
     assert measure(study, Pool(workers)) == measure(study, engine)
+    # An error that another try would not mend is raised at once.
+    (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
+    with failed("failed", "realisations 0 to 9: mode must be 'frames' or 'auto'"):
+        pool.realise(bright, start=0, count=10, seed=1, mode="stacked")
+    assert pool.standing.retries == 0
 
 
 def kill_after(pool: Pool, shards: int, kill: Callable[[], object]) -> Future[Any]:
@@ -120,14 +124,6 @@ def test_strangers_cannot_connect(workers: DaskWorkers) -> None:
     assert [who_greets(context) for context in (None, without, another)] == [0, 0, 0]
     for pid in pids:
         assert b"PRIVATE" not in Path(f"/proc/{pid}/cmdline").read_bytes()
-
-
-def test_error_that_another_try_would_not_mend_is_raised_at_once(workers: DaskWorkers) -> None:
-    pool = Pool(workers)
-    (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
-    with failed("failed", "realisations 0 to 9: mode must be 'frames' or 'auto'"):
-        pool.realise(bright, start=0, count=10, seed=1, mode="stacked")
-    assert pool.standing.retries == 0
 
 
 def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,7 +237,7 @@ if not hasattr(cluster, "changed"):
 
 @pytest.mark.parametrize("change", OTHER_CODE)
 def test_shards_of_workers_with_other_code_are_drawn_again(
-    change: str, scheduler_file: str, tmp_path: Path, engine: Engine, scene: list[Expectation]
+    change: str, scheduler_file: str, tmp_path: Path, engine: Engine, scene: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "other_code.py").write_text(PRELOAD.format(change=OTHER_CODE[change]))
     n, workers = 200_000, DaskWorkers(scheduler_file)
@@ -252,13 +248,8 @@ def test_shards_of_workers_with_other_code_are_drawn_again(
         found = detected(pool, scene, n)
         assert len(workers._strangers) == 1
         assert pool.standing.retries >= 1
-    workers.close()
     same(found, detected(engine, scene, n))
-
-
-def test_cluster_of_workers_with_other_code_raises(scheduler_file: str, scene: Any, monkeypatch: Any) -> None:
-    """Replace the only worker by one with other code."""
-    workers = DaskWorkers(scheduler_file)
+    # Workers that all have other code raise.
     monkeypatch.setattr(cluster, "code_identity", lambda: ("1.0.0", "another"))
     with pytest.raises(RuntimeError, match="workers with other code"):
         detected(Pool(workers), scene)
@@ -287,29 +278,18 @@ def test_end_of_a_process_started_by_hand_is_noticed(
         workers.close()
 
 
-class Leaves:
-    """A finished task whose worker, or scheduler, leaves while the result is transferred."""
-
-    status = "finished"
-    asked = 0
-
-    def __init__(self, who: str) -> None:
-        self.who = who
-
-    def add_done_callback(self, came: Callable[[Any], None]) -> None:
-        threading.Thread(target=came, args=(self,)).start()
-
-    def result(self, timeout: float) -> None:
-        self.asked += 1
-        self.status = "finished" if self.asked < 3 else "lost"
-        raise TimeoutError if self.who == "worker" else ConnectionResetError("Connection reset by peer")
-
-
 @pytest.mark.parametrize("who", ["worker", "scheduler"])
 def test_end_during_a_transfer_is_noticed(who: str, scheduler_file: str, engine: Engine, scene: Any) -> None:
     """Send a shard again whose worker leaves with its result, and report a scheduler that is lost."""
-    workers, lost = DaskWorkers(scheduler_file), Leaves(who)
-    submit, pool = workers._client.submit, Pool(workers)
+    workers = DaskWorkers(scheduler_file)
+    submit, pool, lost = workers._client.submit, Pool(workers), Mock(status="finished")
+
+    def leave(timeout: float) -> None:
+        lost.status = "finished" if lost.result.call_count < 3 else "lost"
+        raise TimeoutError if who == "worker" else ConnectionResetError("Connection reset by peer")
+
+    lost.result.side_effect = leave
+    lost.add_done_callback.side_effect = lambda came: in_background(lambda: came(lost))
 
     def lose_the_first(work: Any, *arguments: Any, **how: Any) -> Any:
         if work.__name__ != "_count":
@@ -320,8 +300,7 @@ def test_end_during_a_transfer_is_noticed(who: str, scheduler_file: str, engine:
     workers._client.submit = lose_the_first
     if who == "worker":
         same(detected(pool, scene), detected(engine, scene))
-        assert lost.asked == 3
-        assert pool.standing.retries == 1
+        assert (lost.result.call_count, pool.standing.retries) == (3, 1)
     else:
         with failed("lost"):
             detected(pool, scene)

@@ -18,7 +18,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from answers import N, detected, same, same_snr, small
-from commands import run
 from marks import long_but
 from processes import in_background
 from refusals import failed, refused
@@ -33,6 +32,8 @@ from mauvecl.runs import cluster
 from mauvecl.runs import pool as pools
 
 pytestmark = pytest.mark.usefixtures("small_shards")
+#: Of most runs below.
+SCENE = star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
 
 
 class Shuffled(LocalWorkers):
@@ -61,27 +62,28 @@ class Shuffled(LocalWorkers):
         return self._late.submit(work)
 
 
-@pytest.mark.parametrize("start", [0, 2**32 - 5000])
-def test_order_of_shards_does_not_affect_the_answer(engine: Engine, scene: list[Expectation], start: int) -> None:
-    quiet, *flares = scene
-    own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
-    how: dict[str, Any] = {"start": start, "statistics": ("chi2", "matched", own)}
+OWN = {"statistics": ("chi2", "matched", Linear("own", np.linspace(0.0, 1.0, SCENE[0].wavelength_nm.size)))}
+#: Flares, arguments and number of shards; seventeen flares need two launches.
+DETECTIONS: list[Any] = [
+    ((0.05, 0.24), OWN, 8),
+    ((0.05, 0.24), OWN | {"start": 2**32 - 5000}, 9),
+    (tuple(np.linspace(0.01, 0.3, 17)), {
+        "n": 9000, "statistics": ("chi2_pair", "matched"), "comparison": Comparison.of("stack:3", "estimated"),
+        "processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05)),
+    }, 2 * 3),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("amplitudes", "how", "n_shards"), long_but(DETECTIONS, *DETECTIONS[:2]))
+def test_order_of_shards_does_not_affect_the_answer(
+    engine: Engine, amplitudes: tuple[float, ...], how: dict[str, Any], n_shards: int
+) -> None:
+    scene = star(amplitudes=amplitudes, payload=instrument(part=True))
     pool = Pool(Shuffled(engine, 3))
     same(detected(pool, scene, **how), detected(engine, scene, **how))
-    n_shards = len(shards.shards(requests.DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
     assert pool.standing.shards == pool.standing.of == n_shards
-    same_snr(*(one.snr(quiet, realisations=N, seed=5, start=start) for one in (pool, engine)))
-
-
-@pytest.mark.long
-def test_shards_of_several_launches_with_all_arguments_join(engine: Engine) -> None:
-    scene = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
-    how: dict[str, Any] = {"n": 9000, "statistics": ("chi2_pair", "matched")}
-    how |= {"comparison": Comparison.of("stack:3", "estimated")}
-    how |= {"processes": mauvecl.Processes(jitter=mauvecl.Uniform(0.0, 0.05))}
-    pool = Pool(Shuffled(engine, 4))
-    same(detected(pool, scene, **how), detected(engine, scene, **how))
-    assert pool.standing.of == 2 * 3
+    asked = {"realisations": N, "seed": 5, "start": how.get("start", 0)}
+    same_snr(*(one.snr(scene[0], **asked) for one in (pool, engine)))
 
 
 @dataclass(frozen=True)
@@ -107,18 +109,13 @@ ABOVE = [Reduced(level, adds=True) for level in (1.0, 2.0, 500.0)]
 def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
     """Compare two engines of different form, with requests in the form in which they travel, with one call."""
     asked = flaring_stares(method, reduction=reduction)
-    widths, counted = iter((16, 1)), set()
-
-    class Noted(Engine):
-        def count(self, *given: Any, **more: Any) -> Any:
-            counted.add(id(self))
-            return super().count(*given, **more)
-
-    workers = LocalWorkers([None, "0"], make=lambda device, progress: Noted(device, width=next(widths)))
-    pool = Pool(workers)
+    engines: dict[str | None, Any] = {None: Engine(width=16), "0": Engine("0", width=1)}
+    for one in engines.values():
+        one.count = Mock(wraps=one.count)
+    pool = Pool(workers := LocalWorkers([None, "0"], make=lambda device, progress: engines[device]))
     found = pool.stares(pickle.loads(pickle.dumps(asked)))
     workers.close()
-    assert len(counted) == 2, "both worked"
+    assert all(one.count.called for one in engines.values())
     assert pool.standing.shards == len(shards.shards(asked)) == 5, "cut at multiples of 64, and where the word ends"
     whole = Stares(engine.open_device).frames(
         asked.components, asked.stare, asked.flare, amplitudes=asked.amplitudes,
@@ -132,53 +129,49 @@ def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, red
     assert (whole[1] != whole[0]).any()
 
 
-class Failing:
-    """An engine whose launches fail at chosen calls."""
-
-    def __init__(self, engine: Engine, fails: set[int], calls: list[int]) -> None:
-        self._engine, self._fails, self._calls = engine, fails, calls
-        self.open_device, self.device, self.device_name = engine.open_device, engine.device, engine.device_name
-
-    def count(self, request: Any, shard: Any, **more: Any) -> Any:
-        self._calls.append(len(self._calls))
-        if self._calls[-1] in self._fails:
-            # Half of the shard is counted already when it fails.
-            self._engine.count(request, replace(shard, count=shard.count // 2))
-            raise self.open_device.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
-        return self._engine.count(request, shard, **more)
+def local(engine: Engine, **how: Any) -> Pool:
+    """Return a pool with an engine instead of its own."""
+    return Pool(LocalWorkers([None], make=lambda device, progress: engine), **how)
 
 
-def working(make: Callable[[], Any]) -> Pool:
-    return Pool(LocalWorkers([None], make=lambda device, progress: make()))
+@pytest.mark.parametrize("fails", [{2, 5, 6}, set(range(99))])
+def test_failed_launch_is_repeated(
+    engine: Engine, scene: list[Expectation], fails: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fail after half of a shard is counted; each further attempt has a new context."""
+    wanted, made, calls, count = detected(engine, scene), list[Engine](), itertools.count(), Engine.count
 
+    def failing(engine: Engine, request: Any, shard: Any, **more: Any) -> Any:
+        if next(calls) not in fails:
+            return count(engine, request, shard, **more)
+        count(engine, request, replace(shard, count=shard.count // 2))
+        raise engine.open_device.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
 
-def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> None:
-    calls, made = list[int](), list[Failing]()
+    def make(device: str | None, progress: Any) -> Engine:
+        made.append(engine)
+        return engine
 
-    def make() -> Failing:
-        made.append(Failing(engine, {2, 5, 6}, calls))
-        return made[-1]
-
-    pool = working(make)
-    same(detected(pool, scene), detected(engine, scene))
-    assert pool.standing.retries == 3
-    assert len(made) == 4, "each time with a new context"
-    pool = working(lambda: Failing(engine, set(range(99)), []))
+    monkeypatch.setattr(Engine, "count", failing)
+    pool = Pool(LocalWorkers([None], make=make))
+    if len(fails) == 3:
+        same(detected(pool, scene), wanted)
+        assert (pool.standing.retries, len(made)) == (3, 4)
+        return
     with failed("failed", "realisations 0 to 4095 failed 8 times", "OUT_OF_RESOURCES"):
         detected(pool, scene)
 
 
-def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation]) -> None:
+def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation], monkeypatch: Any) -> None:
     """Close workers while a pool waits for a shard that is counted and for another behind it, its last."""
-    begun, free = threading.Event(), threading.Event()
+    begun, free, count = threading.Event(), threading.Event(), Engine.count
 
-    class Held(Failing):
-        def count(self, request: Any, shard: Any, **more: Any) -> Any:
-            begun.set()
-            assert free.wait(60)
-            return engine.count(request, shard, **more)
+    def held(*given: Any, **more: Any) -> Any:
+        begun.set()
+        assert free.wait(60)
+        return count(*given, **more)
 
-    pool = working(lambda: Held(engine, set(), []))
+    monkeypatch.setattr(Engine, "count", held)
+    pool = local(engine)
     asking = in_background(lambda: detected(pool, scene, 8192))
     assert begun.wait(60)
     closing = in_background(pool.workers.close)
@@ -189,26 +182,7 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
     closing.result(60)
 
 
-AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
-#: Tables: verb, attribute of its answer, sections of the study.
-TABLES: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "detect": ("detect", "table", {}), "limit": ("limit", "table", {}), "map": ("map", "table", {"map": AXES}),
-    "snr": ("snr", "element", {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
-    "unknowns": ("map", "table", {"map": AXES, "unknowns": {"draws": 3}}),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", long_but(TABLES, "detect", "map", "snr"))
-def test_pool_gives_the_table_of_the_engine(engine: Engine, name: str) -> None:
-    verb, table, sections = TABLES[name]
-    ask = getattr(mauvecl, verb)
-    ours, theirs = (getattr(ask(small(**sections), one), table) for one in (engine, Pool(Shuffled(engine, 9))))
-    assert ours.colnames == theirs.colnames
-    for name in ours.colnames:
-        np.testing.assert_array_equal(np.asarray(ours[name]), np.asarray(theirs[name]), err_msg=name)
-
-
-def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
+def test_fingerprints_distinguish_requests(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
     """Check that the name of a shard changes with everything that changes an answer, and with nothing else."""
     quiet, *flares = scene
     own = [Linear("own", level * np.ones(quiet.wavelength_nm.size)) for level in (1.0, 2.0)]
@@ -241,9 +215,8 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
         assert shards.fingerprint(same_one) == names[0]
     assert shards.fingerprint(pickle.loads(pickle.dumps(stares))) == shards.fingerprint(stares)
     assert shards.fingerprint(replace(unlit, start=0, realisations=7)) == names[-1]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "FORM", 1)
-        assert shards.fingerprint(base) != names[0], "shards of an older form are not read"
+    monkeypatch.setattr(shards, "FORM", 1)
+    assert shards.fingerprint(base) != names[0], "shards of an older form are not read"
 
 
 def test_shards_depend_on_the_number_of_realisations_in_the_last_and_largest_only(scene: Any, monkeypatch: Any) -> None:
@@ -265,12 +238,8 @@ def test_shards_depend_on_the_number_of_realisations_in_the_last_and_largest_onl
 def at_work(folder: Path, engine: Engine, progress: Any = None, study: mauvecl.Study | None = None, **how: Any) -> Any:
     """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
     with shards.Checkpoint(folder, "detect", study or small(), **{"patience_s": 0.0} | how) as checkpoint:
-        pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint, progress=progress)
+        pool = local(engine, checkpoint=checkpoint, progress=progress)
         return detected(pool, SCENE), pool, checkpoint
-
-
-#: Of all runs below.
-SCENE = star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
 
 
 @pytest.fixture(scope="module")
@@ -353,19 +322,6 @@ def test_unfinished_run_is_not_overwritten(begun: Path, engine: Engine) -> None:
         at_work(begun, engine, resume=True)
 
 
-def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the wall time jump and run backwards while a command reports its progress."""
-    leaps, real = itertools.cycle([1e9, -1e9, 0.0, 5e9]), time.time
-    question = "-s G2V -m 7.4 -a 0.24 -n 30000 --fap 0.1 --statistic chi2 --no-pictures"
-    words = ("detect", *question.split())
-    monkeypatch.setitem(shards.Checkpoint.__init__.__kwdefaults__, "patience_s", 0.0)
-    run(*words, "--output", "usual", folder=tmp_path)
-    monkeypatch.setattr(time, "time", lambda: real() + next(leaps))
-    run(*words, "--output", "jumps", folder=tmp_path)
-    usual, jumps = ((tmp_path / name / "detection.ecsv").read_bytes() for name in ("usual", "jumps"))
-    assert usual == jumps
-
-
 def test_short_run_leaves_no_files_and_full_disk_is_resumed(
     tmp_path: Path, engine: Engine, whole: Detection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -391,7 +347,7 @@ def test_background_work_begins_once_after_the_devices() -> None:
     assert [of > 0 for of in begun] == [True]
 
 
-def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> None:
+def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine, scene: Any) -> None:
     pool = Pool(Shuffled(engine, 1))
     pauses: Sequence[float] = [0.05, 0.0, 0.03, 0.01, 0.02, 0.0]
     together = threading.Barrier(pool.workers.count)
@@ -423,27 +379,22 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
     with refused("number", "2"):
         list(pools.map_in_order(pool, bad, range(6)))
     with pytest.raises(pools.Stopped):
-        detected(pool, SCENE)
-
-
-def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None:
-    """Check that work ahead of a verb's progress is stopped before its workers are closed."""
+        detected(pool, scene)
+    # So does progress that raises: work ahead of a verb is stopped before its workers are closed.
+    axes = {"x": {"quantity": "magnitude", "values": [6, 8]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
     pool = Pool(Shuffled(engine, 1))
     with pytest.raises(ArithmeticError):
-        mauvecl.map(small(map=AXES), pool, Mock(side_effect=ArithmeticError))
+        mauvecl.map(small(map=axes), pool, Mock(side_effect=ArithmeticError))
     with pytest.raises(pools.Stopped):
-        detected(pool, SCENE)
+        detected(pool, scene)
 
 
-@pytest.mark.parametrize("package", ["distributed", "cryptography"])
-def test_missing_package_raises(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refuse to start a cluster without encryption."""
-    monkeypatch.setitem(sys.modules, package, None)
-    with refused({"distributed": "dask"}.get(package, package), "'mauvecl[cluster]'"):
-        DaskWorkers("local:2")
-
-
-def test_absent_scheduler_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cluster_that_cannot_start_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "PATIENCE_S", 1.0)
     with pytest.raises(RuntimeError, match=r"tcp://127\.0\.0\.1:1"):
         DaskWorkers("tcp://127.0.0.1:1")
+    # None is started without encryption.
+    for package, name in (("cryptography", "cryptography"), ("distributed", "dask")):
+        monkeypatch.setitem(sys.modules, package, None)
+        with refused(name, "'mauvecl[cluster]'"):
+            DaskWorkers("local:2")

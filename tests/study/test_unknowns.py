@@ -20,68 +20,8 @@ def study(unknowns: dict[str, Any], **changes: Any) -> Study:
     return study_of_g2v(run={"realisations": 40_000}, unknowns={"draws": 8} | unknowns, **changes)
 
 
-@pytest.fixture(scope="module")
-def averaged(engine: Engine) -> Any:
-    """Return the limit over 24 draws of all unknowns."""
-    return limit(study({"draws": 24}), engine)
-
-
-@pytest.mark.long
-def test_draws_follow_their_priors(averaged: Any) -> None:
-    """Check that the sample is a Latin hypercube: every 24th of each prior once."""
-    draws = averaged.limits[0].unknown.draws
-    assert draws.names == ALL
-    column = dict(zip(draws.names, draws.values.T, strict=True))
-    even = {"temperature_c": stats.uniform(13, 8), "pointing_loss": stats.uniform(0, 0.05),
-            "light_loss": stats.truncnorm(-3, 3, loc=0.34, scale=0.1)}  # fmt: skip
-    for name, prior in even.items():
-        np.testing.assert_array_equal(np.sort(np.floor(24 * prior.cdf(column[name]))), np.arange(24))
-    one, nominal = draws.studies[7].observation.load_instrument(), Instrument.load("mauvesim")
-    for name in ("temperature_c", "light_loss", "pointing_loss", "conversion_uv_per_electron", "read_noise_dn"):
-        assert getattr(one, name) == column[name][7]
-    assert one.collecting_area_cm2 == pytest.approx(column["qe_scale"][7] * nominal.collecting_area_cm2)
-
-
-def test_prior_of_zero_width_changes_nothing(engine: Engine) -> None:
-    """A prior of zero width gives the limit of the nominal instrument, and no draw if all values are known."""
-    sure = {"light_loss": {"uniform": [0.34, 0.34]}, "known": [name for name in ALL if name != "light_loss"]}
-    first, second = (limit(study(given), engine) for given in (sure | {"draws": 2}, {"draws": 0}))
-    (one,), (two,) = first.limits, second.limits
-    assert first.table["matters_most"].tolist() == [""], "nothing moves the limit"
-    assert one.closed_form == pytest.approx(two.closed_form, abs=1e-4)
-    assert one.unknown.range == pytest.approx((two.closed_form, two.closed_form), abs=1e-4)
-    assert abs(one.value.value - two.value.value) < 0.03
-
-
-@pytest.mark.long
-def test_limit_over_unknowns_has_the_power_on_average(averaged: Any, engine: Engine) -> None:
-    """The mean of the closed form is the power; worse instruments have brighter limits; one unknown explains most."""
-    (found,) = averaged.limits
-    unknown = found.unknown
-    few = {"realisations": 10_000, "fap": 1e-2, "statistics": ["matched"]}
-    at_limit = [
-        one.at("magnitude", found.closed_form).with_changes({"run": few}, None) for one in unknown.draws.studies
-    ]
-    each = [float(detect(one, engine).table["closed_form_probability"][0]) for one in at_limit]
-    assert np.mean(each) == pytest.approx(0.9, abs=2e-3)
-    assert found.verdict in ("confirms it", "")
-    low, high = unknown.range
-    assert low < found.value.value < high
-    # The limit must hold for most instruments and is therefore brighter than the median.
-    assert found.closed_form < np.median(unknown.limits)
-    values = dict(zip(unknown.draws.names, unknown.draws.values.T, strict=True))
-    assert np.corrcoef(values["qe_scale"], unknown.limits)[0, 1] > 0.6
-    assert averaged.table["matters_most"][0] == next(iter(unknown.shares)) == "qe_scale"
-    limits = [averaged.table[name] for name in ("unknown_low", "unknown_high", "magnitude")]
-    assert limits[0][0] < limits[1][0]
-    assert {column.unit for column in (*limits, averaged.draws["magnitude"])} == {u.mag}
-    np.testing.assert_array_equal(averaged.draws["qe_scale"], values["qe_scale"])
-
-
-@pytest.mark.long
-def test_shares_equal_those_of_a_linear_model(averaged: Any) -> None:
+def assert_shares_are_those_of_a_linear_model(unknown: Any) -> None:
     """Add the unknowns to a linear fit in each of 720 orders, and average what each adds to the explained variance."""
-    unknown = averaged.limits[0].unknown
     x, y = stats.zscore(unknown.draws.values), unknown.limits
 
     @cache
@@ -100,6 +40,52 @@ def test_shares_equal_those_of_a_linear_model(averaged: Any) -> None:
     assert found.pop("the rest") == pytest.approx(1.0 - wanted.sum())
     assert list(found.values()) == sorted(found.values(), reverse=True)
     np.testing.assert_allclose([found[name] for name in ALL], wanted, rtol=1e-9)
+
+
+@pytest.mark.long
+def test_limit_over_unknowns_has_the_power_on_average(engine: Engine) -> None:
+    """The mean of the closed form is the power; worse instruments have brighter limits; one unknown explains most."""
+    averaged = limit(study({"draws": 24}), engine)
+    (found,) = averaged.limits
+    unknown, draws = found.unknown, found.unknown.draws
+    assert draws.names == ALL
+    values = dict(zip(draws.names, draws.values.T, strict=True))
+    # The sample is a Latin hypercube: every 24th of each prior once.
+    even = {"temperature_c": stats.uniform(13, 8), "pointing_loss": stats.uniform(0, 0.05),
+            "light_loss": stats.truncnorm(-3, 3, loc=0.34, scale=0.1)}  # fmt: skip
+    for name, prior in even.items():
+        np.testing.assert_array_equal(np.sort(np.floor(24 * prior.cdf(values[name]))), np.arange(24))
+    one, nominal = draws.studies[7].observation.load_instrument(), Instrument.load("mauvesim")
+    for name in ("temperature_c", "light_loss", "pointing_loss", "conversion_uv_per_electron", "read_noise_dn"):
+        assert getattr(one, name) == values[name][7]
+    assert one.collecting_area_cm2 == pytest.approx(values["qe_scale"][7] * nominal.collecting_area_cm2)
+    few = {"realisations": 10_000, "fap": 1e-2, "statistics": ["matched"]}
+    at_limit = [one.at("magnitude", found.closed_form).with_changes({"run": few}, None) for one in draws.studies]
+    each = [float(detect(one, engine).table["closed_form_probability"][0]) for one in at_limit]
+    assert np.mean(each) == pytest.approx(0.9, abs=2e-3)
+    assert found.verdict in ("confirms it", "")
+    low, high = unknown.range
+    assert low < found.value.value < high
+    # The limit must hold for most instruments and is therefore brighter than the median.
+    assert found.closed_form < np.median(unknown.limits)
+    assert np.corrcoef(values["qe_scale"], unknown.limits)[0, 1] > 0.6
+    assert averaged.table["matters_most"][0] == next(iter(unknown.shares)) == "qe_scale"
+    limits = [averaged.table[name] for name in ("unknown_low", "unknown_high", "magnitude")]
+    assert limits[0][0] < limits[1][0]
+    assert {column.unit for column in (*limits, averaged.draws["magnitude"])} == {u.mag}
+    np.testing.assert_array_equal(averaged.draws["qe_scale"], values["qe_scale"])
+    assert_shares_are_those_of_a_linear_model(unknown)
+
+
+def test_prior_of_zero_width_changes_nothing(engine: Engine) -> None:
+    """A prior of zero width gives the limit of the nominal instrument, and no draw if all values are known."""
+    sure = {"light_loss": {"uniform": [0.34, 0.34]}, "known": [name for name in ALL if name != "light_loss"]}
+    first, second = (limit(study(given), engine) for given in (sure | {"draws": 2}, {"draws": 0}))
+    (one,), (two,) = first.limits, second.limits
+    assert first.table["matters_most"].tolist() == [""], "nothing moves the limit"
+    assert one.closed_form == pytest.approx(two.closed_form, abs=1e-4)
+    assert one.unknown.range == pytest.approx((two.closed_form, two.closed_form), abs=1e-4)
+    assert abs(one.value.value - two.value.value) < 0.03
 
 
 def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:

@@ -16,7 +16,7 @@ import pytest
 from refusals import says_what_is_accepted
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 
-from mauvecl.runs.checkpoint import Stopped
+from mauvecl.runs import checkpoint
 from mauvecl.web.visitor import Job
 from tests.web.visits import Server, Talk, link
 
@@ -218,7 +218,7 @@ def test_cancel_ends_work_in_libraries_that_catch_exceptions(caught: type[BaseEx
     job = Job(work, drawing=False)
     assert started.wait(10)
     job.cancel()
-    with pytest.raises(Stopped):
+    with pytest.raises(checkpoint.Stopped):
         job.future.result(10)
 
 
