@@ -7,7 +7,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import astropy.units as u
 import pytest
+from astropy.table import Table
 from commands import started
 from processes import python
 from scenes import paper
@@ -140,6 +142,8 @@ def test_stare_without_found_flares_has_a_layout_and_gaps() -> None:
     assert len(bands) == 5
     # Twenty frames before the gap and thirty after it.
     assert all(np.flatnonzero(np.isnan(band)).tolist() == [20, 21] and band.size == 52 for band in bands)
+    # Light is relative to that before the flare, not to a median that the flare raises.
+    assert [float(np.nanmin(band)) for band in bands] == pytest.approx([1.0] * 5, rel=1e-12)
 
 
 def test_maps_and_sweeps_are_drawn_as_their_tables_have_them(engine: Engine) -> None:
@@ -162,6 +166,39 @@ def test_maps_and_sweeps_are_drawn_as_their_tables_have_them(engine: Engine) -> 
         (line,) = (line for line in axis.lines if line.get_label() == f"G2V, exposure {seconds} s")
         wanted = np.sort(rows["expected"][rows["exposure"].value == seconds])[::-1]
         assert line.get_xydata() == pytest.approx(np.column_stack([[7, 9], wanted]))
+
+
+def words(figure: Any) -> str:
+    """Return all texts of a figure on one line."""
+    texts = [text.get_text() for text in figure.findobj(Text)]
+    return " ".join(" | ".join(texts).split())
+
+
+def test_pictures_are_of_the_cells_of_a_sweep_and_of_their_instrument(engine: Engine, tmp_path: Path) -> None:
+    """Exposures and magnitudes of the study are not those of its cells, nor is a calibrated throughput nominal."""
+    modes = {"wavelength": [200.0, 700.0] * u.nm, "mode_1": [0.05, 0.05]}
+    Table(modes).write(tmp_path / "modes.ecsv")
+    (tmp_path / "grey.toml").write_text("extends = 'mauvesim'\nname = 'grey'\nthroughput_errors = 'modes.ecsv'\n")
+    grey = f"observation.instrument={tmp_path / 'grey.toml'}", "observation.changes.resolution_element_nm=20"
+    exposures, magnitudes = "{quantity='exposure', values=[60, 5]}", "{quantity='magnitude', values=[8, 9]}"
+    star = ("star=[{library='G2V'}]", *FEW, *ONLY, *grey)
+    limits = mauvecl.limit(paper(*star, "flare.amplitudes=[0.24]", f"sweep.axes=[{exposures}]"), engine)
+    text = words(limits.plot())
+    assert "probability of 0.9, 5 s and 60 s, false-alarm" in text
+    assert all(f"G2V, exposure {seconds} s, flare 24 %" in text for seconds in (5, 60))
+    assert limits.headline.startswith("grey would see a flare of 24 % on G2V in 60 s with")
+    changes = mauvecl.change(paper(*star, f"sweep.axes=[{exposures}, {magnitudes}]"))
+    figure = changes.plot()
+    assert "G2V V = 8, exposure 60 s: smallest change between two visits;" in words(figure)
+    assert {
+        float(line.get_xdata()[0]) for axis in figure.axes for line in axis.lines if line.get_label() == "this star"
+    } == {8.0}
+    spectra = words(mauvecl.snr(paper(*star, *ONE), engine).plot())
+    for said in (text, spectra):
+        assert "calibrated throughput" in said
+        assert "nominal" not in said
+    assert "S/N per resolution element" in spectra
+    assert "10.5" not in spectra
 
 
 def test_report_has_every_table_remark_and_picture_and_no_level_is_drawn_in_long_gaps() -> None:
