@@ -1,19 +1,16 @@
 """Closed forms against exact distributions, the paper's smoothing, and coverage of intervals of probabilities."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from marks import long_but
-from scenes import instrument, star
+from scenes import star
 from scipy import optimize, stats
 from scipy.ndimage import gaussian_filter1d
 
-from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
-from mauvecl.detection import STATISTIC_NAMES, chi2, distributions, requests
-
-
-def test_every_statistic_can_be_asked_for_in_the_order_of_tables() -> None:
-    """Compare with the names that studies accept, which are listed apart, in a module that is fast to import."""
-    assert tuple(requests.STATISTICS) == STATISTIC_NAMES
+from mauvecl import Expectation, Instrument, Sky, Source, expect
+from mauvecl.detection import distributions, requests
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 29, 400, 1643])
@@ -87,6 +84,13 @@ def test_mixture_of_parts_far_apart_is_the_sum_of_their_chances() -> None:
             assert found.sf(found.isf(chance)) == pytest.approx(chance, rel=1e-6)
 
 
+def smoothing_of(quiet: Expectation, *flares: Expectation) -> Any:
+    """Return the smoothing of the paper's statistic for some flares."""
+    asked = requests.DetectRequest.of(quiet, flares, 1000, seed=1, statistics=("paper",)).hypotheses
+    paper: Any = requests.STATISTICS["paper"]
+    return paper.smoothing(asked.setting)
+
+
 def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows, factors of squares and variances of modes of the paper's sum over every pixel."""
     n = quiet.wavelength_nm.size
@@ -103,7 +107,7 @@ def test_few_centres_represent_all_pixels() -> None:
     """Compare draws to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
     quiet, flare = star(amplitudes=(0.081,))
     rows, factor, modes = whole(quiet, flare)
-    smoothing = chi2.Smoothing.of(quiet, np.ones(len(rows), bool), (flare,))
+    smoothing = smoothing_of(quiet, flare)
     assert np.diff(smoothing.centres).max() == 7
     rng = np.random.default_rng(1)
     noise = rng.normal(0.0, np.sqrt(2 * quiet.variance_dn2), (200, len(rows)))
@@ -123,39 +127,26 @@ def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
     nm = np.arange(170.0, 1150.0, 0.5)
     dark = Source.from_arrays(nm, np.where(nm > 400.0, 1e-11, 0.0)).at_magnitude(7.4)
     quiet = expect(dark, Instrument.load("mauvesim"), exposure=50.0, sky=Sky.none())
-    used = np.ones(quiet.wavelength_nm.size, bool)
-    smoothing = chi2.Smoothing.of(quiet, used)
-    assert len(smoothing.centres) == used.size
-    rows = gaussian_filter1d(np.eye(used.size), smoothing.sigma, axis=0, mode="nearest")
+    smoothing, n = smoothing_of(quiet, quiet), quiet.wavelength_nm.size
+    assert len(smoothing.centres) == n
+    rows = gaussian_filter1d(np.eye(n), smoothing.sigma, axis=0, mode="nearest")
     np.testing.assert_allclose(smoothing.rows, rows)
 
 
 @pytest.mark.parametrize("chunk", [4, 32])
-@pytest.mark.parametrize("changes", [{}, {"output_min_nm": 300.0, "output_max_nm": 330.0}])
-def test_bands_hold_the_rows(chunk: int, changes: dict) -> None:
-    """Follow the bands in chunks as the kernel does, with some pixels left out."""
-    (quiet,) = star(payload=instrument(**changes))
-    n = quiet.wavelength_nm.size
-    used = np.random.default_rng(2).random(n) > 0.1
-    used[20:90] = False
-    smoothing = chi2.Smoothing.of(quiet, used)
-    padded = -(-n // 32) * 32
-    weights, finished = smoothing.bands(padded, chunk)
-    x = np.zeros(padded)
+def test_bands_hold_the_rows(chunk: int) -> None:
+    """Follow the bands in chunks as the kernel does."""
+    (quiet,) = star()
+    smoothing, n = smoothing_of(quiet, quiet), quiet.wavelength_nm.size
+    x = np.zeros(-(-n // 32) * 32)
     x[:n] = np.random.default_rng(3).normal(size=n)
+    weights, finished = smoothing.bands(x.size, chunk)
     window, out = np.zeros(weights.shape[1]), []
     for c, count in enumerate(finished):
         window += weights[c] @ x[c * chunk : (c + 1) * chunk]
         out += list(window[:count])
         window = np.append(window[count:], np.zeros(count))
-    assert len(out) == len(smoothing.rows)
     np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
-
-
-def test_comparison_is_read_from_words() -> None:
-    assert Comparison.of("stack:5", "estimated") == Comparison(5, True)
-    assert Comparison.of("exposure").added_variance == 1.0
-    assert Comparison.of().plain
 
 
 #: Of the chi-squared statistic here.

@@ -1,8 +1,7 @@
 """Drawn stares: cumulants, pixels, an independent recipe, the engine's exposures, and the reference's bits."""
 
 import time
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from scenes import NEAR, instrument, star
 from scipy import special
 
 from mauvecl import CosmicRays, Engine, Processes, Stare, Stares, Study
-from mauvecl.detection import requests
 from mauvecl.flares import stare_scene
 from mauvecl.flares.frames import Components
 
@@ -255,6 +253,10 @@ def test_stares_equal_the_reference(any_stares: Stares, name: str, method: Any) 
     ours = drawn(scene, flares, numbers, frames, SEED)
     np.testing.assert_array_equal(found[..., list(frames), :], ours if amplitudes is not None else ours[0])
     assert found.std() > 0
+    # The noise of flares' sums, and the light of the frames that it depends on.
+    request = stare_scene.StaresRequest(components, stare, COUNT, SEED, start=FIRST, method=method, glow=True)
+    glow = stare_reference.glow(scene, numbers, range(stare.n_frames), SEED)
+    np.testing.assert_array_equal(any_stares.reduced(request)["glow"], glow)
 
 
 @pytest.mark.long
@@ -281,30 +283,3 @@ def test_splitting_changes_no_bit(engine: Engine, method: Any) -> None:
     gapless, gapped = (Stare.of(110.0, gaps=gaps, **warm) for gaps in ((), [(20.0, 60.0)]))
     both = [device.frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
     np.testing.assert_array_equal(both[0][:, gapped.numbers], both[1])
-
-
-@dataclass(frozen=True)
-class Beside:
-    """Keep the statistics and the sums for flares unchanged."""
-
-    adds: ClassVar[bool] = False
-
-    def __call__(self, values: np.ndarray, first: int, glow: np.ndarray) -> dict[str, np.ndarray]:
-        return {"values": values.copy(), "glow": glow.copy()}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", ["plain", "all that wobbles", "unknown alone"])
-def test_sums_for_flares_equal_the_reference(any_stares: Stares, name: str, method: Any) -> None:
-    """Check their own normals and the light of the frames, for any share of drawn stares."""
-    components, stare, *_ = case(name)
-    how: dict[str, Any] = {"start": FIRST, "method": method, "reduction": Beside(), "glow": True}
-    asked = stare_scene.StaresRequest(components, stare, COUNT, SEED, **how)
-    found, scene = any_stares.reduced(asked), stare_scene.StareScene.of(components, stare)
-    numbers, frames = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64), range(stare.n_frames)
-    np.testing.assert_array_equal(found["glow"], stare_reference.glow(scene, numbers, frames, SEED))
-    whole = any_stares.frames(components, stare, first=FIRST, count=COUNT, seed=SEED, method=method)
-    np.testing.assert_array_equal(found["values"], whole)
-    part = any_stares.reduced(asked, requests.Shard(0, FIRST + 5, 21))
-    np.testing.assert_array_equal(part["glow"], found["glow"][5:26])
