@@ -9,7 +9,7 @@ from scenes import star
 from scipy import optimize, stats
 from scipy.ndimage import gaussian_filter1d
 
-from mauvecl import Expectation, Instrument, Sky, Source, expect
+from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
 from mauvecl.detection import distributions, requests
 
 
@@ -91,23 +91,18 @@ def smoothing_of(quiet: Expectation, *flares: Expectation) -> Any:
     return paper.smoothing(asked.setting)
 
 
-def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows, factors of squares and variances of modes of the paper's sum over every pixel."""
-    n = quiet.wavelength_nm.size
+@pytest.mark.long
+def test_few_centres_represent_all_pixels() -> None:
+    """Compare draws to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
+    quiet, flare = star(amplitudes=(0.081,))
+    smoothing, n = smoothing_of(quiet, flare), quiet.wavelength_nm.size
+    # Rows, factors of squares and variances of modes of the sum over every pixel.
     sigma = 10.5 / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
     rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")
     factor = 1.0 / gaussian_filter1d(flare.recorded_light_dn, sigma, mode="nearest") / flare.exposure_s
     half = np.sqrt(factor)[:, None] * rows
     modes = np.linalg.eigvalsh((half * (quiet.variance_dn2 + quiet.variance_dn2)) @ half.T)
-    return rows, factor, modes[modes > 1e-10 * modes.max()]
-
-
-@pytest.mark.long
-def test_few_centres_represent_all_pixels() -> None:
-    """Compare draws to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
-    quiet, flare = star(amplitudes=(0.081,))
-    rows, factor, modes = whole(quiet, flare)
-    smoothing = smoothing_of(quiet, flare)
+    modes = modes[modes > 1e-10 * modes.max()]
     assert np.diff(smoothing.centres).max() == 7
     rng = np.random.default_rng(1)
     noise = rng.normal(0.0, np.sqrt(2 * quiet.variance_dn2), (200, len(rows)))
@@ -149,6 +144,12 @@ def test_bands_hold_the_rows(chunk: int) -> None:
     np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
 
 
+def test_comparison_is_read_from_words() -> None:
+    assert Comparison.of("stack:5", "estimated") == Comparison(5, True)
+    assert Comparison.of("exposure").added_variance == 1.0
+    assert Comparison.of().plain
+
+
 #: Of the chi-squared statistic here.
 DOF = 48
 
@@ -158,21 +159,17 @@ def exact(k: int, n: int) -> tuple[float, float]:
     return found.low, found.high
 
 
-def strength(kind: str, fap: float, probability: float) -> tuple[float, float]:
-    """Return the true threshold, and what a flare must add to be detected with a probability."""
-    if kind == "matched":
-        cut = float(stats.norm.isf(fap))
-        return cut, cut - float(stats.norm.isf(probability))
-    cut = float(stats.chi2.isf(fap, DOF))
-    return cut, optimize.brentq(lambda push: stats.ncx2.sf(cut, DOF, push) - probability, 1e-6, 1e3)
-
-
 def intervals(
     kind: str, fap: float, probability: float, n: int, seeds: int
 ) -> tuple[np.ndarray, list[distributions.Interval]]:
     """Count flares above a simulated threshold and the ends of its interval; return counts and interval per seed."""
     rng = np.random.default_rng([round(1e4 * fap), round(1e4 * probability), n, len(kind)])
-    _, push = strength(kind, fap, probability)
+    # What a flare must add to be detected with the probability.
+    if kind == "matched":
+        push = float(stats.norm.isf(fap) - stats.norm.isf(probability))
+    else:
+        cut = float(stats.chi2.isf(fap, DOF))
+        push = optimize.brentq(lambda push: stats.ncx2.sf(cut, DOF, push) - probability, 1e-6, 1e3)
     low, high = (int(count) for count in stats.binom.ppf([0.025, 0.975], n, fap))
     ranks = [int(np.floor(fap * n * (1 + 1e-12))), max(low - 1, 1), high]
     above, shared = np.empty((seeds, 3), int), np.zeros(seeds)

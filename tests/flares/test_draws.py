@@ -17,11 +17,10 @@ from mauvecl.flares.frames import Components
 METHODS = ["pixels", "cumulants"]
 
 
-@pytest.mark.parametrize("magnitude", [7.4, -0.7], ids=["plain", "at saturation"])
-def test_frames_sum_to_exposures_of_the_engine(engine: Engine, stares: Stares, magnitude: float) -> None:
+def test_frames_sum_to_exposures_of_the_engine(engine: Engine, stares: Stares) -> None:
     """Compare counts of the same draws, of which float32 rounds hardly one in 1e5 frames to another DN."""
     one, long = (
-        star(magnitude=magnitude, amplitudes=(0.24,), exposure=s, payload=instrument(part=True)) for s in (5.0, 50.0)
+        star(magnitude=-0.7, amplitudes=(0.24,), exposure=s, payload=instrument(part=True)) for s in (5.0, 50.0)
     )
     # The brightest that does not saturate, and others.
     usable = np.flatnonzero(~one[0].saturated)
@@ -35,7 +34,7 @@ def test_frames_sum_to_exposures_of_the_engine(engine: Engine, stares: Stares, m
         assert np.abs(off).max() < 1.1
         assert np.mean(np.abs(off) > 0.1) < 2e-3
         clipped = np.mean(y[..., 0] + one[0].mean_raw_dn[pixels[0]] > one[0].highest_dn - 0.1)
-        assert (clipped > 0.02) == (magnitude < 0), "frames are cut off where they saturate, one by one"
+        assert clipped > 0.02, "frames are cut off where they saturate, one by one"
 
 
 def test_only_pixels_with_a_weight_take_time(stares: Stares) -> None:

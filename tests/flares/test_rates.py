@@ -44,7 +44,7 @@ def answer(tmp_path_factory: pytest.TempPathFactory) -> Any:
     })  # fmt: skip
 
 
-def test_rates_by_mass_and_age_equal_published_values(answer: Any) -> None:
+def test_rates_equal_published_values_and_the_convention_of_altaipony(answer: Any) -> None:
     """Davenport et al. 2019 (TIME.md, section 3), whose energies are those of the star's light in the Kepler band."""
     star = Source.from_library("K5V").at_magnitude(8.0)
     light = EnergyScale.of_star(star, 10.0, flare_k=10_000.0).erg_per_s
@@ -52,10 +52,7 @@ def test_rates_by_mass_and_age_equal_published_values(answer: Any) -> None:
     assert rate(answer, "young", 1e33 * light / luminosity) == pytest.approx(0.074131, rel=2e-5)
     # Fewer flares of older stars.
     assert rate(answer, "old", 1e33) < rate(answer, "young", 1e33)
-
-
-def test_rates_follow_the_convention_of_altaipony(answer: Any) -> None:
-    """Flares between two energies are the integral of dN/dE = beta E^-alpha."""
+    # Flares between two energies are the integral of dN/dE = beta E^-alpha.
     energy = np.geomspace(1e33, 1e34, 200_001)
     beta = 0.2 * 0.8 * 1e33**0.8
     between = np.trapezoid(beta * energy**-1.8, energy)

@@ -1,7 +1,5 @@
 """Poisson draws by alias table and expansion: exact probabilities, extreme words."""
 
-from dataclasses import replace
-
 import exact
 import numpy as np
 import pytest
@@ -69,7 +67,7 @@ def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None
 
 def test_equal_means_share_a_table() -> None:
     alike, other = (
-        prepare([replace(selftest.toy(4, 1, read=0.7, light=0.0), dark_dn=np.array(means))], recipe="apart")
+        prepare([exact.flat(4, 1, read=0.7, dark=np.array(means))], recipe="apart")
         for means in ([5.0, 5.0, 5.0, 5.0], [5.0, 64.0, 5.0, 64.0])
     )
     assert alike.tables.size == layout.alias_table(5.0).entries.size
