@@ -122,7 +122,7 @@ MUTATIONS: dict[str, Mutation] = {
         ('fma(light, m["photon_variance"], fma(', 'fma(0 * light, m["photon_variance"], fma('),
     ),
     "frames counted without their gaps": (
-        "test_splitting_changes_no_bit[cumulants]",
+        "test_stares_depend_on_neither_scenarios_nor_gaps[cumulants]",
         ("_padded(stare.numbers, np.uint32)", "_padded(np.arange(stare.n_frames), np.uint32)"),
     ),
     "a shard's flares from the first": (

@@ -229,8 +229,8 @@ def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
 
 @pytest.fixture(scope="module", params=["vectors", "scalar"])
 def any_stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
-    """Return stares with vectors, as on processors, and with one stare or frame per work-item, as on a GPU."""
-    return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1)
+    """Return stares with vectors, as on processors, and in tiles with one stare or frame per work-item, as on a GPU."""
+    return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1, tile=16)
 
 
 @pytest.mark.long
@@ -260,25 +260,17 @@ def test_stares_equal_the_reference(any_stares: Stares, name: str, method: Any) 
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
-def test_splitting_changes_no_bit(engine: Engine, method: Any) -> None:
-    """Check that stares depend on seed and number alone, and frames on their time, however calls are divided."""
+def test_stares_depend_on_neither_scenarios_nor_gaps(stares: Stares, method: Any) -> None:
+    """Check flares of a scenario against the same without one, and that frames depend on their time alone."""
     components, stare, flare, amplitudes, _ = case("electrons")
     how: dict[str, Any] = {"seed": SEED, "method": method}
-
-    def part(a: int, b: int, tile: int | None = None) -> np.ndarray:
-        some: dict[str, Any] = {"first": FIRST + a, "count": b - a, "amplitudes": amplitudes[:, a:b]}
-        return Stares(engine.open_device, tile=tile).frames(components, stare, flare[a:b], **some, **how)
-
-    whole = part(0, COUNT)
-    for tile in (None, 16):
-        parts = [part(a, b, tile) for a, b in ((0, 1), (1, 23), (23, 40))]
-        np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
-    device, scaled = Stares(engine.open_device), flare * amplitudes[1][:, None, None]
-    alone = device.frames(components, stare, scaled, first=FIRST, count=COUNT, **how)
+    place: dict[str, Any] = {"first": FIRST, "count": COUNT}
+    whole = stares.frames(components, stare, flare, amplitudes=amplitudes, **place, **how)
+    alone = stares.frames(components, stare, flare * amplitudes[1][:, None, None], **place, **how)
     # The device multiplies in float32 what is multiplied in float64 here: whole DN may differ now and then.
     np.testing.assert_allclose(alone, whole[1], atol=5.0)
     # The frames that a gap leaves are those of the stare without it.
     warm = {"temperature_c": components.quiet.conditions["temperature_c"]}
     gapless, gapped = (Stare.of(110.0, gaps=gaps, **warm) for gaps in ((), [(20.0, 60.0)]))
-    both = [device.frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
+    both = [stares.frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
     np.testing.assert_array_equal(both[0][:, gapped.numbers], both[1])
