@@ -162,7 +162,7 @@ def test_skew_is_predicted(engine: Engine) -> None:
     assert d.skew > 0.3
 
 
-def test_clipping_is_predicted(engine: Engine) -> None:
+def test_clipping_and_rounding_are_predicted(engine: Engine) -> None:
     """Predict the effect of clipping at zero, for a bias of 5 DN and a read noise of 12 DN; two exposures share it."""
     for exposures in (1, 0):
         compared = Comparison(exposures)
@@ -171,10 +171,7 @@ def test_clipping_is_predicted(engine: Engine) -> None:
         assert rows["uv_excess"].ratio - 1 == pytest.approx(rows["uv_excess"].clipping, rel=0.05)
     assert rows["chi2"].ratio < 0.1
     assert rows["chi2"].clipping < -0.9
-
-
-def test_rounding_is_predicted(engine: Engine) -> None:
-    """Predict the effect of rounding, for noise below the ADC's step."""
+    # Rounding, for noise below the ADC's step.
     range_nm = {"output_min_nm": 200.0, "output_max_nm": 260.0}
     d = departed(engine, read_noise_dn=0.35, dark_scale_dn_per_s=0.0, magnitude=20.0, **range_nm)["chi2"]
     assert d.why == "rounding"

@@ -51,7 +51,7 @@ def test_many_terms_of_two_kinds_have_the_tail_of_their_convolution(spread: floa
         assert form.sf(value) == pytest.approx(exact, rel=1e-6, abs=1e-12)
 
 
-def test_mixture_follows_simulation() -> None:
+def test_mixture_follows_simulation_and_the_chances_of_its_parts() -> None:
     """Compare moments, tails and quantiles with draws from the components: 4.5 standard errors of 4e5 draws."""
     rng, n = np.random.default_rng(20_261_122), 400_000
     weight, shift = np.array([0.5, 2.0, 1.0]), np.array([0.3, 1.0, 0.0])
@@ -68,10 +68,7 @@ def test_mixture_follows_simulation() -> None:
         cut = found.isf(p)
         assert found.sf(cut) == pytest.approx(p, rel=1e-6)
         assert abs(np.mean(x > cut) - p) < 4.5 * np.sqrt(p * (1 - p) / n) + 1e-5
-
-
-def test_mixture_of_parts_far_apart_is_the_sum_of_their_chances() -> None:
-    """In the middle of one part, far above another, and above both, where chances are below those of rounding."""
+    # In the middle of one part, far above another, and above both, where chances are below those of rounding.
     parts = tuple(
         distributions.QuadraticForm(np.linspace(0.9, 1.1, 300) * size, np.full(300, 0.1)) for size in (1.0, 1.3, 9.0)
     )

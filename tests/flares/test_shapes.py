@@ -26,7 +26,7 @@ def between(function, first: float, last: float, kinks: list[float]) -> float:
     return sum(quad(function, a, b, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(ends))
 
 
-def test_shape_equals_the_published_formula():
+def test_shapes_equal_the_published_formulas():
     # Tovar Mendoza et al. 2022 as printed, with plain exp and erfc.
     shape, tau = SHAPES["tovarmendoza2022"], np.linspace(-1.2, 30, 500)
     a, b, c = shape.A, shape.B, shape.C
@@ -38,6 +38,12 @@ def test_shape_equals_the_published_formula():
     with np.errstate(all="raise", under="ignore"):
         far = shape.at(np.array([-1e4, -50.0, 1e4]))
     assert (far == 0).all()
+    # The fiducial flare has its equivalent duration.
+    for delta in (100.0, 1000.0, 1e5):
+        amplitude, half_width = FIDUCIAL.of(delta)
+        assert amplitude == pytest.approx(0.3 * delta**0.6)
+        assert amplitude * half_width * FIDUCIAL.equivalent_duration == pytest.approx(delta, rel=1e-12)
+        assert amplitude * half_width * FIDUCIAL.BOX == pytest.approx(delta / 1.5, rel=1e-12)
 
 
 @every_shape
@@ -89,14 +95,6 @@ def test_small_integrals_keep_their_digits():
     shape = SHAPES["davenport2014"]
     exact = sum(a / b * (np.exp(-b * 100) - np.exp(-b * 101)) for a, b in shape.DECAY)
     assert float(shape.integral(100, 101)) == pytest.approx(exact, rel=1e-10)
-
-
-@pytest.mark.parametrize("delta", [100.0, 1000.0, 1e5])
-def test_fiducial_flare_has_its_equivalent_duration(delta):
-    amplitude, half_width = FIDUCIAL.of(delta)
-    assert amplitude == pytest.approx(0.3 * delta**0.6)
-    assert amplitude * half_width * FIDUCIAL.equivalent_duration == pytest.approx(delta, rel=1e-12)
-    assert amplitude * half_width * FIDUCIAL.BOX == pytest.approx(delta / 1.5, rel=1e-12)
 
 
 SUN_CM, NM = 6.957e10, np.linspace(200.0, 1200.0, 40_001)
