@@ -213,14 +213,14 @@ def test_orbits_and_priors_of_exposures_are_those_of_frames():
 def test_known_conditions_and_unknowns_are_separate():
     stare = Stare.of(
         Study().stare.orbit_s, thermal=0.5, temperature_c=13.0, variability=points((0.0, 0.0), (6000.0, 0.06)),
-        jitters={"light": 0.02, "temperature": 0.01}, offsets={"sky": 0.1}, drifts={"light": 0.01},
+        jitters={"light": 0.02, "sky": 0.03, "temperature": 0.01}, offsets={"sky": 0.1}, drifts={"light": 0.01},
         cycles={"temperature": 0.3},
     )  # fmt: skip
     assert np.ptp(stare.temperature_c) == pytest.approx(1.0, abs=1e-4)
     assert stare.temperature_c.mean() == pytest.approx(13.0, abs=1e-3)
     np.testing.assert_allclose(stare.star, 1 + 1e-5 * stare.middle_s)
     np.testing.assert_array_equal(stare.sky, 1.0)
-    assert stare.jitters == {"light": 0.02, "sky": 0.0, "temperature": 0.01}
+    assert stare.jitters == {"light": 0.02, "sky": 0.03, "temperature": 0.01}
     named = {unknown.name: unknown for unknown in stare.unknowns}
     assert list(named) == ["sky offset", "light drift", "temperature sine", "temperature cosine"]
     drift = named["light drift"].curve
