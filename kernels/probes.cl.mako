@@ -44,19 +44,6 @@ void probe_alias(__global const uint *restrict words, __global const uint *restr
 }
 
 __kernel ${attributes}
-void probe_expansion(__global const uint *restrict words, const float offset, const float slope, const float cubic,
-                     __global float *restrict out)
-{
-    /* words[2][n] -> counts[2][n], n = WIDTH x global size */
-    const uint item = get_global_id(0), n = get_global_size(0) * ${width}u;
-    const uintv w[2] = {LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u)};
-    floatv z[2];
-    normal_pair(w, z);
-    STORE(expansion_draw(z[0], offset, slope, cubic), out + item * ${width}u);
-    STORE(expansion_draw(z[1], offset, slope, cubic), out + n + item * ${width}u);
-}
-
-__kernel ${attributes}
 void probe_prior(__global const uint *restrict words, __global const float *restrict table, __global float *restrict out)
 {
     /* words[2][n]: probabilities and their finer digits -> factors[n], minus one; n = WIDTH x global size */

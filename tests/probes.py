@@ -66,11 +66,3 @@ class Probes:
         """Return a prior's factors minus one at the probabilities given by two words each."""
         words = np.stack([word, finer])
         return self.run("probe_prior", word.size // self.width, np.empty(word.size, np.float32), words, table)
-
-    def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
-        """Return two rows of counts relative to the mean rounded to an integer."""
-        words, root = np.stack([radius, angle]), np.sqrt(mean)
-        offset, slope, cubic = mean - np.rint(mean) - 1 / 6, root - 1 / (36 * root), -1 / (72 * root)
-        coefficients = [np.float32(c) for c in (offset, slope, cubic)]
-        out = np.empty(words.shape, np.float32)
-        return self.run("probe_expansion", radius.size // self.width, out, words, *coefficients).astype(np.int64)

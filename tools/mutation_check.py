@@ -122,7 +122,7 @@ MUTATIONS: dict[str, Mutation] = {
         ('fma(light, m["photon_variance"], fma(', 'fma(0 * light, m["photon_variance"], fma('),
     ),
     "frames counted without their gaps": (
-        "test_splitting_changes_no_bit[cumulants]",
+        "test_stares_depend_on_neither_scenarios_nor_gaps[cumulants]",
         ("_padded(stare.numbers, np.uint32)", "_padded(np.arange(stare.n_frames), np.uint32)"),
     ),
     "a shard's flares from the first": (
@@ -220,11 +220,11 @@ MUTATIONS: dict[str, Mutation] = {
         ("    signal = signal - sky\n", ""),
     ),
     "carry of the index dropped between launches": (
-        "test_draws_at_counter_boundaries_equal_reference",
+        "test_raw_spectra_equal_reference[vectors-stack]",
         ("np.uint32(first >> 32)", "np.uint32(0)"),
     ),
     "carry of the index dropped within a launch": (
-        "test_draws_at_counter_boundaries_equal_reference",
+        "test_raw_spectra_equal_reference[vectors-stack]",
         ("min(size - index % size, count)", "min(size, count)"),
     ),
     "carry of the product dropped in odd lanes": (
@@ -247,11 +247,11 @@ MUTATIONS: dict[str, Mutation] = {
         ('\n    "dark": 1,', '\n    "dark": 0,'),
     ),
     "priors' tables too coarse at their ends": (
-        "test_drawn_factors_have_the_moments_of_the_prior",
+        "test_drawn_factors_have_the_moments_and_tails_of_the_prior",
         ("PRIOR_BITS = 7", "PRIOR_BITS = 4"),
     ),
     "priors' finer digits dropped": (
-        "test_drawn_factors_have_the_tails_of_the_prior",
+        "test_drawn_factors_have_the_moments_and_tails_of_the_prior",
         ("finer & (uintv)0x7fffffu", "finer & (uintv)0u"),
         ("finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
     ),

@@ -320,6 +320,11 @@ class PowerLaw(Rates):
     >>> from mauvecl.flares.energies import davenport2019
     >>> round(float(davenport2019(mass_msun=0.5, age_myr=100).per_day_above(1e33)), 6)
     0.074131
+    >>> ends = PowerLaw(alpha=2.0, log10_beta=33.0, largest_erg=1e34)
+    >>> ends.per_day_above([1e32, 5e33, 2e34]).round(9).tolist()
+    [9.9, 0.1, 0.0]
+    >>> ends.times_energy(3.0).per_day_above([3e32, 1.5e34, 6e34]).round(9).tolist()
+    [9.9, 0.1, 0.0]
     """
 
     alpha: RateExponent
@@ -476,6 +481,13 @@ def fiducial2018(quiescent_si_iv_erg_s: Positive) -> PowerLaw:
 
     nu(> delta) = 8 / d (delta / 1000 s)^-0.75 for equivalent durations in Si IV from 1e2 to 1e6 s; the blackbody of
     9000 K has 160 times the energy of Si IV.
+
+    Examples
+    --------
+    >>> from mauvecl.flares.energies import fiducial2018
+    >>> seconds, light = [100, 1000, 100_000], 1e27
+    >>> [round(float(fiducial2018(light).per_day_above(160 * light * delta)), 6) for delta in seconds]
+    [44.987306, 8.0, 0.252982]
     """
     second = 160 * quiescent_si_iv_erg_s
     return PowerLaw.through(

@@ -1,19 +1,16 @@
 """Closed forms against exact distributions, the paper's smoothing, and coverage of intervals of probabilities."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from marks import long_but
-from scenes import instrument, star
+from scenes import star
 from scipy import optimize, stats
 from scipy.ndimage import gaussian_filter1d
 
 from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
-from mauvecl.detection import STATISTIC_NAMES, chi2, distributions, requests
-
-
-def test_every_statistic_can_be_asked_for_in_the_order_of_tables() -> None:
-    """Compare with the names that studies accept, which are listed apart, in a module that is fast to import."""
-    assert tuple(requests.STATISTICS) == STATISTIC_NAMES
+from mauvecl.detection import distributions, requests
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 29, 400, 1643])
@@ -54,7 +51,7 @@ def test_many_terms_of_two_kinds_have_the_tail_of_their_convolution(spread: floa
         assert form.sf(value) == pytest.approx(exact, rel=1e-6, abs=1e-12)
 
 
-def test_mixture_follows_simulation() -> None:
+def test_mixture_follows_simulation_and_the_chances_of_its_parts() -> None:
     """Compare moments, tails and quantiles with draws from the components: 4.5 standard errors of 4e5 draws."""
     rng, n = np.random.default_rng(20_261_122), 400_000
     weight, shift = np.array([0.5, 2.0, 1.0]), np.array([0.3, 1.0, 0.0])
@@ -71,10 +68,7 @@ def test_mixture_follows_simulation() -> None:
         cut = found.isf(p)
         assert found.sf(cut) == pytest.approx(p, rel=1e-6)
         assert abs(np.mean(x > cut) - p) < 4.5 * np.sqrt(p * (1 - p) / n) + 1e-5
-
-
-def test_mixture_of_parts_far_apart_is_the_sum_of_their_chances() -> None:
-    """In the middle of one part, far above another, and above both, where chances are below those of rounding."""
+    # In the middle of one part, far above another, and above both, where chances are below those of rounding.
     parts = tuple(
         distributions.QuadraticForm(np.linspace(0.9, 1.1, 300) * size, np.full(300, 0.1)) for size in (1.0, 1.3, 9.0)
     )
@@ -87,23 +81,25 @@ def test_mixture_of_parts_far_apart_is_the_sum_of_their_chances() -> None:
             assert found.sf(found.isf(chance)) == pytest.approx(chance, rel=1e-6)
 
 
-def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows, factors of squares and variances of modes of the paper's sum over every pixel."""
-    n = quiet.wavelength_nm.size
-    sigma = 10.5 / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
-    rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")
-    factor = 1.0 / gaussian_filter1d(flare.recorded_light_dn, sigma, mode="nearest") / flare.exposure_s
-    half = np.sqrt(factor)[:, None] * rows
-    modes = np.linalg.eigvalsh((half * (quiet.variance_dn2 + quiet.variance_dn2)) @ half.T)
-    return rows, factor, modes[modes > 1e-10 * modes.max()]
+def smoothing_of(quiet: Expectation, *flares: Expectation) -> Any:
+    """Return the smoothing of the paper's statistic for some flares."""
+    asked = requests.DetectRequest.of(quiet, flares, 1000, seed=1, statistics=("paper",)).hypotheses
+    paper: Any = requests.STATISTICS["paper"]
+    return paper.smoothing(asked.setting)
 
 
 @pytest.mark.long
 def test_few_centres_represent_all_pixels() -> None:
     """Compare draws to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
     quiet, flare = star(amplitudes=(0.081,))
-    rows, factor, modes = whole(quiet, flare)
-    smoothing = chi2.Smoothing.of(quiet, np.ones(len(rows), bool), (flare,))
+    smoothing, n = smoothing_of(quiet, flare), quiet.wavelength_nm.size
+    # Rows, factors of squares and variances of modes of the sum over every pixel.
+    sigma = 10.5 / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
+    rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")
+    factor = 1.0 / gaussian_filter1d(flare.recorded_light_dn, sigma, mode="nearest") / flare.exposure_s
+    half = np.sqrt(factor)[:, None] * rows
+    modes = np.linalg.eigvalsh((half * (quiet.variance_dn2 + quiet.variance_dn2)) @ half.T)
+    modes = modes[modes > 1e-10 * modes.max()]
     assert np.diff(smoothing.centres).max() == 7
     rng = np.random.default_rng(1)
     noise = rng.normal(0.0, np.sqrt(2 * quiet.variance_dn2), (200, len(rows)))
@@ -123,32 +119,25 @@ def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
     nm = np.arange(170.0, 1150.0, 0.5)
     dark = Source.from_arrays(nm, np.where(nm > 400.0, 1e-11, 0.0)).at_magnitude(7.4)
     quiet = expect(dark, Instrument.load("mauvesim"), exposure=50.0, sky=Sky.none())
-    used = np.ones(quiet.wavelength_nm.size, bool)
-    smoothing = chi2.Smoothing.of(quiet, used)
-    assert len(smoothing.centres) == used.size
-    rows = gaussian_filter1d(np.eye(used.size), smoothing.sigma, axis=0, mode="nearest")
+    smoothing, n = smoothing_of(quiet, quiet), quiet.wavelength_nm.size
+    assert len(smoothing.centres) == n
+    rows = gaussian_filter1d(np.eye(n), smoothing.sigma, axis=0, mode="nearest")
     np.testing.assert_allclose(smoothing.rows, rows)
 
 
 @pytest.mark.parametrize("chunk", [4, 32])
-@pytest.mark.parametrize("changes", [{}, {"output_min_nm": 300.0, "output_max_nm": 330.0}])
-def test_bands_hold_the_rows(chunk: int, changes: dict) -> None:
-    """Follow the bands in chunks as the kernel does, with some pixels left out."""
-    (quiet,) = star(payload=instrument(**changes))
-    n = quiet.wavelength_nm.size
-    used = np.random.default_rng(2).random(n) > 0.1
-    used[20:90] = False
-    smoothing = chi2.Smoothing.of(quiet, used)
-    padded = -(-n // 32) * 32
-    weights, finished = smoothing.bands(padded, chunk)
-    x = np.zeros(padded)
+def test_bands_hold_the_rows(chunk: int) -> None:
+    """Follow the bands in chunks as the kernel does."""
+    (quiet,) = star()
+    smoothing, n = smoothing_of(quiet, quiet), quiet.wavelength_nm.size
+    x = np.zeros(-(-n // 32) * 32)
     x[:n] = np.random.default_rng(3).normal(size=n)
+    weights, finished = smoothing.bands(x.size, chunk)
     window, out = np.zeros(weights.shape[1]), []
     for c, count in enumerate(finished):
         window += weights[c] @ x[c * chunk : (c + 1) * chunk]
         out += list(window[:count])
         window = np.append(window[count:], np.zeros(count))
-    assert len(out) == len(smoothing.rows)
     np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
 
 
@@ -167,21 +156,17 @@ def exact(k: int, n: int) -> tuple[float, float]:
     return found.low, found.high
 
 
-def strength(kind: str, fap: float, probability: float) -> tuple[float, float]:
-    """Return the true threshold, and what a flare must add to be detected with a probability."""
-    if kind == "matched":
-        cut = float(stats.norm.isf(fap))
-        return cut, cut - float(stats.norm.isf(probability))
-    cut = float(stats.chi2.isf(fap, DOF))
-    return cut, optimize.brentq(lambda push: stats.ncx2.sf(cut, DOF, push) - probability, 1e-6, 1e3)
-
-
 def intervals(
     kind: str, fap: float, probability: float, n: int, seeds: int
 ) -> tuple[np.ndarray, list[distributions.Interval]]:
     """Count flares above a simulated threshold and the ends of its interval; return counts and interval per seed."""
     rng = np.random.default_rng([round(1e4 * fap), round(1e4 * probability), n, len(kind)])
-    _, push = strength(kind, fap, probability)
+    # What a flare must add to be detected with the probability.
+    if kind == "matched":
+        push = float(stats.norm.isf(fap) - stats.norm.isf(probability))
+    else:
+        cut = float(stats.chi2.isf(fap, DOF))
+        push = optimize.brentq(lambda push: stats.ncx2.sf(cut, DOF, push) - probability, 1e-6, 1e3)
     low, high = (int(count) for count in stats.binom.ppf([0.025, 0.975], n, fap))
     ranks = [int(np.floor(fap * n * (1 + 1e-12))), max(low - 1, 1), high]
     above, shared = np.empty((seeds, 3), int), np.zeros(seeds)

@@ -177,10 +177,7 @@ def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine) -> None
             assert np.isnan(table["threshold"]).all()
             assert np.isnan(table["probability"]).all()
     assert kinds == {True, False}
-
-
-def test_sampled_threshold_raises_as_well(engine: Engine) -> None:
-    """Sample a single frame, drawn as a stack, whose most probable value is the same."""
+    # Sample a single frame, drawn as a stack, whose most probable value is the same.
     quiet, flare = (replace(x, n_frames=1) for x in nearly_saturated(3, 0.5))
     found = engine.detect(quiet, [flare], realisations=FEW, seed=1, statistics=("matched",), tails="sampled")
     with pytest.raises(InputError, match="no threshold"):

@@ -11,8 +11,3 @@ def probes(request: pytest.FixtureRequest, engine: Engine) -> Probes:
     """Return probes of PoCL's fast forms, of the plain vectors for other compilers, and of a GPU's scalars."""
     width = 1 if request.param == "scalar" else 16
     return Probes(device=engine.open_device, width=width, vector_forms=request.param == "vector forms")
-
-
-@pytest.fixture(scope="session")
-def probes_fast(engine: Engine) -> Probes:
-    return Probes(device=engine.open_device)

@@ -70,16 +70,8 @@ def test_nominal_payload_is_drawn_jointly_and_stacked_at_all_settings(name: str)
                 assert exact.draws_to_tell(exact.of_stack(x, pixel), by_polynomial(x, pixel)) > SOONEST
 
 
+#: Logarithms of Gaussian noise over a Poisson step, gain and dark, the dark's unit, logarithm of light, phase in a DN.
 BOUNDS = [(np.log10(1.5), 1.5), (-1.0, 1.0), (-2.5, 3.3), (0.0, 1.0), (-4.5, 3.3), (0.0, 1.0)]
-
-
-def pixel_at(point: np.ndarray) -> Expectation:
-    """Return a pixel of any noise: Gaussian over Poisson step, gain, dark, its unit, light, and phase within a DN."""
-    over, gain, dark, _, light, _ = 10.0**point
-    unit, step = ("electrons", gain) if point[3] > 0.5 else ("DN", 1.0)
-    light = light if point[4] > -4 else 0.0
-    x = one_frame(dark * step, light, over * max(step, gain), gain=gain, unit=unit)
-    return replace(x, bias_dn=3000.0 + point[5] * np.ones(8))
 
 
 @pytest.mark.long
@@ -92,7 +84,10 @@ def test_worst_draws_that_the_region_allows(what: str, varying: bool) -> None:
 
     def merit(point: np.ndarray) -> float:
         nonlocal tried
-        x = pixel_at(point)
+        over, gain, dark, _, light, _ = 10.0**point
+        unit, step = ("electrons", gain) if point[3] > 0.5 else ("DN", 1.0)
+        light = light if point[4] > -4 else 0.0
+        x = one_frame(dark * step, light, over * max(step, gain), gain=gain, unit=unit, bias=3000.0 + point[5])
         try:
             if varying:
                 quartic = prepare([x], processes=constant).quartic

@@ -8,6 +8,7 @@ import randomgen
 from probes import Probes
 from scipy import special, stats
 
+from mauvecl import Engine
 from mauvecl.device import selftest
 from mauvecl.noise import layout, reference
 
@@ -67,27 +68,29 @@ def test_normals_have_a_bounded_error_and_the_bits_of_the_reference(probes: Prob
 
 
 @pytest.mark.long
-def test_every_word_is_finite(probes_fast: Probes) -> None:
+def test_every_word_is_finite(engine: Engine) -> None:
     """Try all 2**32 radius words with angles at two ends of the sine's range."""
+    probes = Probes(device=engine.open_device)
     items, per_item = 2**14, 2**18
     for angle in (0, 2**31 - 1):
-        ends = np.empty((items, 2, probes_fast.width), np.float32)
-        bad = np.empty((items, probes_fast.width), np.uint32)
-        probes_fast.run("probe_every_word", items, bad, np.uint32(per_item), np.uint32(angle), out_first=ends)
+        ends = np.empty((items, 2, probes.width), np.float32)
+        bad = np.empty((items, probes.width), np.uint32)
+        probes.run("probe_every_word", items, bad, np.uint32(per_item), np.uint32(angle), out_first=ends)
         assert bad.sum() == 0
         reach = np.abs(ends).max()
         assert 6.75 < reach < 6.77
 
 
 @pytest.mark.long
-def test_thousand_million_draws(probes_fast: Probes) -> None:
+def test_thousand_million_draws(engine: Engine) -> None:
     """Pearson, Kolmogorov-Smirnov and tails to six sigma at 1e9; each fails by chance once in 1e6 new seeds."""
+    probes = Probes(device=engine.open_device)
     items, groups = 4096, 3815
     counts = np.zeros((items, 4096), np.uint32)
-    probes_fast.run("probe_histogram", items, counts, np.uint32(77), np.uint32(groups), start=counts)
+    probes.run("probe_histogram", items, counts, np.uint32(77), np.uint32(groups), start=counts)
     found = counts.sum(axis=0, dtype=np.int64)
     n = int(found.sum())
-    assert n == items * groups * 4 * probes_fast.width > 1e9 - 1e6
+    assert n == items * groups * 4 * probes.width > 1e9 - 1e6
     edges = np.arange(4097) / 256 - 8
     expected = n * np.where(edges[1:] <= 0, np.diff(special.ndtr(edges)), -np.diff(special.ndtr(-edges)))
     common = expected > 20

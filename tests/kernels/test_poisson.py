@@ -1,7 +1,5 @@
 """Poisson draws by alias table and expansion: exact probabilities, extreme words."""
 
-from dataclasses import replace
-
 import exact
 import numpy as np
 import pytest
@@ -67,19 +65,9 @@ def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None
         assert needed(0.0) < 1e-2 * needed(float(source["cubic"]))
 
 
-@pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0])
-def test_expansion_equals_the_reference(probes: Probes, mean: float) -> None:
-    w, root = np.array(reference.words_at(np.arange(4096), 0, "dark", 1, 5)), np.sqrt(mean)
-    offset, slope, cubic = (np.float32(c) for c in (-1 / 6, root - 1 / (36 * root), -1 / (72 * root)))
-    z = np.array(reference.normal_pair(w[0], w[1]))
-    curve = reference.fma(z, cubic, np.float32(1 / 6))
-    twin = np.rint(reference.fma(z, reference.fma(z, curve, slope), offset))
-    np.testing.assert_array_equal(probes.expansion(w[0], w[1], mean), twin)
-
-
 def test_equal_means_share_a_table() -> None:
     alike, other = (
-        prepare([replace(selftest.toy(4, 1, read=0.7, light=0.0), dark_dn=np.array(means))], recipe="apart")
+        prepare([exact.flat(4, 1, read=0.7, dark=np.array(means))], recipe="apart")
         for means in ([5.0, 5.0, 5.0, 5.0], [5.0, 64.0, 5.0, 64.0])
     )
     assert alike.tables.size == layout.alias_table(5.0).entries.size

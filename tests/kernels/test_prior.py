@@ -81,8 +81,11 @@ def moments(x: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, flo
     return mean, sd, *(float(weight @ ((x - mean) / sd) ** k) for k in (3, 4))
 
 
+CHANCES = [1e-9, 1e-7, 1e-5, 1e-3, 0.1]
+
+
 @pytest.mark.parametrize(("name", "prior"), PRIORS)
-def test_drawn_factors_have_the_moments_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
+def test_drawn_factors_have_the_moments_and_tails_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
     """Integrate the values of the prior over every cell of the table, without draws."""
     t, w = np.polynomial.legendre.leggauss(3)
     cells = np.arange(layout.PRIOR_NODES - 1)
@@ -97,14 +100,7 @@ def test_drawn_factors_have_the_moments_of_the_prior(probes: Probes, name: str, 
     assert sd == pytest.approx(wanted[1], rel=1e-4)
     assert skew == pytest.approx(wanted[2], abs=1e-3, rel=3e-4)
     assert kurtosis == pytest.approx(wanted[3], rel=3e-4)
-
-
-CHANCES = [1e-9, 1e-7, 1e-5, 1e-3, 0.1]
-
-
-@pytest.mark.parametrize(("name", "prior"), PRIORS)
-def test_drawn_factors_have_the_tails_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
-    """Compare the probability beyond the device's value with its word, to 0.1 % and the resolution of float32."""
+    # The probability beyond the device's value is that of its word, to 0.1 % and the resolution of float32.
     table, centre = factors(name, prior)
     for upper in (False, True):
         for chance, value in zip(CHANCES, drawn(probes, name, prior, np.array(CHANCES), upper), strict=True):

@@ -133,15 +133,6 @@ def test_extreme_words_in_production_kernel_equal_reference(
         assert z[0] > 6.5
 
 
-@pytest.mark.parametrize("index", [2**32 - 1, 2**32, 2**40 - 1, 2**40, 2**62])
-def test_draws_at_counter_boundaries_equal_reference(engine: Engine, index: int) -> None:
-    (x,) = star(payload=instrument(part=True, output_max_nm=320.0))
-    raw = engine.realise(x, start=index - 20, count=41, seed=2**64 - 1)
-    numbers = np.arange(index - 20, index + 21, dtype=np.uint64)
-    np.testing.assert_array_equal(raw, reference.realise(prepare([x]), numbers, 2**64 - 1))
-    assert len(np.unique(raw, axis=0)) == 41
-
-
 def test_largest_number_of_pixels_is_drawn(engine: Engine) -> None:
     """Draw 65 536 pixels: all equal the reference, all groups differ, and statistics are defined."""
     x = exact.flat(65_536, 1, dark=2225.0, photons=40.0)

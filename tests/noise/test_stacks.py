@@ -61,10 +61,7 @@ def test_nearly_noiseless_detector_is_drawn_frame_by_frame(engine: Engine) -> No
         assert abs(raw[:, pixel].mean() - mean) < 5 * np.sqrt(variance / rows) + 1e-9
         spread = np.sqrt(max(fourth - variance**2, 0.0) / rows)
         assert abs(((raw[:, pixel] - mean) ** 2).mean() - variance) < 5 * spread + 1e-9
-
-
-def test_mode_follows_least_light_of_prior() -> None:
-    """Choose the mode by the least light that a prior allows, whose photons smooth the rounding least."""
-    x = quiet(0.1, 100, photons=60.0)
-    assert not prepare([x]).frames
-    assert prepare([x], processes=Processes(qe_scale=Uniform(0.01, 1.0))).frames
+    # The least light that a prior allows decides, whose photons smooth the rounding least.
+    smooth = quiet(0.1, 100, photons=60.0)
+    assert not prepare([smooth]).frames
+    assert prepare([smooth], processes=Processes(qe_scale=Uniform(0.01, 1.0))).frames

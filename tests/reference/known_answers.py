@@ -39,6 +39,9 @@ def results(name: str, count: int) -> dict[str, np.ndarray]:
     plan = requests.plan_channels(hypotheses, range(1))
     sums = statistics.statistics(hypotheses, plan, index, seed)
     values = statistics.marginalise(sums, plan.subtractions)
+    # The channels of the fast kernel, with zeros for statistics that it does not compute.
+    fast = values[: plan.n_rows - len(plan.scales)].copy()
+    fast[[2, 5]] = 0.0
     tally = counts.Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
     counted, moments, _ = statistics.tally(values, tally.grids)
     tally.add(counted, moments, count)
@@ -48,17 +51,10 @@ def results(name: str, count: int) -> dict[str, np.ndarray]:
         "raw": reference.realise(scene, index, seed).astype(np.int32),
         "clipped": reference.clipped(scene, index, seed).sum(axis=(1, 2)).astype(np.uint32),
         "statistics": values,
-        "fast statistics": fast(values, plan),
+        "fast statistics": fast,
         "histograms": selftest.histograms_of(seen),
         "tally": selftest.tally_of(tally.distribution(0)),
     }
-
-
-def fast(values: np.ndarray, plan: requests.ChannelPlan) -> np.ndarray:
-    """Select the channels of the fast kernel, with zeros for statistics that it does not compute."""
-    chosen = values[: plan.n_rows - len(plan.scales)].copy()
-    chosen[[2, 5]] = 0.0
-    return chosen
 
 
 def stare_results(name: str, count: int) -> dict[str, np.ndarray]:

@@ -69,21 +69,19 @@ def _normals(scene: StareScene, numbers: np.ndarray, frame: int, stream: str, se
     return [z for each in words for z in reference.four_normals(each)]
 
 
-def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: np.ndarray) -> list[np.ndarray]:
-    """Return the coefficients of the flare spectra, shape (n_stare,) each."""
-    given = flares.rows[:, :, frame] * (scene.known[-1, frame] * flares.amplitudes[scenario][:, None])
-    return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
-
-
 def _conditions(
     scene: StareScene, flares: Flares, numbers: np.ndarray, frames: Iterable[int], seed: int
 ) -> Iterator[tuple[int, dict[str, np.ndarray], list[list[np.ndarray]]]]:
     """Yield each frame with its coefficients of steady components, and of the flares of each scenario."""
     lost = scene.losses(numbers, seed)
     for frame in frames:
-        steady = strengths(scene, numbers, frame, seed, lost)
-        every = range(len(flares.amplitudes))
-        yield frame, steady, [_coefficients(scene, flares, frame, k, steady["light"]) for k in every]
+        steady, of_flares = strengths(scene, numbers, frame, seed, lost), []
+        light = steady["light"]
+        for amplitudes in flares.amplitudes:
+            given = flares.rows[:, :, frame] * (scene.known[-1, frame] * amplitudes[:, None])
+            every = np.broadcast_to(given, (len(light), given.shape[1])).T
+            of_flares.append([fma(light, flare, flare) for flare in every])
+        yield frame, steady, of_flares
 
 
 def pixels(scene: StareScene, flares: Flares, numbers: np.ndarray, frames: Iterable[int], seed: int) -> np.ndarray:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.detection import chi2, requests, snr
+from mauvecl.detection import requests, snr
 from mauvecl.noise import layout, reference
 
 fma = reference.fma
@@ -14,7 +14,8 @@ def statistics(hypotheses: requests.Hypotheses, plan: Any, realisation: np.ndarr
     """Compute all channels of the kernels in their order; rows of `chi2_pair` are zero if it is not asked."""
     scene: Any = hypotheses.scene
     pair, smoothed = "chi2_pair" in hypotheses.statistics, len(plan.scales) > 0
-    rows = chi2.Paper().smoothing(hypotheses.setting).rows.astype(np.float32) if smoothed else np.zeros((0, 0))
+    paper: Any = requests.STATISTICS["paper"]
+    rows = paper.smoothing(hypotheses.setting).rows.astype(np.float32) if smoothed else np.zeros((0, 0))
     n_scenario, fixed = len(scene.levels), len(layout.FIXED_STATISTICS)
     weights, linear_end, pixels_end = plan.weights, plan.linear_end, plan.pixels_end
     constants = scene.constants(weights, linear_end, pixels_end)

@@ -1,5 +1,7 @@
 """Searches of sums of frames: values of filters, losses of a bank, and rates of false alarms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy
@@ -7,16 +9,24 @@ from refusals import refused
 from scipy import special
 
 from mauvecl import SHAPES, Stare, Study
-from mauvecl.search import completeness, false_alarms, templates
+from mauvecl.search import completeness, false_alarms
 from mauvecl.search.search import Search
 
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))
-KNOWN = templates.Baseline(offset=False, slope=False, window_s=0.0)
+KNOWN = {"offset": False, "slope": False, "window_s": 0.0}
 HALF_WIDTHS_S = Study().search.half_widths_s
 COLOURS = np.array([[1.0, 0.0], [0.95, 0.312], [0.8, 0.6]])
+
+
+def bank_of(widths, directions=ONE, *, cycle=False, **level):
+    """Return a bank of flares of Davenport's shape in frames of 5 s, by default of a single light curve."""
+    bank = Study.build({"search": {"half_widths_s": widths, **level}}, "test").search.white_bank(5.0)
+    return replace(bank, directions=directions, baseline=replace(bank.baseline, cycle=cycle))
+
+
 #: The bank of the theory's table: eight filters from 30 s on, a factor of two apart.
-EIGHT = templates.Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
+EIGHT = bank_of([30.0 * 2**k for k in range(8)], **KNOWN)
 
 
 def filtered(search, sums, curves):
@@ -45,15 +55,14 @@ def filtered(search, sums, curves):
             yield rho[:, :, onset], np.einsum("t,stk,dk->sd", left, sums[:, inside], bank.directions)
 
 
-@pytest.mark.parametrize(
-    "level", [KNOWN, templates.Baseline(window_s=600.0), templates.Baseline(cycle=True, window_s=600.0)]
-)
+@pytest.mark.parametrize("level", [KNOWN, {"window_s": 600.0}, {"cycle": True, "window_s": 600.0}])
 def test_filters_are_least_squares_over_gaps(level):
     """Fit each template over gaps, with unequal variances and a varying level; the last is longer than the stare."""
     stare = Stare.of(6000.0, gaps=[(1000, 1500), (3000, 3050)])
     rng = np.random.default_rng(1)
+    bank = bank_of((11.0, 54.0, 266.0, 2000.0), COLOURS[::2], **level)
+    level = bank.baseline
     curves = np.array([np.sin(stare.start_s / 600), np.cos(stare.start_s / 600)]) if level.cycle else np.zeros((0, 1))
-    bank = templates.Bank((11.0, 54.0, 266.0, 2000.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, level)
     assert bank.window(2000.0)[1] > stare.n_frames or level.offset
     variance = rng.uniform(0.5, 2.0, stare.n_frames)
     search = Search(bank, stare, curves if level.cycle else None, variance)
@@ -65,17 +74,17 @@ def test_filters_are_least_squares_over_gaps(level):
     assert max(np.abs(a - b).max() for a, b in pairs) < 5e-3
 
 
-@pytest.mark.parametrize("level", [KNOWN, templates.Baseline()])
+@pytest.mark.parametrize("level", [KNOWN, {}])
 def test_bank_loses_little_in_time(level):
     """Check a loss of 1.3 % of S/N at most for half-widths of 10-1800 s at any phase (spectra: 0.7 %)."""
-    bank, edges = templates.Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, level), np.arange(12_001) * 5.0
+    bank, edges = bank_of(HALF_WIDTHS_S, **level), np.arange(12_001) * 5.0
     flares, own = [], []
     for half_width in np.geomspace(10, 1800, 24):
         lead, tail = bank.window(half_width)
         for phase, frame in ((0.1, 5000), (0.5, 5007), (0.8, 5020)):
             flares.append(DAVENPORT.mean_over(edges, (frame + phase) * 5.0, half_width))
             left = DAVENPORT.mean_over(np.arange(-lead, tail + 2) * 5.0, phase * 5.0, half_width)
-            own.append(np.linalg.norm(scipy.signal.detrend(left) if level.offset else left))
+            own.append(np.linalg.norm(scipy.signal.detrend(left) if bank.baseline.offset else left))
     kept = Search(bank, Stare.of(60_000.0)).largest(np.array(flares, np.float32)[:, :, None]) / np.array(own)
     assert (1 - kept).max() < 0.013
 
@@ -118,7 +127,7 @@ def test_repeated_estimates_scatter_by_their_errors():
 
 def test_rate_of_one_filter_equals_the_closed_form():
     """Compare independent frames with P = 1 - (1 - Q)^n."""
-    alone = templates.Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN)
+    alone = bank_of([0.02], **KNOWN)
     tail = false_alarms.sample_rate(Search(alone, Stare.of(500.0)), seed=1, draws=50)
     # Both phases of a template see its one frame: they are the same filter.
     exact = -np.expm1(100 * np.log1p(-special.ndtr(-tail.thresholds)))
@@ -128,23 +137,18 @@ def test_rate_of_one_filter_equals_the_closed_form():
         assert completeness.search_threshold(17_280 * special.ndtr(-sigma), alone) == pytest.approx(sigma, abs=1e-3)
 
 
-def test_threshold_inverts_the_rate():
-    bank = templates.Bank((20.0, 60.0, 180.0), COLOURS[::2], DAVENPORT, 5.0, templates.Baseline(window_s=900.0))
-    tail = false_alarms.sample_rate(Search(bank, Stare.of(9000.0, gaps=[(4000, 5000)])), seed=2, draws=400)
+@pytest.mark.parametrize("widths", [pytest.param(HALF_WIDTHS_S, marks=pytest.mark.long), (20.0, 40.0, 80.0, 160.0)])
+def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
+    """An upper bound, up to a tenth above, for one alarm a day to one in 10^10 days; fails once in 10^4 runs."""
+    directions = ONE if widths is HALF_WIDTHS_S else COLOURS
+    bank = bank_of(widths, directions, window_s=900.0)
+    tail = false_alarms.sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
+    for asked in (1.0, 1e-2, 1e-4, 1e-7, 1e-10):
+        log_rate, error = tail.log_rate(completeness.search_threshold(asked, bank))
+        assert -0.1 - 4 * error < log_rate - np.log(asked) < 4 * error
     for rate in (1.0, 1e-2, 1 / 365.25):
         cut = tail.threshold(rate)
         assert tail.log_rate(cut.value)[0] == pytest.approx(np.log(rate), abs=1e-4)
         assert 0 < cut.high - cut.value < 0.1
     with refused("false_alarms", "1e-30"):
         tail.threshold(1e-30)
-
-
-@pytest.mark.parametrize("widths", [pytest.param(HALF_WIDTHS_S, marks=pytest.mark.long), (20.0, 40.0, 80.0, 160.0)])
-def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
-    """An upper bound, up to a tenth above, for one alarm a day to one in 10^10 days; fails once in 10^4 runs."""
-    directions = ONE if widths is HALF_WIDTHS_S else COLOURS
-    bank = templates.Bank(widths, directions, DAVENPORT, 5.0, templates.Baseline(window_s=900.0))
-    tail = false_alarms.sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
-    for asked in (1.0, 1e-2, 1e-4, 1e-7, 1e-10):
-        log_rate, error = tail.log_rate(completeness.search_threshold(asked, bank))
-        assert -0.1 - 4 * error < log_rate - np.log(asked) < 4 * error
