@@ -16,8 +16,8 @@ from mauvecl.cli import app
 SMALL_SHARDS = [
     sys.executable,
     "-c",
-    "import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
-    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; from mauvecl.cli import app; app.main()",
+    "import runpy; import mauvecl.runs.checkpoint as s; s.SHARD_WORK = 2**27; "
+    "s.Checkpoint.__init__.__kwdefaults__['patience_s'] = 0.0; runpy.run_module('mauvecl', run_name='__main__')",
 ]
 
 

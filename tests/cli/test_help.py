@@ -65,20 +65,36 @@ def test_flags_equal_those_of_the_file() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, verb in VERBS.items() if not hasattr(verb, "commands")])
-def test_help_has_examples_and_fits_80_columns(name: str, tmp_path: Path) -> None:
-    shown = run(*name.split(), "--help", folder=tmp_path, columns=80).stdout
-    examples = re.findall(r"^ +mauvecl (?:.*\\\n)*.*$", shown, re.MULTILINE)
+def test_help_has_examples_and_the_common_flags_and_help_all_every_flag(name: str, tmp_path: Path) -> None:
+    texts = [run(*name.split(), "--help", folder=tmp_path, columns=80).stdout]
+    examples = re.findall(r"^ +mauvecl (?:.*\\\n)*.*$", texts[0], re.MULTILINE)
     assert all(shlex.split(example)[0] == "mauvecl" for example in examples)
     assert any(" ".join(example.split()).startswith(f"mauvecl {name}") for example in examples)
     assert max(len(line) for example in examples for line in example.splitlines()) <= 80
+    if "study_file" not in {parameter.name for parameter in VERBS[name].params}:
+        return
+    texts.append(run(name, "--help-all", folder=tmp_path, columns=80).stdout)
+    assert max(len(line) for text in texts for line in text.splitlines()) <= 80
+    common, every = (re.findall(r"^  (?:-\w, )?(--[\w-]+)", text, re.MULTILINE) for text in texts)
+    assert 4 <= len(common) - 2 <= 12
+    assert set(common) < set(every)
+    assert {*every} == {max(one.opts, key=len) for one in options(VERBS[name])} | {"--help"}
+    if name == "detect":
+        groups = dict(re.findall(r"^(\S.*):\n((?:  .*\n)+)", texts[1], re.MULTILINE))
+        wanted = {"Star": "--star", "Sky": "--sky", "Flare": "--line", "Run": "--fap", "Output and devices": "--json"}
+        assert [heading for heading, flag in wanted.items() if f" {flag} " not in groups[heading]] == []
 
 
 def test_bare_command_lists_every_command_on_a_line_of_its_own() -> None:
-    """List commands in four groups, answers in the order of the registry; a bare `mauvecl` is no error."""
+    """List commands in four groups, answers in the order of the registry, and exit codes; to ask so is no error."""
     done = CliRunner().invoke(app.app, [], env={"COLUMNS": "80"})
     assert (done.exit_code, done.stderr) == (0, "")
     assert done.output == CliRunner().invoke(app.app, ["--help"], env={"COLUMNS": "80"}).output
     assert max(map(len, done.output.splitlines())) <= 80
+    documented = (DATA.parents[1] / "docs" / "command-line.md").read_text()
+    for code in (1, 2, 70, 74, 130, 141, 143):
+        assert re.search(rf"\b{code}\b", done.output)
+        assert f"| {code} |" in documented
     groups = re.findall(r"^(Plan|Simulate|Analyse|Tools)[^\n]*:\n((?:  .*\n)+)", done.output, re.MULTILINE)
     assert [heading for heading, _ in groups] == ["Plan", "Simulate", "Analyse", "Tools"]
     listed = [[line.split() for line in lines.splitlines()] for _, lines in groups]
@@ -89,20 +105,6 @@ def test_bare_command_lists_every_command_on_a_line_of_its_own() -> None:
         assert own in names
         answers = [name for name in names if name in ANSWERS]
         assert answers == sorted(answers, key=ANSWERS.index)
-
-
-@pytest.mark.parametrize("name", [name for name, one in VERBS.items() if "study_file" in {p.name for p in one.params}])
-def test_help_shows_the_common_flags_and_help_all_every_flag(name: str, tmp_path: Path) -> None:
-    texts = [run(name, flag, folder=tmp_path, columns=80).stdout for flag in ("--help", "--help-all")]
-    assert max(len(line) for text in texts for line in text.splitlines()) <= 80
-    common, every = (re.findall(r"^  (?:-\w, )?(--[\w-]+)", text, re.MULTILINE) for text in texts)
-    assert 4 <= len(common) - 2 <= 12
-    assert set(common) < set(every)
-    assert {*every} == {max(one.opts, key=len) for one in options(VERBS[name])} | {"--help"}
-    if name == "detect":
-        groups = dict(re.findall(r"^(\S.*):\n((?:  .*\n)+)", texts[1], re.MULTILINE))
-        wanted = {"Star": "--star", "Sky": "--sky", "Flare": "--line", "Run": "--fap", "Output and devices": "--json"}
-        assert [heading for heading, flag in wanted.items() if f" {flag} " not in groups[heading]] == []
 
 
 def completed(typed: str, folder: Path) -> set[str]:
@@ -144,22 +146,6 @@ def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
         code, out, reported = ended(verb, *star, flag, "many", folder=tmp_path)
         assert (code, out) == (2, ""), (verb, flag)
         assert re.fullmatch(rf"mauvecl: {flag} must be a .*, not 'many'\n", reported), reported
-
-
-#: The argument of `analyse` is a file of frames.
-OBSERVING = [name for name, one in TOP.items()
-             if {"study_file", "star"} <= {p.name for p in one.params} and name != "analyse"]  # fmt: skip
-
-
-@pytest.mark.parametrize("verb", OBSERVING)
-def test_star_is_accepted_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
-    """Give every verb a star with a wrong magnitude, which its message names."""
-    (tmp_path / "noname").write_text("170 1e-12\n600 1e-12\n1150 1e-12\n")
-    for star in ("G2V,M3V", "noname"):
-        code, _, reported = ended(verb, star, "-m", "99", folder=tmp_path)
-        assert (code, reported) == (2, "mauvecl: --magnitude must be a number between -30 and 40 mag, not 99\n"), star
-    code, _, reported = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
-    assert (code, reported) == (2, "mauvecl: 'G2V' and --star are both stars, but only one may be given\n")
 
 
 def tables(text: str) -> list[list[str]]:

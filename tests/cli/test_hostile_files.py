@@ -1,6 +1,10 @@
-"""Files without an end or of absurd size, and what is no file: refused in one sentence, in little time and memory."""
+"""Hostile files and generated values are answered or refused in one sentence, in little time and memory.
+
+Files without an end or of absurd size, what is no file, and values of every kind; none ends in a traceback.
+"""
 
 import os
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -12,7 +16,10 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
 from scripts import tool
+from study_keys import fields
 from tables import toml
 
 pytestmark = pytest.mark.long
@@ -88,10 +95,11 @@ READERS, VERIFIED = ({name: (file, tuple(shlex.split(words))) for name, (file, w
                      for kind in ("read", "verified"))  # fmt: skip
 
 
-def logged(fuzz: ModuleType, words: tuple[str, ...], place: Path, *codes: int) -> str:
+def logged(fuzz: ModuleType, words: tuple[str, ...], place: Path, *codes: int, **environment: str) -> str:
     """Run a command within its limits, check that it ends with one of some codes, and return its messages."""
-    code, out, log = fuzz.ended(list(words), place, fuzz.limited, {"MAUVECL_DATA_DIR": str(place / "d")})
-    assert fuzz.fault_of(code, out, log, codes) == "", out + log
+    where = {"MAUVECL_DATA_DIR": str(place / "d")} | environment
+    code, out, log = fuzz.ended(list(words), place, fuzz.limited, where)
+    assert fuzz.fault_of(code, out, log, codes) == "", (words, out + log)
     return out + log
 
 
@@ -155,3 +163,41 @@ def test_sizes_that_an_hdf5_file_claims_are_refused(key: str, place: Path, fuzz:
         del group[key]
         group.create_dataset(key, (10**11, *rest), dtype, chunks=(1000, *rest), fillvalue=1).attrs.update(kept)
     assert str(10**11) in logged(fuzz, (*ANALYSE, "frames.h5[star-1/quiescent]"), place, 2)
+
+
+#: What can be wrong with a value: numbers, texts, names of files, and any text or number.
+ODD = st.one_of(
+    st.sampled_from(["0", "-1", "1e-308", "5e-324", "1e308", "-1e308", "nan", "inf", "-inf", "1e-31", "1e31", "1e999"]),
+    st.sampled_from(["1_0", "0x" + "f" * 2000, "9" * 5000, str(2**63 - 1), str(2**64), "0.1", "1e17", "true", "{}"]),
+    st.sampled_from(["", ".", "..", "/", "[/red]", "[bold]x", "a\0b", "\udcff", "\n", "'", '"', "²", "1979-05-27"]),
+    st.sampled_from(["x" * 5000, "y" * 300 + ".toml", "/dev/zero", "[" * 3000 + "]" * 3000]),
+    st.sampled_from(["G2V", "mauvesim", "stack:5", "V", "chi2", "all", "none"]),
+    st.text(max_size=30),
+    st.floats(allow_nan=False).map(repr),
+    st.integers().map(str),
+)
+#: Keys of studies, also of stars that are numbered wrongly.
+EVERY = [".".join(path) for path, _ in fields() if len(path) < 3] + ["star.0.magnitude", "star.0.file", "star.-1", ""]
+GENERATED = TABLE["generated"]
+
+
+@pytest.mark.parametrize("kind", GENERATED)
+def test_generated_inputs_are_answered_or_refused(kind: str, tmp_path: Path, fuzz: ModuleType) -> None:
+    row = {"keys": EVERY, "forms": ["{1}"], "file": "", "environment": {}} | GENERATED[kind]
+
+    # The same examples in every run; the first failure will do: looking for a shorter one takes minutes.
+    @settings(max_examples=row["examples"], derandomize=True, database=None, deadline=None, phases=[Phase.generate],
+              suppress_health_check=list(HealthCheck))  # fmt: skip
+    @given(st.sampled_from(row["keys"]), st.sampled_from(row["forms"]), ODD)
+    def ask(key: str, form: str, value: str) -> None:
+        # The operating system passes no null bytes, and what is written outside the folder would stay.
+        value = re.sub(r"\0|/|\.\." if kind == "output" else r"\0", "?", value)
+
+        def filled(text: str) -> str:
+            return text.replace("{0}", key).replace("{1}", form.replace("{1}", value))
+
+        (tmp_path / "mine.toml").write_text(filled(row["file"]), errors="replace")
+        words = tuple(filled(word) for word in shlex.split(row["run"].replace("{0}", key)))
+        logged(fuzz, words, tmp_path, 0, 2, **{filled(name): filled(text) for name, text in row["environment"].items()})
+
+    ask()

@@ -57,7 +57,8 @@ def assumed(shown: str) -> list[str]:
 
 
 @ALL
-def test_verb_writes_its_files_and_states_its_assumptions(verb: str) -> None:
+def test_verb_writes_its_files_and_a_study_that_gives_the_same_bits(verb: str) -> None:
+    """State assumptions as well; with --json, standard output holds nothing else."""
     folder, done = answered(verb)
     written = [folder / "out" / name for name in (*TABLE[verb]["files"].split(), "study.toml", "run.json")]
     assert {*(folder / "out").iterdir()} == {*written}
@@ -74,12 +75,7 @@ def test_verb_writes_its_files_and_states_its_assumptions(verb: str) -> None:
     assert {"seed", "study", "inputs", "wall_time_s", "mauvecl", "messages"} | drawn <= set(record)
     assert record["verb"] == verb
     assert all(len(entry.get("source digest", "-" * 64)) == 64 for entry in record["inputs"])
-
-
-@ALL
-def test_written_study_gives_the_same_bits(verb: str) -> None:
-    """Ask again with the study that was written; with --json, standard output holds nothing else."""
-    folder, _ = answered(verb)
+    # The study that was written is asked again.
     first, again = folder / "out", folder / "again"
     asked = [*words(verb)] if verb == "analyse" else [verb, first / "study.toml"]
     done = run(*asked, "--no-pictures", "--json", "-o", "again", folder=folder)
@@ -225,7 +221,7 @@ def test_output_folder_is_locked_while_written(tmp_path: Path, monkeypatch: pyte
     run(*asked, folder=tmp_path)
 
 
-def test_files_of_the_previous_run_are_removed(tmp_path: Path) -> None:
+def test_files_of_the_previous_run_alone_are_removed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     run("simulate", "--star", "G2V", "--star", "K3V", "-m", "7", "-t", "5", "-o", "out", folder=tmp_path)
     assert {"observation-2.ecsv", "observation-2.png", "observation-1.png"} <= {path.name for path in out.iterdir()}
@@ -234,16 +230,13 @@ def test_files_of_the_previous_run_are_removed(tmp_path: Path) -> None:
     run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
     kept = {path.name for path in out.iterdir()}
     assert kept == {"exposure.ecsv", "study.toml", "run.json", "notes.txt", "observation-2.fits"}
-
-
-@pytest.mark.parametrize("record", ["", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}'])
-def test_foreign_record_removes_nothing(record: str, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    texts = {"out/run.json": record, "out/a": "mine", "mine": "mine"}
-    for name, text in texts.items():
-        (tmp_path / name).write_text(text)
-    run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
-    assert (tmp_path / "out" / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
+    # A foreign record removes nothing.
+    (tmp_path / "mine").write_text("mine")
+    (out / "a").write_text("mine")
+    for record in ("", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}'):
+        (out / "run.json").write_text(record)
+        run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
+        assert (out / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
 
 
 @pytest.mark.parametrize(("setting", "stated"), SETTINGS.items())
