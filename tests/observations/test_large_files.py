@@ -20,19 +20,18 @@ CHILD = f"""
 import json, resource, sys
 import astropy.io.fits, astropy.table, astropy.time, scipy.special
 import numpy as np
-from mauvecl.observations.mapping import FrameMapping
 from mauvecl import read_frames
-from mauvecl.observations.frame_files import reduce_frames
+from mauvecl.observations import frame_files
 # OpenBLAS reserves address space at the first large product; reading does not need it.
 np.ones((300, 300)) @ np.ones((300, 300))
 small, path, out, mapping = sys.argv[1:]
-mapping = FrameMapping(**json.loads(mapping))
+mapping = frame_files.FrameMapping(**json.loads(mapping))
 weights = np.zeros((2, read_frames(small, mapping).wavelength_nm.size)); weights[0, 3] = 1.0; weights[1, :2] = 1.0
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + {MARGIN_MIB} * 2**20
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 frames = read_frames(path, mapping)
-reduced = reduce_frames(path, weights, mapping)
+reduced = frame_files.reduce_frames(path, weights, mapping)
 one, two = (curve.flux for curve in reduced.light_curves)
 print(*frames.remarks, sep=chr(10), file=sys.stderr)
 np.savez(out, time=frames.time_s, white=frames.flux, one=one, two=two, mean=reduced.pixels.mean,
