@@ -234,9 +234,8 @@ def test_intervals_agree_with_minos() -> None:
     minuit.errordef = 1.0
     minuit.migrad()
     minuit.hesse()
-    for level, cl in zip(found.levels, (0.6827, 0.95), strict=True):
+    for k, cl in enumerate((0.6827, 0.95)):
         minuit.minos("a", "t", "j", cl=cl)
-        k = found.levels.index(level)
         for name, place, scale in (("a", 1, 1.0), ("t", 0, 1e3), ("j", 2, 1.0)):
             best = minuit.values[name] * scale
             ends = [best + scale * minuit.merrors[name].lower, best + scale * minuit.merrors[name].upper]

@@ -93,8 +93,8 @@ def test_fit_recovers_values_and_throughput(answer: Any) -> None:
     expected = {
         "dark slope": 0.072, "bias": 612.0, "gain": true.gain_dn_per_electron, "read noise": 13.0,
         "wavelength shift": 0.1, "wavelength stretch": 0.0, "line width": 11.2, "line width, change to the red": 0.0,
+        "dark current": true.with_(temperature_c=answer.dark.reference_c).dark_dn_per_s,
     }  # fmt: skip
-    expected["dark current"] = true.with_(temperature_c=answer.dark.reference_c).dark_dn_per_s
     assert_fitted(answer, expected)
     assert answer.transfer.dark_unit == "DN"
     assert all(row["p_value"] > 1e-4 for row in answer.fits)
@@ -218,10 +218,7 @@ def test_plans_and_measurements_state_the_error_of_the_throughput(tmp_path: Path
 
 
 def test_two_exposure_times_give_the_bias_of_pixels_and_light_that_jitters_the_gain() -> None:
-    """1643 normal values have a mean square of 1 within 4 standard errors; the noise of the dark current counts.
-
-    Jitter of all light by 5 % alone would triple the gain.
-    """
+    """1643 normal values have a mean square of 1 within 4 standard errors; jitter by 5 % would triple the gain."""
     rng = np.random.default_rng(4)
     bias = np.full(NOMINAL.pixels, 600.0)
     bias[NOMINAL.read_pixels] += np.linspace(-20, 20, NOMINAL.wavelength_nm.size)

@@ -16,36 +16,34 @@ from mauvecl.observations import events, light_curve
 DURATION = SHAPES["davenport2014"].equivalent_duration
 
 
-@pytest.mark.parametrize(
-    ("half_width_s", "after", "amplitude", "window", "seed"),
-    long_but([(60.0, 1.5, 60.0, 12.0, 1), (90.0, 1.2, 200.0, 11.0, 4), (60.0, 0.7, 5.0, 12.0, 5)],
-             (60.0, 1.5, 60.0, 12.0, 1)),
-)  # fmt: skip
-def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
-    half_width_s: float, after: float, amplitude: float, window: float, seed: int
+#: Size, peak and half-width of each flare, in s: tails without their peak, two that look like one, one on a faint star.
+TAILS = ((60.0, -90.0, 60.0),), ((200.0, -108.0, 90.0),), ((5.0, -42.0, 60.0),)
+TWO, GREAT = ((0.218, 284.0, 88.0), (0.191, 406.0, 102.0)), ((120.0, 900.0, 90.0),)
+
+
+@pytest.mark.parametrize(("n", "flares", "noise", "often", "seed"), long_but([
+    (144, TAILS[0], 5e-3, 3.0, (501, 1)), (198, TAILS[1], 5e-3, 3.0, (501, 4)), (144, TAILS[2], 5e-3, 3.0, (501, 5)),
+    (197, TWO, 1.2e-3, 1.0, (508, 1)), (197, TWO, 1.2e-3, 1.0, (508, 2)), (340, GREAT, 5.5 / 30.4, 1.0, (403,)),
+], (144, TAILS[0], 5e-3, 3.0, (501, 1)), (197, TWO, 1.2e-3, 1.0, (508, 1))))  # fmt: skip
+def test_flares_that_windows_cut_or_join_have_their_energies(
+    n: int, flares: Any, noise: float, often: float, seed: tuple[int, ...]
 ) -> None:
-    """Observe 11 to 15 half-widths after the peak; five standard errors, exceeded once in 1.7 million cases."""
-    time = (np.arange(round(window * half_width_s / 5.0)) + 0.5) * 5.0
-    light = 1 + amplitude * flare(time, 5.0, -after * half_width_s, half_width_s)
-    # Rarer false alarms take long to simulate for windows this short.
-    analysis = analysed(noisy([501, seed], time, light, 5e-3), false_alarms=3.0).analysis
-    event = max(analysis.events, key=lambda one: one.value)
-    assert (event.first, event.cut, event.kind) == (0, True, "flare")
-    assert event.value > analysis.threshold
-    truth = amplitude * half_width_s * DURATION
-    assert abs(event.fitted_s - truth) < 2.5 * (event.high_s[0] - event.low_s[0])
+    """Five standard errors of the energy, exceeded once in 1.7 million cases.
 
-
-@pytest.mark.parametrize("seed", long_but([1, 2], 1))
-def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
-    """A third, longer than the window, must not stand for either; five standard errors of the energy."""
-    time = (np.arange(197) + 0.5) * 5.0
-    peaks, widths, sizes = (284.0, 406.0), (88.0, 102.0), (0.218, 0.191)
-    light = sum(size * flare(time, 5.0, *one) for *one, size in zip(peaks, widths, sizes, strict=True))
-    event = max(analysed(noisy([508, seed], time, 1 + light, 1.2e-3)).analysis.events, key=lambda one: one.value)
-    assert sorted(one.peak_s for one in event.flares) == pytest.approx(peaks, abs=8.0)
-    truth = DURATION * sum(size * width for size, width in zip(sizes, widths, strict=True))
-    assert abs(event.fitted_s - truth) < 2.5 * (event.high_s[0] - event.low_s[0])
+    A third flare, longer than the window, must not stand for two. The energy is relative to the level, whose error is
+    that of a great flare on a faint star. Rarer false alarms take long to simulate for windows this short.
+    """
+    time = (np.arange(n) + 0.5) * 5.0
+    light = 1 + sum(size * flare(time, 5.0, *one) for size, *one in flares)
+    analysis = analysed(noisy(seed, time, light, noise), false_alarms=often).analysis
+    event, peaks = max(analysis.events, key=lambda one: one.value), [peak for _, peak, _ in flares]
+    assert (event.kind, event.value > analysis.threshold) == ("flare", True)
+    assert (event.first == 0) == (peaks[0] < 0)
+    assert event.cut or peaks[0] > 0
+    assert peaks[0] < 0 or sorted(one.peak_s for one in event.flares) == pytest.approx(peaks, abs=8.0)
+    error = (event.high_s[0] - event.low_s[0]) / 2
+    assert abs(event.fitted_s - DURATION * sum(size * width for size, _, width in flares)) < 5 * error
+    assert flares is not GREAT or 0.005 < error / event.fitted_s < 0.03
 
 
 @pytest.mark.parametrize("longer", [False, True])
@@ -169,9 +167,8 @@ def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
     period, spots = 1.37 * 86_400, rng.uniform(0.01, 0.03)
     phase = (time / period + rng.uniform()) % 1
     turn = 2 * np.pi * (time / (period * rng.uniform(0.97, 1.03)) + rng.uniform())
-    depth = np.zeros(time.size)
-    for middle, size in ((0.25, 0.12), (0.75, 0.05)):
-        depth += size * np.clip(1.3 * (1 - np.abs(phase - middle) / 0.05), 0, 1)
+    eclipses = ((0.25, 0.12), (0.75, 0.05))
+    depth = sum(size * np.clip(1.3 * (1 - np.abs(phase - middle) / 0.05), 0, 1) for middle, size in eclipses)
     light = (1 + spots * (np.sin(turn) + rng.uniform(0, 0.7) * np.sin(2 * turn + 1))) * (1 - depth)
     for size, peak in zip(np.geomspace(0.008, 0.15, 5), rng.uniform(0.03, 0.97, 5) * time[-1], strict=True):
         light += size * flare(time, frame_s, peak, rng.uniform(200, 1000))
@@ -275,6 +272,5 @@ def test_changes_that_do_not_last_are_no_steps(what: str) -> None:
     }[what]
     answer = analysed(noisy(508, time, 1 + light, NOISE), per="month")
     assert not any("for a day or more" in message for message in answer.messages)
-    assert (what == "long flare") == any(
-        str(row["verdict"]) == "detected" and row["value"] > 20 for row in answer.events
-    )
+    seen = [row for row in answer.events if row["verdict"] == "detected" and row["value"] > 20]
+    assert bool(seen) == (what == "long flare")
