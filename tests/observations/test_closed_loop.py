@@ -13,12 +13,32 @@ from scripts import loaded
 
 import mauvecl
 from mauvecl import SHAPES, Frames, Instrument, Source, Stares, Study, TableShape, analyse, expect, read_frames, stare
+from mauvecl.observations import events, light_curve
 from mauvecl.observations import level as levels
 
 SHAPE = SHAPES["davenport2014"]
 FRAMES, CADENCE_S, LEVEL, SD = 600, 60.0, 1000.0, 5.0
 TIME = np.arange(FRAMES) * CADENCE_S
 flare = partial(scenes.flare, TIME, CADENCE_S)
+
+
+@pytest.mark.long
+def test_flares_at_the_limit_are_detected_nine_times_in_ten() -> None:
+    """New light curves with two flares at the stated limit; fails by chance once in a thousand times."""
+    rng = np.random.default_rng(297)
+    answer = analysed(noisy(rng, TIME, np.full(FRAMES, LEVEL), SD))
+    width, limit = (answer.limits[name][1].to_value("s") for name in ("half_width", "limit"))
+    amplitude = limit / width / SHAPE.equivalent_duration
+    seen, number = 0, 20
+    for _ in range(number // 2):
+        peaks = rng.uniform((4000, 20_000), (16_000, 32_000))
+        light = amplitude * sum(flare(peak, width) for peak in peaks)
+        survey = light_curve.survey_light_curve(noisy(rng, TIME, LEVEL * (1 + light), SD), SHAPE, 1)[0]
+        found, _ = events.detect_events(survey, answer.analysis.threshold)
+        seen += sum(any(abs(one.peak_s - peak) < 4 * width + 300 for one in found) for peak in peaks)
+    # The limit itself comes from forty injections per size: its completeness is known to some 5 %.
+    low, high = stats.binom.ppf([0.0005, 0.9995], number, [0.78, 0.97])
+    assert low <= seen <= high
 
 
 def test_noise_at_the_level_is_that_of_its_counts() -> None:
@@ -96,10 +116,7 @@ SECTIONS: dict[str, Any] = {
 @pytest.mark.long
 @pytest.mark.parametrize("pointing", [{}, {"pointing": {"rate_per_h": 3.0}}], ids=["steady", "pointing losses"])
 def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: Stares, tmp_path: Path) -> None:
-    """Sizes of half and nine tenths of the flares detected, over the threshold.
-
-    The ratio of 11 stares was 1.00 for half of them, its scatter 0.06.
-    """
+    """Size of half of the flares detected, over the threshold: the ratio of 11 stares was 1.00, its scatter 0.06."""
     ratios = []
     for seed in (1, 2, 3):
         sections = SECTIONS | {"stare": SECTIONS["stare"] | pointing, "run": {"seed": seed}}
@@ -110,8 +127,7 @@ def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: St
         completeness, spectra = answer.analysis.completeness, answer.analysis.spectra
         # Sizes of inject are relative to the star in the flare's band, those of analyse to all light of the frames.
         relative = float(spectra.cleaned.model.flares((10_000.0,))[0].sum() / spectra.light.sum())
-        sizes = np.array([completeness.limit(1, 0.5), answer.limits["limit"][1].to_value("s")])
-        ratios.append(sizes / answer.analysis.threshold / relative)
+        ratios.append(completeness.limit(1, 0.5) / answer.analysis.threshold / relative)
     width = float(completeness.half_widths_s[1])
     injections = {"of": "duration", "half_width_low_s": width, "half_width_high_s": width, "widths": 1, "sizes": 12,
                   "count": 200, "positions": 200, "fitted": 0}  # fmt: skip
@@ -121,9 +137,8 @@ def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: St
     level = {"slope": False, "cycle": False, "window_s": 40_000.0}
     alike = SECTIONS["search"] | {"frame": free} | level
     expected = mauvecl.inject(Study(**sections | {"search": alike}, injections=injections), stares)
-    (row,) = expected.tables["limits"]
-    there = np.array([row["e50"].value, row["e90"].value]) / float(expected.tables["search"]["threshold"][0])
-    np.testing.assert_allclose(np.mean(ratios, axis=0) / there, 1.0, atol=0.1)
+    there = float(expected.tables["limits"]["e50"][0].value) / float(expected.tables["search"]["threshold"][0])
+    assert np.mean(ratios) / there == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.long
