@@ -311,7 +311,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)", "reaches = low < -np.inf"),
     ),
     "the noise of a star for that of its flare": (
-        "test_forecasts_of_blackbodies[M3V-0.5-50s-30000K]",
+        "test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies[jump-2.5]",
         (
             "constant + quiet.gain_dn_per_electron * photons_dn for photons_dn in (light, most)",
             "constant + quiet.gain_dn_per_electron * photons_dn for photons_dn in (quiet.light_dn, most)",
@@ -496,14 +496,14 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     # Calibration, changes of throughput and colour.
     "steps of two frames that scatter like one": (
-        "test_gain_ignores_jitter_of_light",
+        "test_two_exposure_times_give_the_bias_of_pixels_and_light_that_jitters_the_gain",
         (
             "np.sum(basis**2, axis=0)) * scale**2 / 2)",
             "np.sum(basis**2, axis=0)) * scale**2)",
         ),
     ),
     "a dark current without noise": (
-        "test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels",
+        "test_two_exposure_times_give_the_bias_of_pixels_and_light_that_jitters_the_gain",
         (
             "photons = noise.dark_factor * level[",
             "photons = 0.0 * level[",
@@ -521,7 +521,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("apart * _linear_basis(nm)", "0.0 * _linear_basis(nm)"),
     ),
     "a wider line that is narrower": (
-        "test_fit_recovers_another_width_and_wavelength_scale",
+        "test_fit_recovers_values_and_throughput",
         ("slope, bend = (wide - narrow) / (2 * step)", "slope, bend = (narrow - wide) / (2 * step)"),
     ),
     "the light of a second for that of a frame": (

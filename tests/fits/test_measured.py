@@ -15,7 +15,6 @@ from mauvecl import Cooling, Engine, FlareModel, Nuisances, Stare, Study, fit_co
 
 MAUVE = mauvecl.Instrument.load("mauvesim")
 FALLING, STEADY = Cooling(14_000.0, 7000.0, 80.0), Cooling(9000.0, 9000.0, 1.0)
-UNKNOWN = {"dark": np.inf, "light": 0.02}
 #: A stare with a gap whose known conditions change.
 CHANGING: dict[str, Any] = {
     "duration_s": 300.0, "gaps": [(90.0, 115.0)], "thermal": 3.0, "throughput": mauvecl.Sinusoid(0.2, 300.0),
@@ -68,14 +67,11 @@ def test_known_conditions_and_gaps_are_respected() -> None:
     assert along.start_s[0] < 90.0 < 115.0 <= along.start_s[-1]
     assert (found.snr > 0.85 * 20.0).all()
     assert (along.first[1:] >= along.first[:-1] + along.count[:-1]).all()
-    table, edges = along.table(), np.column_stack([along.start_s, along.end_s])
+    edges = np.column_stack([along.start_s, along.end_s])
     rise = 1.5 * mauvecl.SHAPES["davenport2014"].mean_over(edges, 52.0, 40.0)
     for name in ("area", "luminosity bolometric", "filling factor"):
         wanted = [model().values(9000.0, [float(one)])[name] for one in rise]
         np.testing.assert_allclose(found.estimates[:, found.column(name)], wanted, rtol=1e-2)
-    energy = table["luminosity_bolometric"] * (table["end"] - table["start"])
-    np.testing.assert_allclose(table["energy_bolometric"].to("erg"), energy.to("erg"), rtol=1e-9)
-    assert list(table["temperature"].value) == list(found.estimates[:, 0])
     # Without the conditions the flare is another.
     wrong = measure_along(frames, quiet(), model())
     assert np.abs(wrong.found.estimates[:, 0] / 9000.0 - 1).max() > 0.02
@@ -144,15 +140,8 @@ def test_intervals_of_an_open_cooling_contain_their_estimates() -> None:
         ends.append(found.estimates[0, 4])
         assert np.exp(model().log_k[0]) * (1 - 1e-9) <= ends[-1] <= found.estimates[0, 3]
     assert min(ends) < 3010.0
-
-
-@pytest.mark.long
-def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
-    found = fit_cooling(recorded(STEADY, Stare.of(150.0)), quiet(), model(), levels=(0.95,), **START)
-    assert found.estimates[0, :4] == pytest.approx([52.0, 40.0, 1.5, 9000.0], rel=0.01)
-    place = found.column("cooling time")
-    assert np.isinf(found.high[0, 0, place])
-    assert found.low[0, 0, 3] < 9000.0 < found.high[0, 0, 3]
+    steady = fit_cooling(recorded(STEADY, Stare.of(150.0)), x, model(), levels=(0.95,), **START)
+    assert np.isinf(steady.high[0, 0, steady.column("cooling time")])
 
 
 def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
@@ -177,8 +166,7 @@ def test_pointing_drifts_and_jitters_are_unknown_levels_of_light() -> None:
 
     found, jitter = joint(drifting), joint(replace(plain, light_jitter=0.1))
     np.testing.assert_allclose(found.errors, jitter.errors, rtol=1e-9)
-    free = Nuisances.of(quiet(), {"dark": np.inf})
-    assert joint(drifting, nuisances=free).dof == found.dof - 1
+    assert joint(drifting, nuisances=Nuisances.of(quiet(), {"dark": np.inf})).dof == found.dof - 1
 
     def binned(**changes: Any) -> Any:
         stare = Stare.of(150.0, **changes)
@@ -198,7 +186,7 @@ def test_pointing_drifts_and_jitters_are_unknown_levels_of_light() -> None:
 ], ids=["known", "unknown"])  # fmt: skip
 def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine) -> None:
     """Count coverages of nine quantities, squared distances and chi-squared; each side fails in 1e-6 of seeds."""
-    nuisances = Nuisances.of(quiet(), UNKNOWN)
+    nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})
     lit, _ = lit_frames(FALLING, Stare.of(300.0))
     raw = np.stack([engine.realise(one, count=count, seed=700 + k) for k, one in enumerate(lit)], axis=1) * 1.0
     if unknown:

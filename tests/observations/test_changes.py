@@ -6,13 +6,12 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
-import scipy
 from scenes import MG_II, analysed, noisy, paper, source
+from scipy import ndimage, stats
 
 from mauvecl import Engine, Expectation, Frames, Instrument, Nuisances, Sky, Source, Study, analyse, change, expect
 from mauvecl.observations import visits
 
-AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
 MAUVE = Instrument.load("mauvesim")
 
 
@@ -31,11 +30,6 @@ def quiet() -> Expectation:
     return expect(source(), MAUVE, exposure=50.0, sky=Sky.of_brightness(22.1))
 
 
-def test_texts_name_no_exposure_that_rows_do_not_have() -> None:
-    answer = asked("sweep.axes=[{quantity='exposure', values=[10.0, 100.0]}]")
-    assert "50 s" not in " ".join([answer.headline, *(view.title for view in answer.views)])
-
-
 @pytest.mark.parametrize(("number", "fap", "power"), [(30, 0.01, 0.8), (2, 0.05, 0.5), (2, 0.001, 0.95)])
 def test_smallest_changes_have_the_power(number: int, fap: float, power: float) -> None:
     """Draws of visits: 20 000 tests each, within 4 binomial standard errors (once in 16 000 times)."""
@@ -46,7 +40,7 @@ def test_smallest_changes_have_the_power(number: int, fap: float, power: float) 
     one = noise.copy()
     one[:, 1] += row["smallest"]
     scattered = noise + row["smallest_scatter"] * rng.standard_normal((n, number))
-    cut = scipy.stats.chi2.isf(fap, number - 1)
+    cut = stats.chi2.isf(fap, number - 1)
     for values, expected in ((noise, fap), (one, power), (scattered, power)):
         share = np.mean(values.var(axis=1) * number / row["error"] ** 2 > cut)
         assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)
@@ -91,10 +85,8 @@ def test_errors_of_indices_are_those_of_drawn_exposures(engine: Engine, quiet: E
 def spread(nm: np.ndarray, flux: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Convolve a spectrum with a top hat of 10.8 nm and a Gaussian of 10.5 nm on a fine grid, independently."""
     fine = np.arange(nm[0], nm[-1], 0.02)
-    offset = np.arange(-45.0, 45.01, 0.02)
-    gauss = np.exp(-4 * np.log(2) * (offset / 10.5) ** 2)
-    kernel = np.convolve(gauss, np.ones(round(10.8 / 0.02)), mode="same")
-    return np.interp(at, fine, np.convolve(np.interp(fine, nm, flux), kernel / kernel.sum(), mode="same"))
+    square = ndimage.uniform_filter1d(np.interp(fine, nm, flux), round(10.8 / 0.02), mode="constant")
+    return np.interp(at, fine, ndimage.gaussian_filter1d(square, 10.5 / np.sqrt(8 * np.log(2)) / 0.02, mode="constant"))
 
 
 def test_index_and_captured_share_are_those_of_a_direct_integration() -> None:
@@ -151,15 +143,12 @@ def test_recovered_periods_are_those_of_another_periodogram() -> None:
             assert abs(found.recovered[k][j].value - other) < 0.03 + 4 * error, (period, amplitude)
 
 
-@pytest.fixture(scope="module")
-def flat(tmp_path_factory: pytest.TempPathFactory) -> str:
-    star = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")
-    return written(star, tmp_path_factory.mktemp("flat") / "flat.csv")
-
-
 @pytest.mark.parametrize("limits", [(300.0, 301.0), (310.03, 317.58), (400.0, 500.0)])
-def test_bands_have_the_light_between_their_edges(limits: tuple[float, float], quiet: Expectation, flat: str) -> None:
+def test_bands_have_the_light_between_their_edges(
+    limits: tuple[float, float], quiet: Expectation, tmp_path: Path
+) -> None:
     """Compare the share of a flat spectrum in each pixel, added up over wavelengths, with the width of the band."""
+    flat = written(Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test"), tmp_path / "flat.csv")
     rows = asked(f"change.of=['{limits[0]}-{limits[1]}', '150-760']", star=flat).changes
     part, whole = (row.change.counts_dn for row in rows)
     # Each pixel has the band's share of its line function, whose sum over pixels is the band's width.
@@ -170,14 +159,14 @@ def test_bands_have_the_light_between_their_edges(limits: tuple[float, float], q
 
 
 @pytest.mark.parametrize(("name", "edge"), [("balmer jump", 364.6), ("colour", 450.0)])
-def test_changes_below_an_edge_end_there(name: str, edge: float, quiet: Expectation, flat: str) -> None:
-    """Compare with the same change as a band, and find the edge where a pixel has half of the light."""
-    rows = asked(f"change.of=['{name}', '150-{edge}', '150-760']", star=flat).changes
-    below, band, whole = (row.change.counts_dn for row in rows)
+def test_changes_below_an_edge_end_there(name: str, edge: float) -> None:
+    """Compare with the same change as a band; a colour is not linear, and a few magnitudes on a faint star."""
+    changes = asked(f"change.of=['{name}', '150-{edge}']", star="library='M3V', magnitude=16").changes
+    (below, band), (change, light) = zip(*((row.change.counts_dn, row.smallest.one) for row in changes), strict=True)
     unit = 0.4 * np.log(10.0) if name == "colour" else 1.0
     np.testing.assert_allclose(below, unit * band, rtol=1e-9, atol=1e-9 * band.max())
-    share = below / whole / unit
-    assert float(np.interp(0.5, share[::-1], quiet.wavelength_nm[::-1])) == pytest.approx(edge, abs=0.01)
+    assert change == pytest.approx(2.5 * np.log10(1.0 + light) if name == "colour" else light, rel=1e-6)
+    assert change < 10.0 or name != "colour"
 
 
 @pytest.mark.parametrize(
@@ -198,48 +187,30 @@ def test_rows_with_saturated_pixels_are_marked(magnitude: float, none: set[str],
     assert not any("HIDDEN" in text for text in answer.messages)
 
 
-def test_a_colour_of_magnitudes_is_not_linear() -> None:
-    """Check that the faintest star's smallest colour is a few magnitudes, and that of a bright one proportional."""
-    faint, bright = (
-        change(paper(f"star=[{{library='M3V', magnitude={v}}}]", "change.of=['colour', '150-450']"))
-        for v in (16.0, 6.0)
-    )
-    for answer in (faint, bright):
-        colour, band = (row.smallest.one for row in answer.changes)
-        assert colour == pytest.approx(2.5 * np.log10(1.0 + band), rel=1e-6)
-    assert faint.changes[0].smallest.one < 10.0
-
-
-NM = np.linspace(270.0, 290.0, 201)
-LINE = np.exp(-((NM - 280.0) ** 2) / 2 / 0.3**2) / 0.3 / np.sqrt(2 * np.pi)
-
-
-def mg_ii(nm: np.ndarray, flux: np.ndarray, error: np.ndarray | None = None) -> tuple[float, float]:
-    found = visits.line_index(nm, flux, error, **MG_II)
-    return float(found.flux), float(found.error)
-
-
 def test_straight_continuum_is_removed_exactly_and_a_batch_equals_single_spectra() -> None:
+    nm = np.linspace(270.0, 290.0, 201)
     for slope in (0.0, 0.3):
-        found = visits.line_index(NM, 5.0 + slope * (NM - 280) + 2 * LINE, **MG_II)
+        found = visits.line_index(nm, 5.0 + slope * (nm - 280) + 2 * stats.norm.pdf(nm, 280.0, 0.3), **MG_II)
         assert found.flux == pytest.approx(2.0, abs=2e-6)
         assert found.equivalent_width_nm == pytest.approx(0.4, abs=1e-5)
         assert np.isnan(found.error)
     rng = np.random.default_rng(1)
-    flux, error = 5.0 + rng.normal(0, 0.1, (4, NM.size)), rng.uniform(0.05, 0.2, (4, NM.size))
+    flux, error = 5.0 + rng.normal(0, 0.1, (4, nm.size)), rng.uniform(0.05, 0.2, (4, nm.size))
     error[2, 60] = np.nan
-    found = visits.line_index(NM * u.nm, flux, error, **MG_II)
+    found = visits.line_index(nm * u.nm, flux, error, **MG_II)
     for k in range(4):
-        assert (found.flux[k], found.error[k]) == pytest.approx(mg_ii(NM, flux[k], error[k]), rel=1e-12)
+        one = visits.line_index(nm, flux[k], error[k], **MG_II)
+        assert (found.flux[k], found.error[k]) == pytest.approx((one.flux, one.error), rel=1e-12)
 
 
 def test_mg_ii_of_au_mic_lies_in_the_published_range() -> None:
     """20 IUE spectra: 0.6-3.5e-12 erg/s/cm2, median 3.0e-12; formal errors from 1e-13, of long exposures, to 5e-13."""
     found = []
-    for path in sorted(AU_MIC.glob("lp*.txt")):
+    for path in sorted((Path(__file__).parents[1] / "data" / "flares" / "aumic_iue").glob("lp*.txt")):
         angstrom, flux, error = np.loadtxt(path, skiprows=19, usecols=(0, 1, 2)).T
         # Per nm, so that the index is a flux.
-        found.append(mg_ii(angstrom / 10, 10 * flux, 10 * error))
+        one = visits.line_index(angstrom / 10, 10 * flux, 10 * error, **MG_II)
+        found.append((float(one.flux), float(one.error)))
     flux, error = np.array(found).T
     assert flux.size == 20
     assert [round(float(1e12 * x), 1) for x in (flux.min(), np.median(flux), flux.max())] == [0.6, 3.0, 3.5]
@@ -262,10 +233,6 @@ def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
     assert change["p_no_colour"] > 1e-4
 
 
-def electrons(star: Source) -> float:
-    return float(expect(star, MAUVE, exposure=50.0).source_electrons.sum())
-
-
 def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(tmp_path: Path) -> None:
     """The light of a flare of unit amplitude on each star, made by hand, says how large it must be."""
     (tmp_path / "near.csv").write_text("name,separation,magnitude,spectral_type\nB,8,10,M4V\nC,30,12,G2V\nD,60,1,A0V\n")
@@ -278,9 +245,9 @@ def test_analyse_lists_for_each_event_the_flares_that_raise_the_light_as_much(tm
     assert n >= 1
     assert table["star"].tolist() == ["M3V V = 9", "B", "C"] * n
     stars = [source(*one) for one in (("M3V", 9.0), ("M4V", 10.0), ("G2V", 12.0))]
-    light = np.array([electrons(one) for one in stars])
-    shares = np.array([1.0, 0.8, 0.8])
-    rise = shares * (np.array([electrons(one.flaring(1.0)) for one in stars]) - light) / (shares @ light)
+    every, shares = (stars, [one.flaring(1.0) for one in stars]), np.array([1.0, 0.8, 0.8])
+    light, lit = ([expect(one, MAUVE, exposure=50.0).source_electrons.sum() for one in some] for some in every)
+    rise = shares * np.subtract(lit, light) / (shares @ light)
     np.testing.assert_allclose(table["amplitude"], table["ampl_rec"] / np.tile(rise, n), rtol=1e-9)
     duration = [one.fitted_s for one in answer.analysis.events for _ in stars]
     np.testing.assert_allclose(table["equivalent_duration"].to_value("s"), duration / np.tile(rise, n), rtol=1e-9)

@@ -13,7 +13,7 @@ from scipy import stats
 
 from mauvecl import SHAPES, Frames, Study, analyse, read_frames, stare
 from mauvecl.answers.analyse import frame_model
-from mauvecl.observations import events, spectra
+from mauvecl.observations import events, light_curve, spectra
 from mauvecl.observations import frame_model as models
 from mauvecl.observations import search as searches
 
@@ -32,9 +32,7 @@ def element_frames(flux: np.ndarray, error: np.ndarray | None = None) -> Frames:
 
 @cache
 def model() -> Any:
-    found = frame_model(STUDY, element_frames(np.ones((N, 48))))
-    assert not isinstance(found, str), found
-    return found
+    return frame_model(STUDY, element_frames(np.ones((N, 48))))
 
 
 @cache
@@ -62,21 +60,22 @@ def prepared(frames: Frames, **how: Any) -> tuple[Any, Any, Any]:
     return series.cleaned, survey, series
 
 
-@pytest.fixture(scope="module")
-def threshold() -> float:
-    survey = prepared(drawn(np.random.default_rng(1)))[1]
-    rates = searches.simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), 20.0, 1)
-    return max(rate.threshold(20.0) for rate in rates)
+def survey_of_spectra(rng: np.random.Generator) -> Any:
+    return prepared(drawn(rng))[1]
 
 
-@pytest.mark.long
-def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> None:
-    frames = drawn(np.random.default_rng(2))
-    for key, changed in (("unit", {"unit": "K"}), ("wavelength", {"wavelength_nm": frames.wavelength_nm + 7})):
-        answer = analyse(STUDY, frames=replace(frames, **changed))  # type: ignore[arg-type]
-        assert answer.analysis.spectra is None
-        (line,) = (one for one in answer.messages if "searched as their sum over wavelength" in one)
-        assert key in line
+def survey_of_light(rng: np.random.Generator) -> Any:
+    """Return a survey of 600 frames of a minute with white noise."""
+    frames = scenes.noisy(rng, np.arange(600) * 60.0, np.full(600, 1000.0), 5.0)
+    return light_curve.survey_light_curve(frames, SHAPES["davenport2014"], 1)[0]
+
+
+@cache
+def threshold_of(survey_of: Any, rate: float) -> float:
+    """Return the threshold above which noise has a rate of events per star-day."""
+    survey = survey_of(np.random.default_rng(1))
+    rates = searches.simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), rate, 1)
+    return max(one.threshold(rate) for one in rates)
 
 
 @cache
@@ -93,7 +92,6 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
     nm = counts.wavelength_nm
     standard = Study(star=[{"library": "B2IV", "magnitude": 9.0}])
     there = frame_model(standard, counts)
-    assert not isinstance(there, str)
     source = standard.star[0].source()
     edges = np.column_stack([nm - 5.25, nm + 5.25])
     mean = [np.interp(np.linspace(*edge, 200), source.wavelength_nm, source.flux_flam).mean() for edge in edges]
@@ -102,36 +100,36 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
     factor = values / (there.bins @ (electrons * there.quiet.gain_dn_per_electron) * there.per_dn)
     fluxes = replace(counts, flux=counts.flux * factor, error=counts.error * factor, unit=unit)
     other = analyse(STUDY, frames=fluxes)
-    assert other.analysis.spectra is not None, other.messages
     row, same = (max(answer.rows, key=lambda each: each.event.value) for answer in (one, other))
     assert row.verdict == same.verdict == "detected"
     assert same.event.value == pytest.approx(row.event.value, rel=0.02)
     assert abs(same.event.brightest - row.event.brightest) <= 1
     for name in ("temperature", "energy bolometric"):
-        estimate, low, high = row.quantity(name)
+        _, low, high = row.quantity(name)
         assert low < same.quantity(name)[0] < high, name
-        assert estimate > 0
 
 
-def test_noise_per_pixel_lies_within_its_range_and_departures_are_used() -> None:
-    """95 % of pixels within their ranges; the binomial bound fails by chance once in ten thousand times."""
+def test_noise_per_pixel_lies_within_its_range_and_sums_have_covariance_one_however_errors_are_stated() -> None:
+    """95 % of pixels are within their ranges; the binomial bound fails by chance once in ten thousand times.
+
+    In the last frames the noise is 1.4 times what is stated. Covariances have standard errors of 0.05, 5 allowed.
+    """
     rng = np.random.default_rng(300)
-    noises = [prepared(drawn(rng))[2].noise for _ in range(12)]
+    found = [prepared(drawn(rng, scale=scale)) for scale in (*np.ones(12), 1.4)]
+    noises = [series.noise for *_, series in found[:-1]]
     outside = sum(int(((one.measured < one.low) | (one.measured > one.high)).sum()) for one in noises)
     low, high = stats.binom.ppf([5e-5, 1 - 5e-5], sum(one.measured.size for one in noises), 0.05)
     assert low <= outside <= high
+    for _, survey, _ in found[-2:]:
+        steps = np.diff(survey.sums / np.sqrt(survey.variance)[:, None], axis=0) / np.sqrt(2)
+        np.testing.assert_allclose(steps.T @ steps / len(steps), np.eye(steps.shape[1]), atol=5 * 0.05)
+    searched = [rho for _, survey, _ in found[:5] for _, rho in survey.search.values(survey.sums[None])]
+    # The mean square of all statistics has a standard error of 0.06.
+    assert np.mean(np.concatenate([rho[np.isfinite(rho)] for rho in searched]) ** 2) == pytest.approx(1.0, abs=0.3)
     scale = np.where(np.arange(light().size) == 20, 1.5, 1.0)
     noise = prepared(drawn(rng, scale=scale))[2].noise
     assert np.flatnonzero(noise.departs).tolist() == [20]
     assert noise.used[20] / noise.stated[20] == pytest.approx(1.5, rel=0.1)
-
-
-def test_sums_of_quiescent_frames_have_covariance_one_however_the_errors_are_stated() -> None:
-    """Also where the noise is 1.4 times what is stated; standard errors of 0.03 of each covariance, 5 allowed."""
-    for scale in (1.0, 1.4):
-        _, survey, _ = prepared(drawn(np.random.default_rng(301), scale=scale))
-        steps = np.diff(survey.sums / np.sqrt(survey.variance)[:, None], axis=0) / np.sqrt(2)
-        np.testing.assert_allclose(steps.T @ steps / len(steps), np.eye(steps.shape[1]), atol=5 * 0.05)
 
 
 def test_jitter_of_the_dark_current_is_measured_and_marginalised_over() -> None:
@@ -149,24 +147,19 @@ def test_jitter_of_the_dark_current_is_measured_and_marginalised_over() -> None:
 @pytest.mark.parametrize("loss", [0.0005, 0.1])
 def test_statistics_do_not_depend_on_changes_of_the_light_however_small(loss: float) -> None:
     """The noise model and the mean spectrum are estimated from the frames and differ by some of the loss."""
-    at = np.random.default_rng(317).random(N) < 0.3
+    at, frames = np.random.default_rng(317).random(N) < 0.3, drawn(np.random.default_rng(318))
     maxima = []
     for lost in (0.0, loss):
-        frames = drawn(np.random.default_rng(318))
         flux = frames.flux - lost * np.outer(at, light())
         _, survey, series = prepared(element_frames(flux, frames.error))
         assert series.jitters == {"light": np.inf}
         maxima.append(survey.search.largest(survey.sums[None])[0])
+        # Two amplitudes, of flare and star, are fitted to a frame: the closed form of their covariance.
+        flares = model().flares(survey.templates.temperatures_k) / series.noise.used
+        star = series.light / series.noise.used
+        correlations = flares @ star / np.linalg.norm(flares, axis=1) / np.linalg.norm(star)
+        assert series.snr_kept == pytest.approx(np.median(np.sqrt(1 - correlations**2)), abs=1e-9)
     assert maxima[1] == pytest.approx(maxima[0], abs=0.01 + 2 * loss)
-
-
-def test_share_of_the_signal_that_a_free_level_leaves() -> None:
-    """Two amplitudes, of flare and star, are fitted to a frame: the closed form of their covariance."""
-    frames = drawn(np.random.default_rng(319))
-    _, survey, series = prepared(frames)
-    flares, star = model().flares(survey.templates.temperatures_k) / series.noise.used, series.light / series.noise.used
-    correlations = flares @ star / np.linalg.norm(flares, axis=1) / np.linalg.norm(star)
-    assert series.snr_kept == pytest.approx(np.median(np.sqrt(1 - correlations**2)), abs=1e-9)
     assert prepared(frames, jitters={"light": 1e-6})[2].snr_kept == pytest.approx(1.0, abs=1e-6)
 
 
@@ -216,13 +209,10 @@ def test_counts_with_and_without_bias_and_dark_current_are_distinguished() -> No
     summed = replace(raw_frames(raw), flux=elements, wavelength_nm=quiet.element_wavelength_nm)
     for frames in (raw_frames(raw), summed, raw_frames(raw - quiet.bias_dn - quiet.dark_dn)):
         found = frame_model(STUDY, frames)
-        assert not isinstance(found, str)
         assert found.raw == (np.median(frames.flux) > np.median(quiet.bias_dn))
         levels.append(float(np.median(models.clean_spectra(frames, found).frames.white_light[0])))
         # A star far brighter than bias and dark current, which are known to be subtracted.
-        net = frame_model(STUDY, replace(frames, net=True))
-        assert not isinstance(net, str)
-        assert not net.raw
+        assert not frame_model(STUDY, replace(frames, net=True)).raw
     assert levels[1:] == pytest.approx(levels[:2], rel=1e-6)
     # The noise of 40 frames is 1 % of the light.
     assert levels[0] == pytest.approx(quiet.light_dn.sum(), rel=0.06)
@@ -233,7 +223,6 @@ def test_light_of_a_second_is_that_of_frames_of_any_exposure(exposure_s: float) 
     """Also where an exposure is no multiple of the instrument's frames, such as by the rounding of its times."""
     frames = element_frames(np.ones((N, 48)))
     other = frame_model(STUDY, replace(frames, exposure_s=np.full(N, exposure_s)))
-    assert not isinstance(other, str)
     quiet = other.bins @ other.quiet.light_dn * other.per_dn
     assert quiet == pytest.approx(light(), rel=1e-9)
     # The variance of two exposures, and what a raw one has besides the star.
@@ -247,69 +236,42 @@ def test_light_of_a_second_is_that_of_frames_of_any_exposure(exposure_s: float) 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("kind", "spectrum", "size"), [("throughput", "light", 0.3), ("dark current", "dark", 1.5), ("flare", "", 0.5)]
-)
-def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, size: float) -> None:
-    """A rise of five minutes: of the throughput, the detector's temperature, or a flare."""
+def test_dark_current_one_pixel_of_several_frames_and_single_frames_are_no_flares() -> None:
+    """A detector that is warm for five minutes; only weighted sums show the single frame of ultraviolet light."""
     shape = flare(1800.0, 90.0, 1.0).sum(axis=1) / light().sum()
-    added = flare(1800.0, 90.0, size) if not spectrum else size * np.outer(shape, model().unknowns(light())[spectrum])
-    frames = drawn(np.random.default_rng(305), added)
-    analysis = analyse(Study(star=STAR, search=OFTEN | {"frame": {"light": 1e-6}}), frames=frames).analysis
+    added, ultraviolet = 1.5 * np.outer(shape, model().unknowns(light())["dark"]), model().flares((30_000.0,))[0]
+    added[100:106, 5] += 12 * np.sqrt(model().variance(light())[5])
+    added[650] += 9 / np.sqrt((ultraviolet**2 / model().variance(light())).sum()) * ultraviolet
+    study = Study(star=STAR, search=OFTEN | {"frame": {"light": 1e-6}})
+    answer = analyse(study, frames=drawn(np.random.default_rng(305), added))
+    analysis = answer.analysis
     event, found = max(zip(analysis.events, analysis.event_spectra, strict=True), key=lambda pair: pair[0].value)
     assert abs(analysis.survey.time_s[event.brightest] - 1800.0) < 60
-    assert (event.kind, found.cause) == (kind, kind)
-    assert (found.reason == "") == (kind == "flare")
+    assert event.kind == found.cause == "dark current"
+    assert found.reason
+    assert [event.kind for event in analysis.events if event.first <= 105 and event.last >= 100] == ["cosmic ray"]
+    assert str(answer.frames["reason"][650]) == "spike"
 
 
 @pytest.mark.long
-def test_one_pixel_of_several_frames_and_single_frames_are_no_flares() -> None:
-    """Only the weighted sums show the single frame of ultraviolet light."""
-    added, ultraviolet = np.zeros((N, light().size)), model().flares((30_000.0,))[0]
-    added[300:306, 5] = 12 * np.sqrt(model().variance(light())[5])
-    added[400] = 9 / np.sqrt((ultraviolet**2 / model().variance(light())).sum()) * ultraviolet
-    answer = analyse(STUDY, frames=drawn(np.random.default_rng(306), added))
-    near = [event for event in answer.analysis.events if event.first <= 305 and event.last >= 300]
-    assert [event.kind for event in near] == ["cosmic ray"]
-    assert str(answer.frames["reason"][400]) == "spike"
-
-
-@pytest.mark.long
-def test_false_alarms_are_as_many_as_promised(threshold: float) -> None:
-    """20 a star-day, level, noise and jitters estimated from the frames; fails by chance once in a thousand times."""
-    rng, count, days = np.random.default_rng(308), 0, 0.0
-    for _ in range(60):
-        _, survey, _ = prepared(drawn(rng))
-        count += len(events.detect_events(survey, threshold)[0])
+@pytest.mark.parametrize(("survey_of", "rate", "number", "seed"), [
+    (survey_of_spectra, 20.0, 60, 308), (survey_of_light, 2.0, 250, 290),
+], ids=["spectra", "light"])  # fmt: skip
+def test_false_alarms_are_as_many_as_promised(survey_of: Any, rate: float, number: int, seed: int) -> None:
+    """Level, noise and jitters are estimated from the frames; fails by chance once in a thousand times."""
+    rng, count, days = np.random.default_rng(seed), 0, 0.0
+    for _ in range(number):
+        survey = survey_of(rng)
+        count += len(events.detect_events(survey, threshold_of(survey_of, rate))[0])
         days += survey.stare.observed_s / 86_400
-    low, high = stats.poisson.ppf([0.0005, 0.9995], 20.0 * days)
+    # The threshold has a standard error of some 3 %, and an estimated noise makes alarms more frequent: by
+    # exp(u^2 s^2 / 2) u^2 of 4 % in the noise.
+    low, high = stats.poisson.ppf([0.0005, 0.9995], rate * days)
     assert 0.9 * low < count < 1.15 * high
 
 
 @pytest.mark.long
-def test_detection_rate_follows_the_signal_to_noise() -> None:
-    """Flares of one size: the statistic is normal about its S/N; the binomial bound fails once in a thousand times."""
-    rng, above = np.random.default_rng(309), 5.0
-    _, survey, _ = prepared(drawn(rng))
-    unit = survey.templates.directions[np.argmin(np.abs(np.array(survey.templates.temperatures_k) - 10_000))]
-    # The template of 48 s is near enough to flares of 48 s; the line under the flare is fitted, which costs S/N.
-    row = min(survey.search.rows, key=lambda each: abs(each.template.half_width_s - 48.0))
-    power = float(np.median(row.per_amplitude[row.per_amplitude > 0]))
-    size = (above + 0.5) / (power * float(np.linalg.norm(unit)))
-    seen, number = 0, 40
-    for _ in range(number):
-        peak = rng.uniform(900, 2700)
-        _, survey, _ = prepared(drawn(rng, flare(peak, row.template.half_width_s, size)))
-        best, rho = max(survey.search.values(survey.sums[None]), key=lambda pair: pair[1].max())
-        at = survey.search.peaks_s(best)[rho[0].max(axis=0).argmax()]
-        seen += rho.max() >= above and abs(at - peak) < 120
-    expected = stats.norm.sf(-0.5)
-    low, high = stats.binom.ppf([0.0005, 0.9995], number, [expected - 0.03, expected + 0.12])
-    assert low <= seen <= high
-
-
-@pytest.mark.long
-def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
+def test_intervals_of_temperature_and_energy_cover() -> None:
     """Flares of S/N 20-100 on a star that drifts by 5 % an hour; each bound fails once in a thousand times."""
     # Intervals allow for drifts that noise may hide: those of 68 % may cover 90 %; without, 53 % held the truth.
     rng = np.random.default_rng(310)
@@ -320,11 +282,10 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
         added = flare(rng.uniform(900, 2700), rng.uniform(30, 90), size, kelvin)
         drift = rng.choice([-0.05, 0.05]) * (TIME - TIME.mean()) / 3600
         _, survey, series = prepared(drawn(rng, added + np.outer(drift, light())))
-        found, taken = events.detect_events(survey, threshold)
+        found, taken = events.detect_events(survey, threshold_of(survey_of_spectra, 20.0))
         one = max(found, key=lambda each: each.value)
         assert spectra.event_spectrum(survey, series, taken, one).cause == "flare"
         measured = spectra.measure_flare(survey, series, taken, one)
-        assert not isinstance(measured, str), measured
         # What the flare adds in the frames of the event: its part of the amplitude, of the model's energy of a frame.
         flares = model().flare.values(kelvin, [1.0])
         frame = model().flares((kelvin,))[0].sum()
@@ -355,6 +316,12 @@ def test_drifts_are_measured_next_to_a_short_event() -> None:
 @pytest.mark.long
 def test_answer_states_measurements_or_why_there_are_none() -> None:
     frames, answer = analysed_counts()
+    # Frames of other wavelengths or units are searched in white light.
+    for key, changed in (("unit", {"unit": "K"}), ("wavelength", {"wavelength_nm": frames.wavelength_nm + 7})):
+        white = analyse(STUDY, frames=replace(frames, **changed))  # type: ignore[arg-type]
+        assert white.analysis.spectra is None
+        (line,) = (one for one in white.messages if "searched as their sum over wavelength" in one)
+        assert key in line
     k = int(np.argmax([row.event.value for row in answer.rows]))
     # The printed table of events fits into 80 columns, with the lines of a terminal.
     assert max(map(len, str(answer.views[0]).splitlines()[1:])) <= 73
@@ -382,37 +349,34 @@ def test_verdicts_on_a_rise_of_the_throughput_and_on_flares(rise: float, search:
     rows = [row for row in answer.rows if row.event.value > 5.0]
     found = {round(float(row.analysis.survey.time_s[row.event.brightest]), -2): row.verdict for row in rows}
     assert {at: found.get(at) for at in expected} == expected
+    causes = {"rejected": "throughput", "detected": "flare"}
+    assert all(row.event.kind == causes[row.verdict] for row in rows if row.verdict in causes)
     assert [said in line for line in answer.messages if "search.frame.light" in line] == [True] * bool(said)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
-def test_flare_in_a_stare_with_a_drifting_detector_has_its_time_and_duration(seed: int, tmp_path: Path) -> None:
+def test_flare_in_a_stare_with_a_drifting_detector_has_its_time_and_duration(tmp_path: Path) -> None:
     """The dark current exceeds star and flare in the sum over wavelength; an interval fails for one seed in 20."""
-    drawn = stare(star="AD Leo", amplitude=0.9, duration=3600, seed=seed)
+    drawn = stare(star="AD Leo", amplitude=0.9, duration=3600, seed=1)
     light = drawn.stares[0].light
     assert np.ptp(light.flux[:, 0]) > 2 * light.mean[:, 0].mean()
     drawn.write(tmp_path)
     frames = read_frames(tmp_path / "light-curve-1.fits")
-    # Whether durations are stated does not depend on the seed.
-    for star in ({"star": "AD Leo"}, {})[: 2 if seed == 1 else 1]:
-        answer = analyse(frames=frames, **star)
+    known, unknown = (analyse(frames=frames, **star) for star in ({"star": "AD Leo"}, {}))
+    for answer in (known, unknown):
         assert any("dark current changes the sum over wavelength" in line for line in answer.messages)
         (flare,) = answer.events[answer.events["kind"] == "flare"]
         assert flare["tpeak"].to_value("s") == pytest.approx(drawn.events["peak_time"][0].to_value("s"), abs=10)
         assert np.isnan(flare["ampl_rec"])
-        if not star:
-            assert np.isnan(flare["ed"])
-            assert "limits" not in answer.tables
-            continue
-        model = frame_model(Study.of(**star), frames)
-        quiet = model.quiet
-        star_dn = quiet.n_frames * quiet.gain_dn_per_electron * quiet.source_electrons
-        all_light = float(model.flares((1e4,)).sum() / (model.bins @ star_dn * model.per_dn).sum())
-        truth_s = all_light * drawn.events["equivalent_duration"][0].to_value("s")
-        assert flare["ed_low_95"].to_value("s") < truth_s < flare["ed_high_95"].to_value("s")
-        assert flare["ed_high_95"] < 1.3 * flare["ed_low_95"]
-        assert {"limits", "completeness"} <= set(answer.tables)
+        assert np.isnan(flare["ed"]) == (answer is unknown)
+        assert len({"limits", "completeness"} & set(answer.tables)) == (0 if answer is unknown else 2)
+    model = frame_model(Study.of(star="AD Leo"), frames)
+    star_dn = model.quiet.n_frames * model.quiet.gain_dn_per_electron * model.quiet.source_electrons
+    all_light = float(model.flares((1e4,)).sum() / (model.bins @ star_dn * model.per_dn).sum())
+    truth_s = all_light * drawn.events["equivalent_duration"][0].to_value("s")
+    (flare,) = known.events[known.events["kind"] == "flare"]
+    assert flare["ed_low_95"].to_value("s") < truth_s < flare["ed_high_95"].to_value("s")
+    assert flare["ed_high_95"] < 1.3 * flare["ed_low_95"]
 
 
 #: Of sudden changes of the light that all pixels share.
@@ -450,9 +414,7 @@ def test_loss_and_return_are_found_at_their_frames_with_their_size() -> None:
     for one, truth in ((down, 200), (up, 400)):
         assert abs(one.frame - truth) <= 2
         assert abs(one.change) == pytest.approx(0.3, abs=5 * one.error)
-
-
-def test_changes_of_another_colour_or_over_gaps_and_in_frames_left_out_are_none() -> None:
+    # Changes of another colour, over gaps and in frames that are left out are none.
     course = np.exp(-np.maximum(EVERY - 300.0, 0) / 40.0) * (EVERY >= 300)
     for other in OTHERS:
         assert changes(402, 5 * float(RED.sum() / other.sum()) * np.outer(course, other)) == []

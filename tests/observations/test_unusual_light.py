@@ -12,48 +12,38 @@ from scenes import PER_MONTH, analysed, detected, flare, noisy
 
 from mauvecl import SHAPES, Frames, Study, analyse
 from mauvecl.observations import events, light_curve
-from mauvecl.observations.search import SeriesSurvey
 
 DURATION = SHAPES["davenport2014"].equivalent_duration
 
 
-@pytest.mark.parametrize(
-    ("half_width_s", "after", "amplitude", "window", "seed"),
-    long_but([(60.0, 1.5, 60.0, 12.0, 1), (90.0, 1.2, 200.0, 11.0, 4), (60.0, 0.7, 5.0, 12.0, 5)],
-             (60.0, 1.5, 60.0, 12.0, 1)),
-)  # fmt: skip
-def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
-    half_width_s: float, after: float, amplitude: float, window: float, seed: int
+#: Size, peak and half-width of each flare, in s: tails without their peak, two that look like one, one on a faint star.
+TAILS = ((60.0, -90.0, 60.0),), ((200.0, -108.0, 90.0),), ((5.0, -42.0, 60.0),)
+TWO, GREAT = ((0.218, 284.0, 88.0), (0.191, 406.0, 102.0)), ((120.0, 900.0, 90.0),)
+
+
+@pytest.mark.parametrize(("n", "flares", "noise", "often", "seed"), long_but([
+    (144, TAILS[0], 5e-3, 3.0, (501, 1)), (198, TAILS[1], 5e-3, 3.0, (501, 4)), (144, TAILS[2], 5e-3, 3.0, (501, 5)),
+    (197, TWO, 1.2e-3, 1.0, (508, 1)), (197, TWO, 1.2e-3, 1.0, (508, 2)), (340, GREAT, 5.5 / 30.4, 1.0, (403,)),
+], (144, TAILS[0], 5e-3, 3.0, (501, 1)), (197, TWO, 1.2e-3, 1.0, (508, 1))))  # fmt: skip
+def test_flares_that_windows_cut_or_join_have_their_energies(
+    n: int, flares: Any, noise: float, often: float, seed: tuple[int, ...]
 ) -> None:
-    """Observe 11 to 15 half-widths after the peak; five standard errors, exceeded once in 1.7 million cases."""
-    time = (np.arange(round(window * half_width_s / 5.0)) + 0.5) * 5.0
-    light = 1 + amplitude * flare(time, 5.0, -after * half_width_s, half_width_s)
-    # Rarer false alarms take long to simulate for windows this short.
-    analysis = analysed(noisy([501, seed], time, light, 5e-3), false_alarms=3.0).analysis
-    event = max(analysis.events, key=lambda one: one.value)
-    assert (event.first, event.cut, event.kind) == (0, True, "flare")
-    assert event.value > analysis.threshold
-    truth = amplitude * half_width_s * DURATION
-    assert abs(event.fitted_s - truth) < 2.5 * (event.high_s[0] - event.low_s[0])
+    """Five standard errors of the energy, exceeded once in 1.7 million cases.
 
-
-@pytest.mark.parametrize("seed", long_but([1, 2], 1))
-def test_two_flares_that_look_like_one_are_fitted_as_two(seed: int) -> None:
-    """A third, longer than the window, must not stand for either; five standard errors of the energy."""
-    time = (np.arange(197) + 0.5) * 5.0
-    peaks, widths, sizes = (284.0, 406.0), (88.0, 102.0), (0.218, 0.191)
-    light = sum(size * flare(time, 5.0, *one) for *one, size in zip(peaks, widths, sizes, strict=True))
-    event = max(analysed(noisy([508, seed], time, 1 + light, 1.2e-3)).analysis.events, key=lambda one: one.value)
-    assert sorted(one.peak_s for one in event.flares) == pytest.approx(peaks, abs=8.0)
-    truth = DURATION * sum(size * width for size, width in zip(sizes, widths, strict=True))
-    assert abs(event.fitted_s - truth) < 2.5 * (event.high_s[0] - event.low_s[0])
-
-
-def constant_star() -> SeriesSurvey:
-    """Return the survey of 400 frames of independent noise as stated."""
-    frames = noisy(521, np.arange(400) * 20.0, np.full(400, 1e3), 1.0)
-    every, shape = np.ones(400, np.bool_), SHAPES["davenport2014"]
-    return SeriesSurvey.of(frames, frames.flux, np.ones(400), every, level=1e3, photon=0.0, shape=shape)
+    A third flare, longer than the window, must not stand for two. The energy is relative to the level, whose error is
+    that of a great flare on a faint star. Rarer false alarms take long to simulate for windows this short.
+    """
+    time = (np.arange(n) + 0.5) * 5.0
+    light = 1 + sum(size * flare(time, 5.0, *one) for size, *one in flares)
+    analysis = analysed(noisy(seed, time, light, noise), false_alarms=often).analysis
+    event, peaks = max(analysis.events, key=lambda one: one.value), [peak for _, peak, _ in flares]
+    assert (event.kind, event.value > analysis.threshold) == ("flare", True)
+    assert (event.first == 0) == (peaks[0] < 0)
+    assert event.cut or peaks[0] > 0
+    assert peaks[0] < 0 or sorted(one.peak_s for one in event.flares) == pytest.approx(peaks, abs=8.0)
+    error = (event.high_s[0] - event.low_s[0]) / 2
+    assert abs(event.fitted_s - DURATION * sum(size * width for size, _, width in flares)) < 5 * error
+    assert flares is not GREAT or 0.005 < error / event.fitted_s < 0.03
 
 
 @pytest.mark.parametrize("longer", [False, True])
@@ -61,15 +51,18 @@ def test_alternation_that_repeats_its_rounds_has_the_same_end_from_each(longer: 
     """Which of them came last had depended on the first guess, and so on the last digits of the light."""
     inside = [(np.arange(400) >= 200) & (np.arange(400) < last) for last in (210, 300)]
 
-    def detect(survey: SeriesSurvey, *_: Any) -> Any:
+    def detect(survey: light_curve.SeriesSurvey, *_: Any) -> Any:
         return [], inside[survey.level == 210]
 
-    def fit(survey: SeriesSurvey, quiet: Any, *_: Any) -> SeriesSurvey:
+    def fit(survey: light_curve.SeriesSurvey, quiet: Any, *_: Any) -> light_curve.SeriesSurvey:
         return replace(survey, level=float(400 - quiet.sum() + 200))
 
+    frames, every = noisy(521, np.arange(400) * 20.0, np.full(400, 1e3), 1.0), np.ones(400, np.bool_)
+    how: Any = {"level": 1e3, "photon": 0.0, "shape": SHAPES["davenport2014"]}
+    star = light_curve.SeriesSurvey.of(frames, frames.flux, np.ones(400), every, **how)
     monkeypatch.setattr(light_curve, "detect_events", detect)
     monkeypatch.setattr(light_curve, "_fit_processes", fit)
-    fitted, found = light_curve.alternate(constant_star(), inside[longer], None, light_curve.UNREPORTED)
+    fitted, found = light_curve.alternate(star, inside[longer], None, light_curve.UNREPORTED)
     assert (fitted.level, found.sum()) == (300, 10)
 
 
@@ -130,15 +123,6 @@ def test_missing_frames_that_may_have_held_a_peak_are_stated(missing: bool) -> N
 
 
 @pytest.mark.long
-def test_bumps_of_every_orbit_are_no_flares() -> None:
-    """Observe eight orbits in each of which the light rises and falls smoothly, by changing sizes."""
-    phase = np.arange(1520) * 30.0 / 5700.0 + 0.3
-    bump = np.exp(4 * (np.cos(2 * np.pi * phase) - 1)) * (1 + 0.2 * np.sin(2 * np.pi * (0.12 * phase + 0.4)))
-    answer = analysed(noisy([505, 1], phase * 5700.0, 1 + 0.012 * bump, 2e-4))
-    assert "detected" not in set(answer.events["verdict"])
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("seed", [4, 5])
 def test_flares_on_sharp_rotation_in_long_frames_are_detected(seed: int) -> None:
     """Find all bright of 16 flares and nothing else on three harmonics, where three frames of ten are flagged."""
@@ -183,9 +167,8 @@ def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
     period, spots = 1.37 * 86_400, rng.uniform(0.01, 0.03)
     phase = (time / period + rng.uniform()) % 1
     turn = 2 * np.pi * (time / (period * rng.uniform(0.97, 1.03)) + rng.uniform())
-    depth = np.zeros(time.size)
-    for middle, size in ((0.25, 0.12), (0.75, 0.05)):
-        depth += size * np.clip(1.3 * (1 - np.abs(phase - middle) / 0.05), 0, 1)
+    eclipses = ((0.25, 0.12), (0.75, 0.05))
+    depth = sum(size * np.clip(1.3 * (1 - np.abs(phase - middle) / 0.05), 0, 1) for middle, size in eclipses)
     light = (1 + spots * (np.sin(turn) + rng.uniform(0, 0.7) * np.sin(2 * turn + 1))) * (1 - depth)
     for size, peak in zip(np.geomspace(0.008, 0.15, 5), rng.uniform(0.03, 0.97, 5) * time[-1], strict=True):
         light += size * flare(time, frame_s, peak, rng.uniform(200, 1000))
@@ -195,20 +178,6 @@ def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
     assert answer.analysis.crowded
     assert "detected" not in set(answer.events["verdict"])
     assert any("eclipses" in message and "no verdicts" in message for message in answer.messages)
-
-
-@pytest.mark.long
-def test_dips_at_random_are_no_flares() -> None:
-    """Observe dips of 2 to 30 %; a message says what to do only where most frames are in events."""
-    rng, frame_s = np.random.default_rng([503, 2]), 1800.0
-    time = np.arange(1200) * frame_s
-    flux = np.ones(time.size)
-    for middle in rng.uniform(0, time[-1], 38):
-        flux *= 1 - rng.uniform(0.02, 0.3) * np.exp(-(((time - middle) / (rng.uniform(0.05, 0.3) * 86_400)) ** 4))
-    answer = analyse(Study().paper(), frames=noisy(rng, time, flux, 1e-3, exposure_s=frame_s))
-    assert "detected" not in set(answer.events["verdict"])
-    messages = [one for one in answer.messages if "no verdicts" in one and "mapping" in one]
-    assert len(messages) == int(answer.analysis.in_events > 0.5)
 
 
 @pytest.mark.long
@@ -226,33 +195,6 @@ def test_light_that_the_process_does_not_describe_has_no_verdicts() -> None:
     (message,) = [one for one in answer.messages if "no verdicts" in one]
     # Smaller dips than candidates are not searched.
     assert f"an S/N of up to {max(analysis.dip, analysis.candidates):.3g}:" in message
-
-
-@pytest.mark.long
-def test_sudden_flares_of_a_few_frames_that_decay_exponentially_have_their_energies() -> None:
-    """Observe six flares and a step in a gap; fewer than 4 of 6 intervals of 95 % hold the truth once in 400 times."""
-    frame_s, inside, noise, day = 600.0, 0, 6e-4, 86_400.0
-    rng = np.random.default_rng([505, 1])
-    time = np.concatenate([np.arange(0, 25 * day, frame_s), np.arange(27.3 * day, 52 * day, frame_s)])
-    turn = 2 * np.pi * time / (3.1 * day)
-    flux = 1 + 0.02 * np.sin(turn) + 0.007 * np.sin(2 * turn + 2)
-    late = time > 26 * day
-    flux[late] *= 1.08
-    flares = []
-    for peak_d, amplitude, decay_s in (
-        (4.2, 0.03, 900), (8, 0.04, 400), (12, 0.01, 1500), (31, 0.05, 600), (38, 0.03, 600), (44, 0.008, 3000)
-    ):  # fmt: skip
-        peak = (peak_d + 0.1 * rng.uniform()) * day
-        left = [np.exp(-np.maximum(time + shift - peak, 0) / decay_s) for shift in (0, frame_s)]
-        flux += amplitude * decay_s * (left[0] - left[1]) / frame_s
-        flares.append((peak, amplitude * decay_s / (1.08 if peak_d > 26 else 1)))
-    events = analyse(Study().paper(), frames=noisy(rng, time, flux, noise, exposure_s=frame_s)).events
-    for peak, duration in flares:
-        near = np.abs(events["tpeak"].to_value("s") - peak) < 2 * frame_s
-        assert near.any()
-        low, high = (float(events[name].to_value("s")[near][0]) for name in ("ed_low_95", "ed_high_95"))
-        inside += low < duration < high
-    assert inside >= 4
 
 
 @pytest.mark.long
@@ -286,7 +228,10 @@ BESIDE = ((3.7, 1500.0, 0.012), (14.4, 900.0, 0.02), (25.5, 1800.0, 0.03), (34.2
 
 @pytest.mark.parametrize("turns", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
-    """A constant star and one that turns: 1.4 false alarms are promised, seven or more occur once in 1600 cases."""
+    """A constant star and one that turns: 1.4 false alarms are promised, seven or more occur once in 1600 cases.
+
+    Durations are relative to the level at the flare, within five standard errors.
+    """
     time, truth = np.arange(N_FRAMES) * FRAME_S, np.ones(N_FRAMES)
     if turns:
         angle, slow = 2 * np.pi * time / (1.158 * DAY_S), 2 * np.pi * time / (70 * DAY_S)
@@ -297,7 +242,6 @@ def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
     answer = analysed(noisy([507, int(turns)], time, light, NOISE), per="month")
     said = " ".join(answer.messages)
     largest = re.search(r"The level changes 3 times suddenly .* by (\S+) % at the most", said)
-    assert largest is not None
     assert float(largest[1]) == pytest.approx(10.0, abs=0.3)
     # The scatter of the light without the steps.
     stated = re.search(r"standard deviation of (\S+) %, by .*rotation", said)
@@ -307,7 +251,10 @@ def test_flares_beside_steps_of_the_level_are_detected(turns: bool) -> None:
     assert re.search(rates, answer.views[0].title)
     found = answer.events[answer.events["verdict"] == "detected"]
     start, stop = (found[name].to_value("d") for name in ("tstart", "tstop"))
-    assert all(((start <= peak) & (peak <= stop)).any() for peak, *_ in BESIDE)
+    for peak, half_width, size in BESIDE:
+        (row,) = found[(start <= peak) & (peak <= stop)]
+        duration = size * half_width * DURATION / truth[round(peak * DAY_S / FRAME_S)]
+        assert abs(row["ed"].to_value("s") - duration) < 2.5 * (row["ed_high"] - row["ed_low"]).to_value("s")
     assert len(found) <= len(BESIDE) + 6
     level = np.asarray(answer.frames["level"], float)
     near = np.concatenate([[first - 1, first] for first in STEPS])
@@ -325,6 +272,5 @@ def test_changes_that_do_not_last_are_no_steps(what: str) -> None:
     }[what]
     answer = analysed(noisy(508, time, 1 + light, NOISE), per="month")
     assert not any("for a day or more" in message for message in answer.messages)
-    assert (what == "long flare") == any(
-        str(row["verdict"]) == "detected" and row["value"] > 20 for row in answer.events
-    )
+    seen = [row for row in answer.events if row["verdict"] == "detected" and row["value"] > 20]
+    assert bool(seen) == (what == "long flare")
