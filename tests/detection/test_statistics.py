@@ -9,7 +9,7 @@ from scenes import star
 from scipy import optimize, stats
 from scipy.ndimage import gaussian_filter1d
 
-from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
+from mauvecl import Comparison, Expectation, Instrument, Sky, Source, Study, expect
 from mauvecl.detection import distributions, requests
 
 
@@ -141,7 +141,9 @@ def test_bands_hold_the_rows(chunk: int) -> None:
     np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
 
 
-def test_comparison_is_read_from_words() -> None:
+def test_comparisons_and_all_statistics_are_read_from_words() -> None:
+    asked = Study().with_settings(["run.statistics=['all']"]).run.statistics
+    assert asked == tuple(requests.STATISTICS), "in the order of tables"
     assert Comparison.of("stack:5", "estimated") == Comparison(5, True)
     assert Comparison.of("exposure").added_variance == 1.0
     assert Comparison.of().plain
