@@ -254,6 +254,26 @@ def test_few_counts_have_their_mean_and_noise(mean: float) -> None:
 
 
 @pytest.mark.long
+def test_flares_of_few_counts_have_pulls_of_unit_deviation() -> None:
+    """Counts of mean 3.64 with three flares a light curve; fails by chance once in a thousand times."""
+    rng = np.random.default_rng(406)
+    pulls = []
+    for _ in range(4):
+        time = (np.arange(2700) + 0.5) * 5.0
+        peaks = 4500 * np.arange(3) + rng.uniform(1500, 3000, 3)
+        added = np.array([3.64 * 6 * flare(time, 5.0, peak, 40.0) for peak in peaks])
+        frames = Frames.of(time, rng.poisson(3.64 + added.sum(axis=0)).astype(np.float64))
+        analysis = analysed(frames, false_alarms=5.0).analysis
+        for peak, light in zip(peaks, added, strict=True):
+            near = (one for one in detected(analysis) if abs(time[one.brightest] - peak) < 300)
+            one = max(near, key=lambda one: one.value)
+            truth = float(light[one.first : one.last + 1].sum()) / 3.64 * 5.0
+            pulls.append((one.summed_s - truth) / one.summed_error_s)
+    low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], len(pulls) - 1) / (len(pulls) - 1))
+    assert low < np.std(pulls, ddof=1) < high
+
+
+@pytest.mark.long
 def test_bins_of_gj_65_are_flagged_and_level_and_great_flare_are_those_of_the_counts() -> None:
     """Analyse GALEX's bins, one bad and one a spike; a flare of 20:01 is as small as other changes of the star."""
     folder = CASES.parent / "flares"

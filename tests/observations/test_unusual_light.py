@@ -181,6 +181,22 @@ def test_eclipses_of_a_spotted_binary_are_no_flares() -> None:
 
 
 @pytest.mark.long
+def test_bumps_of_every_orbit_and_dips_at_random_are_no_flares() -> None:
+    """Observe smooth rises in each of eight orbits, and dips of 2 to 30 %, of which a message says what to do."""
+    phase = np.arange(1520) * 30.0 / 5700.0 + 0.3
+    bump = np.exp(4 * (np.cos(2 * np.pi * phase) - 1)) * (1 + 0.2 * np.sin(2 * np.pi * (0.12 * phase + 0.4)))
+    rng, time = np.random.default_rng([503, 2]), np.arange(1200) * 1800.0
+    dips = np.ones(time.size)
+    for middle in rng.uniform(0, time[-1], 38):
+        dips *= 1 - rng.uniform(0.02, 0.3) * np.exp(-(((time - middle) / (rng.uniform(0.05, 0.3) * 86_400)) ** 4))
+    answer = analyse(Study().paper(), frames=noisy(rng, time, dips, 1e-3, exposure_s=1800.0))
+    for one in (answer, analysed(noisy([505, 1], phase * 5700.0, 1 + 0.012 * bump, 2e-4))):
+        assert "detected" not in set(one.events["verdict"])
+    messages = [one for one in answer.messages if "no verdicts" in one and "mapping" in one]
+    assert len(messages) == int(answer.analysis.in_events > 0.5)
+
+
+@pytest.mark.long
 def test_light_that_the_process_does_not_describe_has_no_verdicts() -> None:
     """Observe a sawtooth of six hours, as the pointing of K2 makes, in half-hour frames with two flares."""
     time = np.arange(1500) * 1800.0
