@@ -78,7 +78,7 @@ def test_saturation_is_at_its_rate_and_the_first_message() -> None:
         assert replace(x, source_electrons=electrons * 1.001).saturated.all()
     star = source("B2IV", 1.5)
     x = expect(star, MAUVE, exposure=7)
-    assert kinds(x) == ["saturated", "rounded up"]
+    assert kinds(x) == ["saturated", "rounded up", "nominal throughput"]
     hit = x.wavelength_nm[x.saturated]
     for words in (f"{hit[0]:.1f}-", f"-{hit[-1]:.1f} nm", f"{x.saturated.sum()} of 1643 pixels"):
         assert words in x.messages[0]
