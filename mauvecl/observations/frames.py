@@ -161,6 +161,21 @@ def _cadence_of(name: str, time: Float, light: Float) -> float:
     return cadence
 
 
+def _in_order(key: str, column: Any, light: Float, order: NDArray[np.intp], name: str) -> Any:
+    """Return values of frames in order of time, an error for all of them as often as needed; None for no values."""
+    if column is None:
+        return None
+    values = np.asarray(column, np.int64 if key == "quality" else np.float64)
+    shape = light.shape if key == "error" else order.shape
+    if key == "error" and values.ndim == 0:
+        values = np.full(shape, values)
+    if values.shape != shape:
+        raise InputError.of(
+            key.removesuffix("_c"), f"those of shape {values.shape}", f"values of shape {shape}", where=name
+        )
+    return values[order]
+
+
 Degrees = Annotated[float, Unit("deg")]
 
 
@@ -232,17 +247,11 @@ class Frames:
         exposure = np.broadcast_to(np.asarray(cadence if exposure_s is None else exposure_s, np.float64), (n,))
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise refused("exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-        by_frame: dict[str, Any] = {"error": error, "temperature_c": temperature_c,
-                                    "quality": np.zeros(n) if quality is None else quality}  # fmt: skip
-        for key, column in by_frame.items():
-            if column is not None:
-                values = np.asarray(column, np.int64 if key == "quality" else np.float64)
-                shape = light.shape if key == "error" else (n,)
-                if key == "error" and values.ndim == 0:
-                    values = np.full(shape, values)
-                if values.shape != shape:
-                    raise refused(key.removesuffix("_c"), f"those of shape {values.shape}", f"values of shape {shape}")
-                by_frame[key] = values[order]
+        flags = np.zeros(n) if quality is None else quality
+        by_frame: dict[str, Any] = {
+            key: _in_order(key, column, light, order, name)
+            for key, column in (("error", error), ("temperature_c", temperature_c), ("quality", flags))
+        }
         nm = None if wavelength_nm is None else np.asarray(wavelength_nm, np.float64)
         frames = cls(time[order], exposure[order], light[order], wavelength_nm=nm, name=name, **by_frame, **how)
         if (np.diff(time) < 0).any():
