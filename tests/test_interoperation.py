@@ -9,6 +9,7 @@ from astropy.table import Table
 from scenes import quiescent, source
 
 from mauvecl import Blackbody, Frames, Source, Study
+from mauvecl.host.stars import flare as flare_tables
 
 SUN = source("G2V", 7.4)
 
@@ -53,6 +54,8 @@ def test_data_frame_and_fits_table_are_read(tmp_path: Path) -> None:
     seconds, light = pandas.Series(np.arange(20.0)), pandas.Series([None] + 19 * [7], dtype="Int64")
     np.testing.assert_array_equal(Frames.of(seconds, light).flux, [np.nan] + 19 * [7.0])
     frame = pandas.DataFrame({"Amplitude": [0.1, 0.2], "Start": [1.0, 2.0]})
+    found = flare_tables.flares_of(frame)
+    assert (found["amplitude"].tolist(), found["start"].to_value("h").tolist()) == ([0.1, 0.2], [24.0, 48.0])
     frame.to_csv(tmp_path / "f.csv", index=False)
     assert Study.of(flares=str(tmp_path / "f.csv")).flare.amplitudes == (0.1, 0.2)
     Table({"amp": [0.3, 0.1, 0.3], "istart": [1, 2, 3]}).write(tmp_path / "f.fits")
