@@ -125,7 +125,6 @@ probes = Probes(device=engine.open_device)
 words = np.arange(160, dtype=np.uint32) * np.uint32(0x9E3779B9)
 assert selftest.known_answers(engine).passed
 probes.normal(words, words[::-1].copy())
-probes.expansion(words, words[::-1].copy(), 2225.0)
 probes.alias(words, np.zeros(16, np.uint32), 4)
 ends = np.repeat(np.array([0, 1, 2**31 - 1, 2**31, 2**32 - 1], np.uint32), 32)
 probes.prior(ends, ~ends, np.zeros(2 * layout.PRIOR_NODES, np.float32))
