@@ -193,7 +193,7 @@ SPECTRUM = Tab(
         SATURATED,
         Dots("drawn exposure", name="drawn"),
         Line("expected per pixel", "sky", "pixel", width=1.2),
-        Line("expected per resolution element", "flare", "element", step=True, width=2.2,
+        Line("expected per element", "flare", "element", step=True, width=2.2,
              tips=("wavelength (nm)", "sigma per element")),
     ),
     pins="element",

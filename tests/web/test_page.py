@@ -295,7 +295,7 @@ def test_visitor_in_the_dark_keeps_pictures_on_white(visit: Visit) -> None:
         page.emulate_media(color_scheme=theme)
         page.reload()
         page.settled()
-        for picture, curve in (("excess", "expected per resolution element"), ("distributions", "no flare")):
+        for picture, curve in (("excess", "expected per element"), ("distributions", "no flare")):
             page.settled_ranges(picture)
             tip = page.locator(".bk-Tooltip", has_text=curve)
             for k in range(200):
