@@ -36,6 +36,9 @@ MINUS = "\N{MINUS SIGN}"
 SMALL = 8
 #: Largest fractions of a figure's width for legends, and for titles, of whose letters the mean width is known.
 INSIDE, TITLE = 0.97, 0.93
+#: The same for titles of panels, of the width that matplotlib gives a panel before the layout, which leaves less room
+#: between panels.
+PANEL_TITLE = 1.2
 
 STYLE = {
     "font.size": 9,
@@ -209,11 +212,17 @@ def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any
     if picture.below:
         _legend_below(figure, [axis for axis, _ in drawn])
     if title:
-        # Wrapped to a part of the width, which matplotlib would fill to the edges.
-        text = figure.suptitle(title, fontsize=9.0)
-        letters = int(TITLE * len(title) * figure.bbox.width / text.get_window_extent().width)
-        text.set_text(textwrap.fill(title, max(letters, 1), break_on_hyphens=False, break_long_words=False))
+        # Of a part of the width, which matplotlib would fill to the edges.
+        _wrap(figure.suptitle(title, fontsize=9.0), TITLE * figure.bbox.width)
     return figure
+
+
+def _wrap(text: Any, width: float) -> None:
+    """Break a text that is wider than some pixels into lines of about this width."""
+    words, extent = text.get_text(), text.get_window_extent().width
+    if extent > width:
+        letters = max(int(len(words) * width / extent), 1)
+        text.set_text(textwrap.fill(words, letters, break_on_hyphens=False, break_long_words=False))
 
 
 def _finish(axis: Any, panel: Panel) -> None:
@@ -251,7 +260,9 @@ def _draw_panel(axis: Any, panel: Panel, *, legend: bool) -> dict[str, Any]:
         if of.log:
             getattr(axis, f"set_{name}scale")("log")
     bars = {item.called: mesh for item in panel.series if (mesh := _draw_series(axis, item)) is not None}
-    axis.set_title(panel.title)
+    title, place = axis.set_title(panel.title), axis.get_subplotspec()
+    if panel.title and place is not None:
+        _wrap(title, PANEL_TITLE * place.get_position(axis.figure).width * axis.figure.bbox.width)
     if legend and axis.get_legend_handles_labels()[1]:
         axis.legend()
     return bars

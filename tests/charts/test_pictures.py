@@ -3,7 +3,7 @@
 import io
 import warnings
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +81,9 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
             boxes = sorted((label.get_window_extent(renderer).extents for label in ticks[side]), key=lambda b: b[low])
             for before, after in pairwise(boxes):
                 assert before[low + 2] <= after[low] + 0.5, (name, "ticks overlap")
+        of_panels = {axis.get_title("left") for axis in figure.axes}
+        titles = [text.get_window_extent(renderer) for text in texts if text.get_text() in of_panels]
+        assert not any(one.overlaps(other) for one, other in combinations(titles, 2)), (name, "titles overlap")
         if place == 0 and QUESTIONS["texts"][case].get("column"):
             assert figure.get_figwidth() <= 3.5, name  # inches, one column of a journal
         words = " ".join(text.get_text() for text in texts).replace("\N{NO-BREAK SPACE}", " ")
