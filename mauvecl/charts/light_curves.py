@@ -44,7 +44,8 @@ def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, bel
     stars, study = FirstItems(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), figures.MAX_COLUMNS)
     rows = figures.in_rows([panel(star) for star in stars], columns)
-    title = f"Flares of {study.flare.light().describe()}, {study.search.rate_text}"
+    light = "swept temperature" if "flare_temperature" in stars[0].at else study.flare.light().describe()
+    title = f"Flares of {light}, {study.search.rate_text}"
     notes = chart.throughput_of(answer.inputs), stars.note, *notes
     return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, notes, below)
 

@@ -196,6 +196,9 @@ def test_pictures_are_of_the_cells_of_a_sweep_and_of_their_instrument(engine: En
     assert {
         float(line.get_xdata()[0]) for axis in figure.axes for line in axis.lines if line.get_label() == "this star"
     } == {8.0}
+    sweep = "sweep.axes=[{quantity='flare_temperature', values=[8000, 12000]}]"
+    injected = mauvecl.inject(paper(*star, *ONE, *QUESTIONS["settings"]["injected"], sweep), mauvecl.Stares())
+    assert "Flares of swept temperature, " in words(injected.plot())
     spectra = words(mauvecl.snr(paper(*star, *ONE), engine).plot())
     for said in (text, spectra):
         assert "calibrated throughput" in said
