@@ -125,7 +125,7 @@ def equal_content(first: Any, second: Any) -> bool:
         return units[0] == units[1] and equal_content(*columns) and equal_content(dict(first.meta), dict(second.meta))
     if isinstance(first, float):
         return first == second or (first != first and second != second)
-    # A dataclass compares undefined numbers, which are unlike themselves.
+    # The own equality of a dataclass would find undefined numbers unequal to themselves.
     if is_dataclass(first) or not any("__eq__" in vars(kind) for kind in type(first).__mro__[:-1]):
         return equal_content(_attributes(first), _attributes(second))
     return bool(first == second)

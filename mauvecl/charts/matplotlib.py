@@ -212,7 +212,7 @@ def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any
     if picture.below:
         _legend_below(figure, [axis for axis, _ in drawn])
     if title:
-        # Of a part of the width, which matplotlib would fill to the edges.
+        # matplotlib would fill the width to the edges.
         _wrap(figure.suptitle(title, fontsize=9.0), TITLE * figure.bbox.width)
     return figure
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import check_probability
 from mauvecl.detection.distributions import Interval, central_counts
-from mauvecl.host.arrays import Arrays, Float
+from mauvecl.host.arrays import Arrays, Float, equal_content
 from mauvecl.noise import layout
 from mauvecl.schema.errors import InputError
 
@@ -53,8 +53,8 @@ class RowCounts:
         """Compare counts, merged or not."""
         if not isinstance(other, RowCounts):
             return NotImplemented
-        pairs = ((self._span, other._span), (self.keys, other.keys), (self.counts, other.counts))
-        return all(np.array_equal(*pair) for pair in pairs)
+        ours, theirs = ((counts._span, counts.keys, counts.counts) for counts in (self, other))
+        return equal_content(ours, theirs)
 
     __hash__ = None  # type: ignore[assignment]
 

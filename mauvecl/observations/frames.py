@@ -162,7 +162,7 @@ def _cadence_of(name: str, time: Float, light: Float) -> float:
 
 
 def _in_order(key: str, column: Any, light: Float, order: NDArray[np.intp], name: str) -> Any:
-    """Return values of frames in order of time, an error for all of them as often as needed; None for no values."""
+    """Return the values of frames in order of time, or None if there are none; one error applies to all frames."""
     if column is None:
         return None
     values = np.asarray(column, np.int64 if key == "quality" else np.float64)

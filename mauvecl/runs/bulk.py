@@ -22,7 +22,7 @@ from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_folder, check_size, parsing, read_bytes, write_whole
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.pool import PREPARED, Pool
-from mauvecl.runs.store import CALIBRATION, Chunk, Store, StoredScene, digest, exposure_attributes, is_intact
+from mauvecl.runs.store import CALIBRATION, DRAWS, Chunk, Store, StoredScene, digest, exposure_attributes, is_intact
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, missing_package
@@ -317,15 +317,15 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
 
 #: Attributes of a star that stores of earlier versions do not have.
 LATER_ATTRIBUTES = ("instrument", "saturation_dn", "dark_unit", "temperature_c")
-#: Attributes that earlier versions word otherwise.
-WORDED = ("mauvecl", "draws", "throughput")
+#: Words of version 2.0.0, which described every instrument as the nominal one.
+FORMER = {"draws": f"r{DRAWS[1:-1]}", "throughput": "the throughput is nominal, not a flight calibration"}
 #: Attributes in which stores of version 1 state the study and the instrument by other defaults and names.
 OTHERWISE_IN_VERSION_1 = ("study", "study_sha256", "instrument", "provenance")
 
 
 def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
     """Compare groups, descriptions of arrays and calibration with those of the study."""
-    ignored = (*WORDED, *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
+    ignored = ("mauvecl", *(OTHERWISE_IN_VERSION_1 if store.of_version_1 else ()))
 
     def without(description: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
         attributes = description.get("attributes", {})
@@ -337,7 +337,10 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
         try:
             data = read_bytes(file, "description")
             if name.endswith("zarr.json"):
-                existing, expected = (without(json.loads(text), ignored) for text in (data, content))
+                stated = json.loads(data)
+                former = (key for key, words in FORMER.items() if stated.get("attributes", {}).get(key) == words)
+                names = (*ignored, *former)
+                existing, expected = (without(one, names) for one in (stated, json.loads(content)))
                 fault = "good" if existing in (expected, without(expected, LATER_ATTRIBUTES)) else "foreign"
             elif data == content:
                 fault = "good"
