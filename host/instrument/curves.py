@@ -23,10 +23,7 @@ from mauvecl.schema.fields import Range, Unit
 
 @contextmanager
 def _opened(path: str | Path, title: str) -> Iterator[tuple[Numbers, str]]:
-    """Read an ECSV table of numbers, and the origin of its values, "tag: source", from its metadata.
-
-    Errors that are raised in the block begin with the name of the file.
-    """
+    """Read an ECSV table of numbers, and their origin, "tag: source"; errors in the block name the file."""
     table = parse_numbers(*text_and_name(path, title))
     source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
     try:
@@ -260,8 +257,7 @@ class ThroughputErrors(ContentEquality):
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
         The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. The
-        first modes contain all errors of weighted sums of the curve, (n_sum, n), such as the light in bands, and of
-        these values.
+        first modes contain all errors of weighted sums of the curve, (n_sum, n), and of these values.
         """
         n, sd = wavelength_nm.size, np.sqrt(np.diag(covariance))
         scale = np.where(sd > 0, sd, 1.0)

@@ -169,12 +169,10 @@ def _no_such(word: str, names: Sequence[str]) -> InputError:
 def _selected_rows(
     table: SpectrumTable, chosen: set[int], cells: list[Any], words: Sequence[str], messages: list[str]
 ) -> tuple[list[list[Any]], str]:
-    """Return the selected row and its name, or all rows if they are segments of one spectrum, with a message.
-
-    The cells are those of the chosen columns; wavelengths of shape (n,) apply to all rows of fluxes, (n_row, n).
-    """
+    """Return the selected row of the chosen columns and its name, or all if they are segments of one spectrum."""
     n, shape = len(cells[-1]), np.shape(cells[-1])
     if len(shape) == 2:
+        # One array of wavelengths applies to all rows of fluxes.
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
         raise InputError(f"it needs {n} rows of wavelengths, as many as of fluxes, not {len(cells[0])}", key="flux")

@@ -285,16 +285,14 @@ class _Reader:
         return self.telescope.startswith(("LAMOST", "SDSS")) and "COEFF0" in header and is_plane
 
     def _pairs(self) -> list[SpectrumTable]:
-        """Return the tables of images of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE).
-
-        DESI's are B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
-        """
+        """Return the tables of images of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE)."""
         images = [k for k, hdu in enumerate(self.hdus) if getattr(hdu, "is_image", False)]
         named = {text_at(self.hdus[k].header, "EXTNAME").upper(): k for k in images}
         tables: list[SpectrumTable] = []
         for name, axis in named.items():
             if (match := _AXIS_NAME.fullmatch(name)) is None:
                 continue
+            # DESI's arms have B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd files).
             arm = match[1] or ""
             titles = [f"{arm}_{kind}".lstrip("_") for kind in _FLUX_NAMES]
             fluxes = [named[title] for title in titles if title in named]
@@ -341,10 +339,7 @@ class _Reader:
         return self._table(number, columns, remarks=f"\n{wave.name}", notes=(*remarks, *notes), row_names=names)
 
     def _rows(self, hdu: Any) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
-        """Return the fluxes of an image, the names of its rows if it has several, and a note.
-
-        Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless a part is selected.
-        """
+        """Return the fluxes of an image, the names of its rows if it has several, and a note."""
         header = hdu.header
         shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
         if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
@@ -355,6 +350,7 @@ class _Reader:
             return flux[0], (), ()
         if self._is_survey_image(header):
             return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
+        # Bands of IRAF's `apall` are spectrum, raw, background and sigma.
         bands = shape[2] if len(shape) > 2 else shape[1]
         if not self.words and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
             return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)

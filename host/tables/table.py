@@ -372,10 +372,7 @@ class Rows:
         return divided_unit(name)[1] if unit is None else str(unit).strip()
 
     def number(self, name: str | None, row: int, unit: str = "", *, above: float = -np.inf) -> float | None:
-        """Return the number of a cell in a unit, None for a missing one; raise InputError for anything else.
-
-        A column that states no unit is in this one. The number must lie above the exclusive lower bound `above`.
-        """
+        """Return the number of a cell in a unit, which columns without one have; it exceeds `above`, or is missing."""
         text = self.text(name, row)
         if name is None or not text:
             return None
@@ -465,11 +462,9 @@ _PARTS = {"ra": ("RAh", "RAm", "RAs"), "dec": ("DEd", "DEm", "DEs")}
 
 
 def _with_coordinates(table: Table) -> Table:
-    """Return a table with ``ra`` and ``dec`` instead of columns of their parts, as in ``RAh`` and ``DE-``.
-
-    A column of astropy's coordinates is that of both; in FITS it is two, as in ``coord.ra`` and ``coord.dec``.
-    """
+    """Return a table with ``ra`` and ``dec`` instead of columns of their parts, as in ``RAh`` and ``DE-``."""
     names = table.colnames
+    # A column of astropy's coordinates has both; in FITS it is two, coord.ra and coord.dec.
     place = next((name for name in names if hasattr(table[name], "icrs")), None)
     pair = next(([name, dec] for name in names if name.endswith(".ra") and (dec := f"{name[:-2]}dec") in names), [])
     columns_of_parts = [name for titles in _PARTS.values() for name in titles]

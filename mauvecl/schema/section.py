@@ -41,10 +41,8 @@ class Record(BaseModel):
         try:
             super().__setattr__(name, value)
         except ValidationError:
-            raise InputError(
-                f"{type(self).__name__}.{name} cannot be set in place; use a changed copy: with_, with_settings, at",
-                key=name,
-            ) from None
+            fault = f"{type(self).__name__}.{name} cannot be set in place"
+            raise InputError(f"{fault}; use a changed copy: with_, with_settings, at", key=name) from None
 
 
 Model = TypeVar("Model", bound=BaseModel)
