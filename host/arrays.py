@@ -149,11 +149,10 @@ def map_in_threads(
     number: int | None = None,
     stop: Callable[[], object] | None = None,
 ) -> Generator[Answer]:
-    """Apply a function to items in several threads and yield the results in the order of the items.
+    """Apply a function to items in several threads and yield the results in order; one per thread may wait in memory.
 
-    At most one result for each thread waits to be yielded, so that the memory stays limited. The number of threads is
-    by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread. `stop` ends work in progress
-    if it fails, or if its caller needs no more results; without it, that work is awaited.
+    The number of threads is by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread.
+    `stop` ends work in progress if it fails or no more results are needed; without it, that work is awaited.
     """
     number = number or min(os.cpu_count() or 1, MOST_THREADS)
     if number == 1:

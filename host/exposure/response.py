@@ -202,8 +202,7 @@ def negative_means_message(
 ) -> tuple[str, ...]:
     """Return the message on pixels with a negative mean, which counts as no light.
 
-    `electrons` and `drawn`, shape (n_pixel,), are the mean electrons per frame and their standard deviation in the
-    exposure. Raises InputError if a mean is more negative than the noise of spectrum and exposure explains.
+    `electrons` and `drawn`, shape (n_pixel,), are the means of a frame and their standard deviation in the exposure.
     """
     below = electrons < -ROUNDING * max(float(electrons.max()), 0.0)
     if not below.any() or not (source.flux_flam < 0.0).any():

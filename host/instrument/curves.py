@@ -257,7 +257,8 @@ class ThroughputErrors(ContentEquality):
         """Return the modes of a covariance of log throughput and of the logarithms of other values.
 
         The covariance has the shape (n + n_name, n + n_name) for n wavelengths and the names of the other values. The
-        first modes contain all errors of weighted sums of the curve, (n_sum, n), and of these values.
+        first modes contain all errors of weighted sums of the curve, (n_sum, n), such as the light in bands, and of
+        these values.
         """
         n, sd = wavelength_nm.size, np.sqrt(np.diag(covariance))
         scale = np.where(sd > 0, sd, 1.0)

@@ -54,10 +54,7 @@ MAX_STEPS = 4_300_000
 @validated
 @dataclass(frozen=True)
 class TimeGrid:
-    """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second).
-
-    Raises InputError if the start is outside 1990-2100 or the number of steps is outside 1 to `MAX_STEPS`.
-    """
+    """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second)."""
 
     start: str  # ISO 8601, UTC
     days: Annotated[float, Unit("d"), Range(0, open_low=True)]  # length of the plan

@@ -416,7 +416,7 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
 
 
-def choice_example(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
+def choice(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
     typed = TYPED.fullmatch(word) is not None and word.isprintable()
@@ -464,9 +464,7 @@ def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ..
     shown = (unknown or candidates or [0])[0]
     descriptions = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in candidates]
     fault = f"no column is recognised as a star's flux, only {listed(descriptions) or 'the wavelength'}"
-    raise InputError(
-        f"{fault}; give the column as in {choice_example(names[shown], 'column', shown, names)}", key="columns"
-    )
+    raise InputError(f"{fault}; give the column as in {choice(names[shown], 'column', shown, names)}", key="columns")
 
 
 def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list[int]:
@@ -485,6 +483,4 @@ def _only(quantity: str, names: Sequence[str], indices: Sequence[int]) -> int:
         raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     several = [names[i].strip() for i in indices]
     fault = f"{len(several)} columns may be the {quantity}: {listed(several)}"
-    raise InputError(
-        f"{fault}; give one as in {choice_example(several[-1], 'column', indices[-1], names)}", key="columns"
-    )
+    raise InputError(f"{fault}; give one as in {choice(several[-1], 'column', indices[-1], names)}", key="columns")

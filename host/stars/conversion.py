@@ -17,17 +17,7 @@ import astropy.units as u
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.stars.columns import (
-    Role,
-    choice_example,
-    choose,
-    flux_kind,
-    is_spectral,
-    linear,
-    listed,
-    numbered,
-    role_of,
-)
+from mauvecl.host.stars.columns import Role, choice, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
 from mauvecl.host.stars.spectrum import FLUX_UNIT, check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, ends_of, marks_in, without_indefinite
@@ -114,7 +104,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> Spectr
         segments = [segment for spectrum in spectra for segment in spectrum.segments]
         message = f"its parts {listed(titles)} are joined"
         return replace(first, segments=segments, messages=(*first.messages, message))
-    example = choice_example(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
+    example = choice(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
     raise InputError(f"{len(titles)} tables have a spectrum: {listed(titles)}; give one as in {example}", key="table")
 
 
@@ -245,7 +235,7 @@ def _selected_row(identifiers: Sequence[Sequence[str]], words: Sequence[str], na
     labels = [(identifiers[row] or [""])[0] or number for row, number in zip(fitting, numbers, strict=True)]
     labels = labels if len(set(labels)) == len(labels) else numbers
     fault = f"it contains {len(fitting)} spectra, one in each row ({listed(labels)})"
-    raise InputError(f"{fault}; give one as in {choice_example(labels[0], 'row', fitting[0], labels)}", key="rows")
+    raise InputError(f"{fault}; give one as in {choice(labels[0], 'row', fitting[0], labels)}", key="rows")
 
 
 #: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.

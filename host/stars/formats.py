@@ -276,11 +276,8 @@ class _Reader:
         return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
 
     def _is_survey_image(self, header: Any) -> bool:
-        """Return whether the first row of an image is a flux, and others are its errors and masks.
-
-        LAMOST (https://dr5.lamost.org/v3/doc/data-production-description) and SDSS-I/II
-        (https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html) have such files.
-        """
+        """Return whether the first row of an image is a flux, and others are its errors and masks."""
+        # dr5.lamost.org/v3/doc/data-production-description, classic.sdss.org/dr7/dm/flatFiles/spSpec.html
         is_plane = header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= 6
         return self.telescope.startswith(("LAMOST", "SDSS")) and "COEFF0" in header and is_plane
 

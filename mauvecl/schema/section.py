@@ -9,14 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Self, TypeVar, get_args
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
 from mauvecl.schema import fields
@@ -165,10 +158,7 @@ class Section(Record):
         """Raise InputError if values contradict each other."""
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
-        """Return a copy with another value at a path of sections and a key.
-
-        Each record of a list, such as stars, takes the value; a list of numbers is replaced by it.
-        """
+        """Return a copy with another value at a path of sections and a key, in each record of a list, such as stars."""
         key, *inner = path
         old = getattr(self, key)
         if not inner:
