@@ -443,9 +443,8 @@ def _separations(table: Rows, target_row: int | None, target: str | None) -> tup
     if has_unit or key != "dist":
         return values, ()
     # ADQL's DISTANCE is in degrees.
-    return values * 3600.0, (
-        f"Separations are the column {name} of {table.label}, read as degrees since it states no unit.",
-    )
+    note = f"Separations are the column {name} of {table.label}, read as degrees since it states no unit."
+    return values * 3600.0, (note,)
 
 
 def _from_positions(table: Rows, ra: str, dec: str, target_row: int | None, target: str) -> Float:

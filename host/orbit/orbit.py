@@ -193,9 +193,7 @@ class Elements:
             path = Path(path)
             text, source, named = read_text(path, "orbit file"), f"file {path.name}", shortened(str(path))
         lines = [line.rstrip() for line in text.splitlines()]
-        sets = [
-            (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
-        ]
+        sets = [pair for pair in pairwise(lines) if pair[0].startswith("1 ") and pair[1].startswith("2 ")]
         if not sets:
             raise InputError(f"orbit file {named} must contain a line '1 ...' before a line '2 ...'", key="elements")
         sets = [(first, second) for first, second in sets if first[2:7] == MAUVE] or sets

@@ -153,12 +153,7 @@ COLLECTIONS = (
 
 
 def fetch(
-    name: str,
-    *,
-    base: str | None = None,
-    replace: bool = False,
-    show_progress: bool = True,
-    extend: str | None = None,
+    name: str, *, base: str | None = None, replace: bool = False, show_progress: bool = True, extend: str | None = None
 ) -> OwnStar:
     """Download a star from a public collection and keep it, as `add` does.
 

@@ -69,7 +69,7 @@ WEIGHTS = ("dq_wgt",)
 def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> SpectrumTable:
     """Return the table with the spectrum of a file, or with the one of several that the user's words select."""
     if not tables:
-        raise InputError("it has no table, but needs one with a wavelength and a flux", key="table")
+        raise InputError("it has no table and no image, but needs one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
     selected: list[int] = []
     of_columns_and_rows: list[str] = []

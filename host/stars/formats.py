@@ -222,8 +222,6 @@ class _Reader:
         is_bare = not any(kind & {"flux", "model", "magnitude"} for kind in kinds)
         if errors and not images and (not tables or (is_bare and not self.words)):
             raise errors[0]
-        if not tables and not images:
-            raise InputError("it has no table and no image; give a table with WAVELENGTH and FLUX", key="table")
         # A table of wavelengths, of lines or of a log is not a spectrum.
         return images if images and not self.words and is_bare else [*tables, *images]
 

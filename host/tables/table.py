@@ -372,7 +372,7 @@ class Rows:
         return divided_unit(name)[1] if unit is None else str(unit).strip()
 
     def number(self, name: str | None, row: int, unit: str = "", *, above: float = -np.inf) -> float | None:
-        """Return the number of a cell in a unit, which columns without one have; it exceeds `above`, or is missing."""
+        """Return the number of a cell in a unit, or None; raise InputError for text, and for numbers up to `above`."""
         text = self.text(name, row)
         if name is None or not text:
             return None
@@ -444,14 +444,11 @@ class Rows:
             like = re.search(r"\d|[/^%]|mag", column_unit, re.IGNORECASE) or is_known(column_unit)
             if getattr(self.table[name], "unit", None) is None and not like:
                 # As in ``mass (this work)``.
-                self._ignored.append(
-                    f"{column_unit!r} in the name of the column {name!r} of {self.label} is read as no unit."
-                )
+                words = f"{column_unit!r} in the name of the column {name!r} of {self.label}"
+                self._ignored.append(f"{words} is read as no unit.")
                 return 1.0
-            example = "%" if unit == "1" else unit
-            raise self.error(
-                f"{name} must have a unit such as {example}, not {shortened(column_unit)}", name
-            ) from error
+            expected = f"a unit such as {'%' if unit == '1' else unit}"
+            raise self.error(f"{name} must have {expected}, not {shortened(column_unit)}", name) from error
 
 
 #: Keywords and columns of the system of coordinates, and words for those that are not right ascensions of J2000.

@@ -78,7 +78,7 @@ SPELLED = {
 
 
 def with_unit(text: str, unit: str) -> float | None:
-    """Convert a number with its unit, such as "10 min"; None for other text; raises ValueError for a wrong unit."""
+    """Convert a number with a unit, such as "10 min"; return None for other text, raise ValueError for a wrong unit."""
     match = _MEASURE.fullmatch(text)
     if match is None:
         return None

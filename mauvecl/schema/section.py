@@ -229,9 +229,8 @@ def check_all(section: Section, subject: str, *keys: str) -> None:
     """Raise InputError if only a part of these keys is given."""
     present = given_keys(section, keys)
     if 0 < len(present) < len(keys):
-        raise InputError(
-            f"{subject} needs all of {', '.join(keys)} or none, but has only {' and '.join(present)}", key=present[0]
-        )
+        needed = f"{subject} needs all of {', '.join(keys)} or none"
+        raise InputError(f"{needed}, but has only {' and '.join(present)}", key=present[0])
 
 
 def check_needs(section: Section, subject: str, keys: Sequence[str], needed: str) -> None:

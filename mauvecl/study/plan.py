@@ -230,9 +230,8 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     """Look up the targets of `orbit`, or else those of `plan`."""
     from mauvecl.host.orbit.orbit import Target
 
-    targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets] or [
-        target.target(orbit.simbad) for target in plan.targets
-    ]
+    targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets]
+    targets = targets or [target.target(orbit.simbad) for target in plan.targets]
     if not targets:
         fault = "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`"
         raise InputError(fault, key="orbit.targets")
