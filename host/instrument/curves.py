@@ -53,9 +53,9 @@ class SpectralCurve:
             raise InputError.of("value", value[bad][0], "finite and at least 0", where=where)
 
     @classmethod
-    def flat(cls, value: float, source: str = "A: assumed, no source given") -> SpectralCurve:
+    def flat(cls, value: float) -> SpectralCurve:
         """Return a curve with the same value at every wavelength."""
-        return cls((0.0,), (value,), source)
+        return cls((0.0,), (value,))
 
     @classmethod
     def read(cls, path: str | Path) -> SpectralCurve:

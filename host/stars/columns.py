@@ -416,7 +416,7 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
 
 
-def choice(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
+def choice(name: str, kind: str, index: int, names: Sequence[str]) -> str:
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
     typed = TYPED.fullmatch(word) is not None and word.isprintable()
@@ -424,7 +424,7 @@ def choice(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
     return f"FILE[{word}]" if typed and is_unique else f"FILE[{kind} {index + 1}]"
 
 
-def choose(roles: Sequence[Role], words: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
+def choose(roles: Sequence[Role], words: Sequence[str]) -> tuple[tuple[int, ...], int]:
     """Choose the columns of wavelength, or of both edges of each bin, and of flux; the user's words may name some."""
     names = [role.name for role in roles]
     selected = [_named(word, names) for word in words]

@@ -263,7 +263,7 @@ class ReadSpectrum:
     axis_unit: str = ""
 
 
-def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
+def converted(table: SpectrumTable, wavelength_unit: Any, flux_unit: Any) -> ReadSpectrum:
     """Convert the spectrum of a table; given units override its own; one of wavelength may end in "air" or "vacuum"."""
     messages = list(table.messages)
     medium: Medium | None = None

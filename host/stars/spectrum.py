@@ -371,7 +371,7 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, extension: tuple[str, Float, Float], *, ultraviolet: tuple[str, ...] = ()
+    name: str, wavelength: Float, flux: Float, extension: tuple[str, Float, Float], ultraviolet: tuple[str, ...]
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
 
