@@ -42,10 +42,7 @@ def true_runs(flags: Bool) -> NDArray[np.intp]:
 
 
 def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Cache the latest results of a function of arrays and plain values.
-
-    Arrays among the results are read-only, since callers share them. Exceptions are not cached.
-    """
+    """Cache the latest results of a function of arrays and plain values, but no exceptions."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         thread = threading.local()
@@ -55,6 +52,7 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
             arguments, keywords = thread.call
             value = function(*arguments, **keywords)
             if isinstance(value, np.ndarray):
+                # Callers share the array.
                 value.setflags(write=False)
             return value
 
@@ -151,11 +149,10 @@ def map_in_threads(
     number: int | None = None,
     stop: Callable[[], object] | None = None,
 ) -> Generator[Answer]:
-    """Apply a function to items in several threads and yield the results in the order of the items.
+    """Apply a function to items in several threads and yield the results in order; one per thread may wait in memory.
 
-    At most one result for each thread waits to be yielded, so that the memory stays limited. The number of threads is
-    by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread. `stop` ends work in progress
-    if it fails, or if its caller needs no more results; without it, that work is awaited.
+    The number of threads is by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread.
+    `stop` ends work in progress if it fails or no more results are needed; without it, that work is awaited.
     """
     number = number or min(os.cpu_count() or 1, MOST_THREADS)
     if number == 1:

@@ -530,11 +530,8 @@ MOST_RUNS = 3
 
 def entirely_saturated(x: Expectation, key: str) -> InputError:
     """Return the error of an exposure of which every pixel saturates."""
-    return InputError(
-        f"every pixel of {x.name} is saturated in a frame of {x.frame_s:g} s; use a fainter star, or frames of at "
-        f"most {_safe_frame_s(x):g} s",
-        key=key,
-    )
+    fault = f"every pixel of {x.name} is saturated in a frame of {x.frame_s:g} s"
+    return InputError(f"{fault}; use a fainter star, or frames of at most {_safe_frame_s(x):g} s", key=key)
 
 
 def _safe_frame_s(x: Expectation) -> float:
@@ -569,9 +566,7 @@ def _faint_enough(electrons: Float, name: str) -> Float:
     """Return the mean electrons of a frame; raise InputError if a star is too bright for any pixel."""
     if (electrons > MAX_PER_FRAME).any():
         remark = " (at 1 au it has V = -26.76, Willmer 2018)" if name == "Sun" else ""
-        raise InputError(
-            f"{name} is too bright: a pixel may have at most {MAX_PER_FRAME:g} electrons in a frame, not "
-            f"{float(electrons.max()):.3g}{remark}; `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
-            key="magnitude",
-        )
+        fault = f"{name} is too bright: a pixel may have at most {MAX_PER_FRAME:g} electrons in a frame"
+        remedy = "`magnitude` makes it a star at a distance, as in `magnitude=7.4`"
+        raise InputError(f"{fault}, not {float(electrons.max()):.3g}{remark}; {remedy}", key="magnitude")
     return electrons

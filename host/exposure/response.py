@@ -73,10 +73,7 @@ def response_matrix(instrument: Instrument, wavelength_nm: ArrayLike, order: Ord
 def electrons_per_second(
     instrument: Instrument, wavelength_nm: ArrayLike, flux_flam: ArrayLike, order: Order = "paper"
 ) -> Float:
-    """Return the mean electrons per second in each pixel, shape (n_pixel,), for a spectrum of any number of nodes.
-
-    The flux at the nodes is in erg s^-1 cm^-2 A^-1; see `response_matrix`.
-    """
+    """Return the mean electrons per second in each pixel, (n_pixel,), of any number of nodes; see `response_matrix`."""
     nodes = _nodes(wavelength_nm)
     flux = np.asarray(flux_flam, np.float64)
     if flux.shape != nodes.shape:
@@ -205,8 +202,7 @@ def negative_means_message(
 ) -> tuple[str, ...]:
     """Return the message on pixels with a negative mean, which counts as no light.
 
-    `electrons` and `drawn`, shape (n_pixel,), are the mean electrons per frame and their standard deviation in the
-    exposure. Raises InputError if a mean is more negative than the noise of spectrum and exposure explains.
+    `electrons` and `drawn`, shape (n_pixel,), are the means of a frame and their standard deviation in the exposure.
     """
     below = electrons < -ROUNDING * max(float(electrons.max()), 0.0)
     if not below.any() or not (source.flux_flam < 0.0).any():

@@ -23,10 +23,7 @@ from mauvecl.schema.fields import Range, Unit
 
 @contextmanager
 def _opened(path: str | Path, title: str) -> Iterator[tuple[Numbers, str]]:
-    """Read an ECSV table of numbers, and the origin of its values, "tag: source", from its metadata.
-
-    Errors that are raised in the block begin with the name of the file.
-    """
+    """Read an ECSV table of numbers, and their origin, "tag: source"; errors in the block name the file."""
     table = parse_numbers(*text_and_name(path, title))
     source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
     try:
@@ -56,9 +53,9 @@ class SpectralCurve:
             raise InputError.of("value", value[bad][0], "finite and at least 0", where=where)
 
     @classmethod
-    def flat(cls, value: float, source: str = "A: assumed, no source given") -> SpectralCurve:
+    def flat(cls, value: float) -> SpectralCurve:
         """Return a curve with the same value at every wavelength."""
-        return cls((0.0,), (value,), source)
+        return cls((0.0,), (value,))
 
     @classmethod
     def read(cls, path: str | Path) -> SpectralCurve:

@@ -54,10 +54,7 @@ MAX_STEPS = 4_300_000
 @validated
 @dataclass(frozen=True)
 class TimeGrid:
-    """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second).
-
-    Raises InputError if the start is outside 1990-2100 or the number of steps is outside 1 to `MAX_STEPS`.
-    """
+    """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second)."""
 
     start: str  # ISO 8601, UTC
     days: Annotated[float, Unit("d"), Range(0, open_low=True)]  # length of the plan
@@ -65,11 +62,8 @@ class TimeGrid:
 
     def __post_init__(self) -> None:
         if not 1 <= self.n <= MAX_STEPS:
-            raise InputError(
-                f"{self.days:g} days in steps of {self.step_s:g} s must be 1 to {MAX_STEPS} steps, not "
-                f"{self.days * DAY_S / self.step_s:.3g}",
-                key="step_s",
-            )
+            fault = f"{self.days:g} days in steps of {self.step_s:g} s must be 1 to {MAX_STEPS} steps"
+            raise InputError(f"{fault}, not {self.days * DAY_S / self.step_s:.3g}", key="step_s")
         _ = self.first  # raises InputError for an invalid start
 
     @property
@@ -191,11 +185,7 @@ class Elements:
 
     @classmethod
     def read(cls, path: str | Path | None = None) -> Elements:
-        """Read the newest set of Mauve in a file, or of its only satellite; titles and comments are ignored.
-
-        Without a path it is the public set that the package contains. Raises InputError if the file has no set or
-        those of several other satellites, or a line's checksum is wrong.
-        """
+        """Read the newest set of Mauve in a file, or of its only satellite; by default the set in the package."""
         if path is None:
             text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
             source, named = "public catalogue, object 66756, embedded", "the embedded elements"
@@ -203,9 +193,7 @@ class Elements:
             path = Path(path)
             text, source, named = read_text(path, "orbit file"), f"file {path.name}", shortened(str(path))
         lines = [line.rstrip() for line in text.splitlines()]
-        sets = [
-            (first, second) for first, second in pairwise(lines) if first.startswith("1 ") and second.startswith("2 ")
-        ]
+        sets = [pair for pair in pairwise(lines) if pair[0].startswith("1 ") and pair[1].startswith("2 ")]
         if not sets:
             raise InputError(f"orbit file {named} must contain a line '1 ...' before a line '2 ...'", key="elements")
         sets = [(first, second) for first, second in sets if first[2:7] == MAUVE] or sets
@@ -341,8 +329,7 @@ class Orbit:
     def states(self, midnight: Float, days: Float, kind: Literal["tle", "mean"]) -> tuple[Vectors, Vectors]:
         """Return positions (km) and velocities (km/s) in SGP4's frame by SGP4 or in the mean orbit, shape (n, 3) each.
 
-        `midnight` and `days` are parts of the Julian dates, UTC, of shape (n,). Raises InputError if SGP4 fails at one
-        of the times.
+        `midnight` and `days` are parts of the Julian dates, UTC, of shape (n,).
         """
         e, record = self.elements, self.elements.satellite
         if kind == "tle":

@@ -252,11 +252,8 @@ def _rules(track: Track, limits: Limits) -> dict[str, Rule]:
 
 
 def _in_polygon(longitude_deg: Float, latitude_deg: Float, corners: Vectors) -> Bool:
-    """Return whether positions lie inside a polygon in the plane of longitude and latitude, deg, shape (n,).
-
-    Longitudes may exceed 180 deg, and the polygon, of shape (m, 2) with its corners in order, may cross longitude 180.
-    """
-    # Longitudes are relative to the first corner.
+    """Return whether positions lie inside a polygon of longitudes and latitudes, deg, of shape (m, 2); shape (n,)."""
+    # Longitudes are relative to the first corner, since the polygon may cross longitude 180.
     x = (longitude_deg - corners[0, 0] + 180) % 360 - 180
     around = np.concatenate([[0.0], np.cumsum((np.diff(corners[:, 0]) + 180) % 360 - 180)])
     inside = np.zeros(np.shape(x), bool)

@@ -153,12 +153,7 @@ COLLECTIONS = (
 
 
 def fetch(
-    name: str,
-    *,
-    base: str | None = None,
-    replace: bool = False,
-    show_progress: bool = True,
-    extend: str | None = None,
+    name: str, *, base: str | None = None, replace: bool = False, show_progress: bool = True, extend: str | None = None
 ) -> OwnStar:
     """Download a star from a public collection and keep it, as `add` does.
 
@@ -210,10 +205,7 @@ def _folder(address: str) -> str:
 
 
 def _download(url: str, max_bytes: int, show_progress: bool) -> bytes:
-    """Download a file within limits of size and time; raises FileNotFoundError if the server has none.
-
-    It is read in pieces, since a server may state no size or a wrong one and never stop sending.
-    """
+    """Download a file within limits of size and time; raises FileNotFoundError if the server has none."""
     # Imported here because TLS is slow to import and most runs download nothing.
     import http.client
     import urllib.error
@@ -229,6 +221,7 @@ def _download(url: str, max_bytes: int, show_progress: bool) -> bytes:
             length = answer.headers.get("Content-Length", "")
             size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else 0
             with ProgressBarOrSpinner(size or None, f"Fetching {url}", file=terminal) as bar:
+                # A server may state no size or a wrong one, and never stop sending.
                 while max(size, len(content)) <= max_bytes and (piece := answer.read1(1 << 16)):
                     content += piece
                     bar.update(len(content))

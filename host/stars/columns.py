@@ -342,15 +342,13 @@ _NO_FLUX = re.compile(
 
 
 def stated_units(header: str, *, wavelength: bool, flux: bool, is_named: bool) -> tuple[str | None, str | None]:
-    """Return the requested units of wavelength and flux that a header states, as text.
-
-    If the columns have no names (`is_named` is false), counts or magnitudes in a header mean that there is no flux.
-    """
+    """Return the requested units of wavelength and flux that a header states, as text."""
     text = header[:20_000]
     distinct = _distinct([_spelt(match[0].strip()) for match in _FLUX.finditer(text)]) if flux else []
     next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
     if len(distinct) > 1 and next_to is not None:
         distinct = [_spelt(next_to[1].strip())]
+    # Without names of columns, counts or magnitudes in a header mean that there is no flux.
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
         fault = f"its header mentions {match[1] or match[2]!r}, but must state a flux density"
         raise InputError(f"{fault}: `flux_unit` names its unit", key="flux_unit")
@@ -418,7 +416,7 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
 
 
-def choice_example(name: str, kind: str, index: int, names: Sequence[str] = ()) -> str:
+def choice(name: str, kind: str, index: int, names: Sequence[str]) -> str:
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
     typed = TYPED.fullmatch(word) is not None and word.isprintable()
@@ -426,7 +424,7 @@ def choice_example(name: str, kind: str, index: int, names: Sequence[str] = ()) 
     return f"FILE[{word}]" if typed and is_unique else f"FILE[{kind} {index + 1}]"
 
 
-def choose(roles: Sequence[Role], words: Sequence[str] = ()) -> tuple[tuple[int, ...], int]:
+def choose(roles: Sequence[Role], words: Sequence[str]) -> tuple[tuple[int, ...], int]:
     """Choose the columns of wavelength, or of both edges of each bin, and of flux; the user's words may name some."""
     names = [role.name for role in roles]
     selected = [_named(word, names) for word in words]
@@ -466,9 +464,7 @@ def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ..
     shown = (unknown or candidates or [0])[0]
     descriptions = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in candidates]
     fault = f"no column is recognised as a star's flux, only {listed(descriptions) or 'the wavelength'}"
-    raise InputError(
-        f"{fault}; give the column as in {choice_example(names[shown], 'column', shown, names)}", key="columns"
-    )
+    raise InputError(f"{fault}; give the column as in {choice(names[shown], 'column', shown, names)}", key="columns")
 
 
 def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list[int]:
@@ -487,6 +483,4 @@ def _only(quantity: str, names: Sequence[str], indices: Sequence[int]) -> int:
         raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     several = [names[i].strip() for i in indices]
     fault = f"{len(several)} columns may be the {quantity}: {listed(several)}"
-    raise InputError(
-        f"{fault}; give one as in {choice_example(several[-1], 'column', indices[-1], names)}", key="columns"
-    )
+    raise InputError(f"{fault}; give one as in {choice(several[-1], 'column', indices[-1], names)}", key="columns")

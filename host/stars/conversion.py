@@ -17,17 +17,7 @@ import astropy.units as u
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.stars.columns import (
-    Role,
-    choice_example,
-    choose,
-    flux_kind,
-    is_spectral,
-    linear,
-    listed,
-    numbered,
-    role_of,
-)
+from mauvecl.host.stars.columns import Role, choice, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
 from mauvecl.host.stars.spectrum import FLUX_UNIT, check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, ends_of, marks_in, without_indefinite
@@ -79,7 +69,7 @@ WEIGHTS = ("dq_wgt",)
 def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> SpectrumTable:
     """Return the table with the spectrum of a file, or with the one of several that the user's words select."""
     if not tables:
-        raise InputError("it has no table, but needs one with a wavelength and a flux", key="table")
+        raise InputError("it has no table and no image, but needs one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
     selected: list[int] = []
     of_columns_and_rows: list[str] = []
@@ -114,7 +104,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> Spectr
         segments = [segment for spectrum in spectra for segment in spectrum.segments]
         message = f"its parts {listed(titles)} are joined"
         return replace(first, segments=segments, messages=(*first.messages, message))
-    example = choice_example(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
+    example = choice(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
     raise InputError(f"{len(titles)} tables have a spectrum: {listed(titles)}; give one as in {example}", key="table")
 
 
@@ -169,12 +159,10 @@ def _no_such(word: str, names: Sequence[str]) -> InputError:
 def _selected_rows(
     table: SpectrumTable, chosen: set[int], cells: list[Any], words: Sequence[str], messages: list[str]
 ) -> tuple[list[list[Any]], str]:
-    """Return the selected row and its name, or all rows if they are segments of one spectrum, with a message.
-
-    The cells are those of the chosen columns; wavelengths of shape (n,) apply to all rows of fluxes, (n_row, n).
-    """
+    """Return the selected row of the chosen columns and its name, or all if they are segments of one spectrum."""
     n, shape = len(cells[-1]), np.shape(cells[-1])
     if len(shape) == 2:
+        # One array of wavelengths applies to all rows of fluxes.
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
         raise InputError(f"it needs {n} rows of wavelengths, as many as of fluxes, not {len(cells[0])}", key="flux")
@@ -247,7 +235,7 @@ def _selected_row(identifiers: Sequence[Sequence[str]], words: Sequence[str], na
     labels = [(identifiers[row] or [""])[0] or number for row, number in zip(fitting, numbers, strict=True)]
     labels = labels if len(set(labels)) == len(labels) else numbers
     fault = f"it contains {len(fitting)} spectra, one in each row ({listed(labels)})"
-    raise InputError(f"{fault}; give one as in {choice_example(labels[0], 'row', fitting[0], labels)}", key="rows")
+    raise InputError(f"{fault}; give one as in {choice(labels[0], 'row', fitting[0], labels)}", key="rows")
 
 
 #: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.
@@ -275,7 +263,7 @@ class ReadSpectrum:
     axis_unit: str = ""
 
 
-def converted(table: SpectrumTable, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
+def converted(table: SpectrumTable, wavelength_unit: Any, flux_unit: Any) -> ReadSpectrum:
     """Convert the spectrum of a table; given units override its own; one of wavelength may end in "air" or "vacuum"."""
     messages = list(table.messages)
     medium: Medium | None = None

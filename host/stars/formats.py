@@ -222,8 +222,6 @@ class _Reader:
         is_bare = not any(kind & {"flux", "model", "magnitude"} for kind in kinds)
         if errors and not images and (not tables or (is_bare and not self.words)):
             raise errors[0]
-        if not tables and not images:
-            raise InputError("it has no table and no image; give a table with WAVELENGTH and FLUX", key="table")
         # A table of wavelengths, of lines or of a log is not a spectrum.
         return images if images and not self.words and is_bare else [*tables, *images]
 
@@ -276,25 +274,20 @@ class _Reader:
         return bool(is_filled and not _NO_FLUX.search(text_at(hdu.header, "EXTNAME")))
 
     def _is_survey_image(self, header: Any) -> bool:
-        """Return whether the first row of an image is a flux, and others are its errors and masks.
-
-        LAMOST (https://dr5.lamost.org/v3/doc/data-production-description) and SDSS-I/II
-        (https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html) have such files.
-        """
+        """Return whether the first row of an image is a flux, and others are its errors and masks."""
+        # dr5.lamost.org/v3/doc/data-production-description, classic.sdss.org/dr7/dm/flatFiles/spSpec.html
         is_plane = header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= 6
         return self.telescope.startswith(("LAMOST", "SDSS")) and "COEFF0" in header and is_plane
 
     def _pairs(self) -> list[SpectrumTable]:
-        """Return the tables of images of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE).
-
-        DESI's are B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
-        """
+        """Return the tables of images of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE)."""
         images = [k for k, hdu in enumerate(self.hdus) if getattr(hdu, "is_image", False)]
         named = {text_at(self.hdus[k].header, "EXTNAME").upper(): k for k in images}
         tables: list[SpectrumTable] = []
         for name, axis in named.items():
             if (match := _AXIS_NAME.fullmatch(name)) is None:
                 continue
+            # DESI's arms have B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd files).
             arm = match[1] or ""
             titles = [f"{arm}_{kind}".lstrip("_") for kind in _FLUX_NAMES]
             fluxes = [named[title] for title in titles if title in named]
@@ -341,10 +334,7 @@ class _Reader:
         return self._table(number, columns, remarks=f"\n{wave.name}", notes=(*remarks, *notes), row_names=names)
 
     def _rows(self, hdu: Any) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
-        """Return the fluxes of an image, the names of its rows if it has several, and a note.
-
-        Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless a part is selected.
-        """
+        """Return the fluxes of an image, the names of its rows if it has several, and a note."""
         header = hdu.header
         shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
         if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
@@ -355,6 +345,7 @@ class _Reader:
             return flux[0], (), ()
         if self._is_survey_image(header):
             return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
+        # Bands of IRAF's `apall` are spectrum, raw, background and sigma.
         bands = shape[2] if len(shape) > 2 else shape[1]
         if not self.words and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
             return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)

@@ -336,10 +336,7 @@ def listed_values(name: str) -> dict[str, float]:
 
 
 def listed_note(name: str, **used: float | None) -> str:
-    """Describe what the library and the list supply for a star; empty if it has a spectrum of its own.
-
-    Magnitude (V) and distance (pc) that are `used` are named with their source if they are those of the list.
-    """
+    """Describe what the library supplies for a star, and V (mag) and distance (pc) that are `used` from the list."""
     star = resolve(name)
     if star is None:
         return ""

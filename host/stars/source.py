@@ -171,7 +171,7 @@ class Source(Drawable, ContentEquality):
             longer = cls.from_library(extend) if isinstance(extend, str) else extend
             ultraviolet = longer.messages if isinstance(extend, str) else ()
             extension = longer.name, longer.wavelength_nm, longer.flux_flam
-            wavelength, flux, added = points.extended(name, wavelength, flux, extension, ultraviolet=ultraviolet)
+            wavelength, flux, added = points.extended(name, wavelength, flux, extension, ultraviolet)
             messages += added
         points.check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))

@@ -102,15 +102,13 @@ def _covered(wavelength_nm: Float, name: str) -> Numbers:
 
 
 def _photon_density(wavelength_nm: Float, flux_flam: Float, chosen: Numbers) -> tuple[Float, Float]:
-    """Return wavelengths, Angstrom, and photon flux densities, photons s-1 cm-2 A-1.
-
-    A spectrum that ends within the band falls to zero over one more step of the same ratio, as in synphot.
-    """
+    """Return wavelengths, Angstrom, and photon flux densities, photons s-1 cm-2 A-1."""
     at = wavelength_nm * ANGSTROM
     light = flux_flam * at / HC
     transmitted = chosen["wavelength"][chosen["throughput"] > 0.0] * ANGSTROM
     if at[0] <= transmitted[0] and transmitted[-1] <= at[-1]:
         return at, light
+    # A spectrum that ends within the band falls to zero over one more step of the same ratio, as in synphot.
     before, after = at[0] ** 2 / at[1], at[-1] ** 2 / at[-2]
     return np.array([before, *at, after]), np.array([0.0, *light, 0.0])
 
@@ -373,12 +371,11 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, extension: tuple[str, Float, Float], *, ultraviolet: tuple[str, ...] = ()
+    name: str, wavelength: Float, flux: Float, extension: tuple[str, Float, Float], ultraviolet: tuple[str, ...]
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
 
-    The messages on the ultraviolet of the extension are returned if it continues the spectrum to the blue. Raises
-    InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
+    They include those on the `ultraviolet` of the extension if it continues the spectrum to the blue.
     """
     longer, nm, level = extension
     messages = []

@@ -44,8 +44,7 @@ def writing(label: str, remedy: str, *, key: str) -> Iterator[None]:
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
     """Write the parts of a file atomically: under a temporary name, flushed to the disk, then renamed.
 
-    Other processes may write a `shared` file at the same time; the last one wins. Raises InputError if the file cannot
-    be written; an existing file is then kept.
+    Of processes that write a `shared` file at the same time the last one wins.
     """
     tail = f".{os.getpid()}-{secrets.token_hex(4)}" if shared else ""
     unfinished = path.with_name(f"{UNFINISHED}{path.name}{tail}")
@@ -212,11 +211,7 @@ MOST_PARTS = 512
 
 @contextlib.contextmanager
 def parsing(label: str, remedy: str) -> Iterator[None]:
-    """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
-
-    Parsers raise many kinds of exceptions on damaged content: their own, those of Python (RecursionError,
-    OverflowError) and of NumPy (MemoryError for sizes that a header claims).
-    """
+    """Convert any exception of a parser of foreign content, such as an OverflowError, to InputError."""
     try:
         yield
     except InputError:

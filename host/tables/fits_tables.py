@@ -34,10 +34,7 @@ PIECE = 2**12 * BLOCK
 
 
 def check_sizes(file: IO[bytes]) -> None:
-    """Raise InputError for headers whose sizes are impossible or larger than the file.
-
-    astropy's reader would never end for a negative size.
-    """
+    """Raise InputError for headers whose sizes are impossible or larger than the file."""
     place, length = 0, file.seek(0, io.SEEK_END)
     for number in range(MAX_EXTENSIONS + 1):
         if _bytes_at(file, place, place + 8) not in (b"SIMPLE  ", b"XTENSION"):
@@ -65,6 +62,7 @@ def check_sizes(file: IO[bytes]) -> None:
         if axes[:1] == [0] and len(axes) > 1:
             # Random groups.
             axes = axes[1:]
+        # astropy's reader would never end for a negative size.
         if min([extra, groups, *axes]) < 0 or abs(bits) > 64 or not 0 <= fields <= MAX_FIELDS:
             raise InputError(f"its header {number} has impossible sizes; {WHOLE}", key="file")
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
@@ -77,10 +75,7 @@ def check_sizes(file: IO[bytes]) -> None:
 
 
 def open_fits(file: IO[bytes], label: str = "", *, check: bool = True) -> fits.HDUList:
-    """Open a FITS file after a check of its sizes and checksums; its data are read on access.
-
-    To `check` the checksums, the whole file is read. Messages name the file by its label.
-    """
+    """Open a FITS file, whose data are read on access, after a check of its sizes and, read whole, its checksums."""
     from astropy.io import fits
 
     options: dict[str, Any] = {"mode": "readonly", "memmap": False, "lazy_load_hdus": False}
@@ -102,10 +97,7 @@ def open_fits(file: IO[bytes], label: str = "", *, check: bool = True) -> fits.H
 
 
 def check_extensions(hdus: Any) -> None:
-    """Raise InputError for an extension whose header is damaged, such as a second primary header.
-
-    astropy reads rows by the formats of their columns, also where they do not take NAXIS1 bytes.
-    """
+    """Raise InputError for an extension whose header is damaged, such as a second primary header."""
     from astropy.io import fits
 
     for number, hdu in enumerate(hdus):
@@ -122,6 +114,7 @@ def check_extensions(hdus: Any) -> None:
         if (odd := next((name for name in names if name is None or names.count(name) > 1), "")) != "":
             fault = f"an empty TTYPE{names.index(None) + 1}" if odd is None else f"several columns named {odd!r}"
             raise InputError(f"its extension {number} has {fault}; give each column a name of its own", key="columns")
+        # astropy reads rows by the formats of their columns alone.
         size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
         if size != hdu.header["NAXIS1"]:
             fault = f"its extension {number} has rows of {hdu.header['NAXIS1']} bytes, whose columns take {size}"
@@ -312,10 +305,8 @@ def _iraf_unit(header: Any) -> str:
 
 
 def _times(header: Any, number: int) -> tuple[bool, dict[str, Any]]:
-    """Return whether a column has times as astropy writes them, two parts of a Julian date, and its keywords of times.
-
-    TCTYPn is the scale and TRPOSn the place of a column (standard 4.0, section 9.2).
-    """
+    """Return whether a column has two parts of a Julian date, as astropy writes times, and its keywords of times."""
+    # The scale and the place of a column (standard 4.0, section 9.2).
     scale, place = (text_at(header, f"{key}{number}") for key in ("TCTYP", "TRPOS"))
     if scale.lower() not in SCALES.values():
         return False, {}

@@ -372,10 +372,7 @@ class Rows:
         return divided_unit(name)[1] if unit is None else str(unit).strip()
 
     def number(self, name: str | None, row: int, unit: str = "", *, above: float = -np.inf) -> float | None:
-        """Return the number of a cell in a unit, None for a missing one; raise InputError for anything else.
-
-        A column that states no unit is in this one. The number must lie above the exclusive lower bound `above`.
-        """
+        """Return the number of a cell in a unit, or None; raise InputError for text, and for numbers up to `above`."""
         text = self.text(name, row)
         if name is None or not text:
             return None
@@ -447,14 +444,11 @@ class Rows:
             like = re.search(r"\d|[/^%]|mag", column_unit, re.IGNORECASE) or is_known(column_unit)
             if getattr(self.table[name], "unit", None) is None and not like:
                 # As in ``mass (this work)``.
-                self._ignored.append(
-                    f"{column_unit!r} in the name of the column {name!r} of {self.label} is read as no unit."
-                )
+                words = f"{column_unit!r} in the name of the column {name!r} of {self.label}"
+                self._ignored.append(f"{words} is read as no unit.")
                 return 1.0
-            example = "%" if unit == "1" else unit
-            raise self.error(
-                f"{name} must have a unit such as {example}, not {shortened(column_unit)}", name
-            ) from error
+            expected = f"a unit such as {'%' if unit == '1' else unit}"
+            raise self.error(f"{name} must have {expected}, not {shortened(column_unit)}", name) from error
 
 
 #: Keywords and columns of the system of coordinates, and words for those that are not right ascensions of J2000.
@@ -465,11 +459,9 @@ _PARTS = {"ra": ("RAh", "RAm", "RAs"), "dec": ("DEd", "DEm", "DEs")}
 
 
 def _with_coordinates(table: Table) -> Table:
-    """Return a table with ``ra`` and ``dec`` instead of columns of their parts, as in ``RAh`` and ``DE-``.
-
-    A column of astropy's coordinates is that of both; in FITS it is two, as in ``coord.ra`` and ``coord.dec``.
-    """
+    """Return a table with ``ra`` and ``dec`` instead of columns of their parts, as in ``RAh`` and ``DE-``."""
     names = table.colnames
+    # A column of astropy's coordinates has both; in FITS it is two, coord.ra and coord.dec.
     place = next((name for name in names if hasattr(table[name], "icrs")), None)
     pair = next(([name, dec] for name in names if name.endswith(".ra") and (dec := f"{name[:-2]}dec") in names), [])
     columns_of_parts = [name for titles in _PARTS.values() for name in titles]

@@ -196,7 +196,6 @@ def rows_of_text(
     dashes, may stand below the names. If nothing else shows how, cells are divided at `commas`.
 
     A text that continues a table has rows only, with the `layout` of the `first` rows above it, which messages count.
-    Raises InputError for a row with another number of cells than columns.
     """
     from astropy.table import Table
 

@@ -158,10 +158,9 @@ Public = TypeVar("Public", bound=Callable[..., Any])
 
 
 def validated(target: Public) -> Public:
-    """Validate the arguments of a function, or of a class's constructor and public methods, when they are called.
+    """Validate the arguments of a function, or of a class's constructor and public methods, by their annotations.
 
-    Arguments are checked against the annotations; `schema_of` and `fields.Unit` state what is converted. Defaults
-    are not checked. A wrong argument raises InputError.
+    `schema_of` and `fields.Unit` state what is converted. Defaults are not checked.
     """
     if not inspect.isclass(target):
         return _validated(target)

@@ -78,10 +78,7 @@ SPELLED = {
 
 
 def with_unit(text: str, unit: str) -> float | None:
-    """Read a number with its unit, such as "10 min" or "24%", and convert it; return None for any other text.
-
-    Raises ValueError if the unit is unknown or has no equivalent in `unit`.
-    """
+    """Convert a number with a unit, such as "10 min"; return None for other text, raise ValueError for a wrong unit."""
     match = _MEASURE.fullmatch(text)
     if match is None:
         return None
@@ -146,12 +143,10 @@ class Unit:
         return _or_text(handler(schema))
 
     def plain(self, value: Any) -> Any:
-        """Convert Quantities and texts with a unit, also in a list, to plain numbers; return other values unchanged.
-
-        Raises ValueError for true and false, which pydantic takes for 1 and 0.
-        """
+        """Convert Quantities and texts with a unit, also in a list, to plain numbers; return other values unchanged."""
         if type(value) in (float, int):
             return value
+        # pydantic takes true and false for 1 and 0.
         if is_truth(value):
             raise ValueError(value)
         if isinstance(value, str):

@@ -9,14 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Self, TypeVar, get_args
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
 from mauvecl.schema import fields
@@ -41,10 +34,8 @@ class Record(BaseModel):
         try:
             super().__setattr__(name, value)
         except ValidationError:
-            raise InputError(
-                f"{type(self).__name__}.{name} cannot be set in place; use a changed copy: with_, with_settings, at",
-                key=name,
-            ) from None
+            fault = f"{type(self).__name__}.{name} cannot be set in place"
+            raise InputError(f"{fault}; use a changed copy: with_, with_settings, at", key=name) from None
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -167,10 +158,7 @@ class Section(Record):
         """Raise InputError if values contradict each other."""
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
-        """Return a copy with another value at a path of sections and a key.
-
-        Each record of a list, such as stars, takes the value; a list of numbers is replaced by it.
-        """
+        """Return a copy with another value at a path of sections and a key, in each record of a list, such as stars."""
         key, *inner = path
         old = getattr(self, key)
         if not inner:
@@ -241,9 +229,8 @@ def check_all(section: Section, subject: str, *keys: str) -> None:
     """Raise InputError if only a part of these keys is given."""
     present = given_keys(section, keys)
     if 0 < len(present) < len(keys):
-        raise InputError(
-            f"{subject} needs all of {', '.join(keys)} or none, but has only {' and '.join(present)}", key=present[0]
-        )
+        needed = f"{subject} needs all of {', '.join(keys)} or none"
+        raise InputError(f"{needed}, but has only {' and '.join(present)}", key=present[0])
 
 
 def check_needs(section: Section, subject: str, keys: Sequence[str], needed: str) -> None:

@@ -44,10 +44,7 @@ UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
 
 
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
-    """Return the assumptions of a study about the parts that an answer uses, one clause each.
-
-    The answer varies the quantities `varied` in addition to those of the sweep, if it uses that.
-    """
+    """Return a clause on each part of a study that an answer uses, which also varies the quantities `varied`."""
     axes = study.sweep.axes
     swept = {axis.quantity for axis in axes if "sweep" in uses} | set(varied)
     orbit, limits = study.orbit.tle, study.orbit.limits
@@ -140,10 +137,7 @@ def star_label(star: Star, x: Expectation) -> str:
 
 
 def place_columns(sweep: Sweep, *own: str) -> tuple[Column, ...]:
-    """Return the columns of the star and of the swept quantities, for rows with the values `at` a cell of the sweep.
-
-    `own` names quantities for which a table has separate columns.
-    """
+    """Return the columns of the star and of swept quantities without a column of their `own`, for rows with `at`."""
     return (star_column("label"), *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own))
 
 
@@ -179,10 +173,7 @@ MAX_SOURCES = 16
 
 
 class Loader:
-    """Stars, instruments and skies that the cases of a study share; each is loaded once.
-
-    `source` returns the spectrum of a star, by default that of the study's section.
-    """
+    """Stars, by default those of the study, instruments and skies that its cases share; each is loaded once."""
 
     def __init__(self, source: Callable[[Star], Source] | None = None) -> None:
         self._given = source
@@ -308,10 +299,7 @@ class Case:
         return [expect(source, self.instrument, **options) for source in sources]
 
     def unknowns(self, quiet: Expectation | None = None) -> Nuisances | None:
-        """Return the nuisance parameters that statistics are marginalised over, or None.
-
-        Their spectra are those of `quiet`, by default the star without a flare.
-        """
+        """Return the nuisance parameters that statistics are marginalised over, with spectra of `quiet`, or None."""
         return self.study.nuisances.marginalised(self.quiet if quiet is None else quiet)
 
     def unknowns_of_fits(self, quiet: Expectation | None = None, stare: Stare | None = None) -> Nuisances | None:
@@ -427,11 +415,9 @@ class Case:
             if choice.energy_erg is not None:
                 energy = self.energy(event, choice.energy, kelvin)
                 if math.isnan(energy):
-                    raise InputError(
-                        f"the amplitude of a flare of {choice.energy_erg:g} erg on {self.source.name} needs the star's "
-                        "distance_pc, or radius_rsun and effective_temperature_k",
-                        key="events.energy_erg",
-                    )
+                    fault = f"the amplitude of a flare of {choice.energy_erg:g} erg on {self.source.name} needs the"
+                    needed = "star's distance_pc, or radius_rsun and effective_temperature_k"
+                    raise InputError(f"{fault} {needed}", key="events.energy_erg")
                 # The energy is linear in the amplitude.
                 events[n] = replace(event, amplitude=choice.energy_erg / energy)
         return events
@@ -468,10 +454,7 @@ MAX_SATURATED = 12
 
 
 def collect_messages(expectations: list[Expectation], processes: Processes | None = None) -> list[str]:
-    """Return the messages of expectations and on the validity of closed forms, in the order of `worst_first`.
-
-    All answers report the saturation of stars and flares through this function.
-    """
+    """Return the messages of expectations and on the validity of closed forms, in the order of `worst_first`."""
     saturated = {star for x in expectations if x.saturated.any() for star, flaring in [_star_of(x)] if not flaring}
     outside = off_centre(expectations, processes) if processes else []
     messages: list[str] = [Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside]

@@ -172,11 +172,9 @@ class PlanTarget(Section):
         if kind not in (*TYPICAL, "sunlike"):
             alpha = EXPONENTS.get(kind)
             exception = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
-            raise InputError(
-                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{exception}; "
-                "give alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file",
-                key="rates",
-            )
+            fault = f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{exception}"
+            remedy = "give alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file"
+            raise InputError(f"{fault}; {remedy}", key="rates")
         return preset(kind)
 
 
@@ -232,9 +230,8 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     """Look up the targets of `orbit`, or else those of `plan`."""
     from mauvecl.host.orbit.orbit import Target
 
-    targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets] or [
-        target.target(orbit.simbad) for target in plan.targets
-    ]
+    targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets]
+    targets = targets or [target.target(orbit.simbad) for target in plan.targets]
     if not targets:
         fault = "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`"
         raise InputError(fault, key="orbit.targets")
@@ -341,11 +338,7 @@ def _check_band(rows: Rows, column: str | None, row: int) -> None:
 
 
 def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: dict[str, Any]) -> str | None:
-    """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there.
-
-    Raises InputError if only one of the two is given, if sexagesimal ones differ, and if a star without any is not in
-    the embedded list.
-    """
+    """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there."""
     from mauvecl.host.stars.library import by_key, name_key
 
     ra, dec = columns["ra"], columns["dec"]

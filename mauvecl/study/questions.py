@@ -263,11 +263,8 @@ def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice
     }
     for axis in sweep.axes:
         if fixed.get(axis.quantity):
-            raise InputError(
-                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare; "
-                "give a quantity that [stare] and [[events]] do not fix",
-                key="sweep",
-            )
+            fault = f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare"
+            raise InputError(f"{fault}; give a quantity that [stare] and [[events]] do not fix", key="sweep")
 
 
 class CalibrationObservation(Section):

@@ -432,11 +432,8 @@ class Flare(Section):
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value; raises InputError for an amplitude of a flare as it was observed."""
         if path[0] == "amplitudes" and self.spectrum.as_observed:
-            raise InputError(
-                f"amplitude = {value} has no effect on a flare that is as bright as observed; it "
-                f"needs flare.spectrum.as_observed = false",
-                key="amplitude",
-            )
+            fault = f"amplitude = {value} has no effect on a flare that is as bright as observed"
+            raise InputError(f"{fault}; it needs flare.spectrum.as_observed = false", key="amplitude")
         return super().with_value(path, value)
 
     def light(self, temperature_k: float | None = None) -> FlareSpectrum:
@@ -446,10 +443,7 @@ class Flare(Section):
     def energy_scale(
         self, star: Star, source: Source, kind: Kind, temperature_k: float | None = None
     ) -> EnergyScale | None:
-        """Return the energy of flares per second of equivalent duration, by default at the study's temperature.
-
-        It follows from the star's distance or else from its radius and temperature; None if neither is known.
-        """
+        """Return the energy of flares per second of equivalent duration; None if the star's size is unknown."""
         from mauvecl.flares.energies import EnergyScale
 
         flare: dict[str, Any] = {

@@ -290,11 +290,10 @@ def _stare_prior(name: str, prior: Prior, instrument: Instrument) -> tuple[Cours
     import numpy as np
 
     if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
-        raise InputError(
-            f"processes.{name} is drawn from a normal distribution in a stare; give a normal prior whose cuts are "
-            f"{NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, drifts or cycles in [stare]",
-            key=f"processes.{name}",
-        )
+        prior_of_stare = f"a normal prior whose cuts are {NEGLIGIBLE_CUT_SD:g} sd or more from its mean"
+        remedy = f"give {prior_of_stare}, or jitters, offsets, drifts or cycles in [stare]"
+        fault = f"processes.{name} is drawn from a normal distribution in a stare"
+        raise InputError(f"{fault}; {remedy}", key=f"processes.{name}")
     process = PROCESSES[name]
     course: Course = "jitters" if process.when == "frame" else "offsets"
     if process.of == "dark":

@@ -98,10 +98,7 @@ def tables_in(data: Any) -> Iterator[dict[str, Any]]:
 
 
 def locate_files(data: dict[str, Any], table: Path) -> None:
-    """Locate the files that the study of an answer's table gives by name and digest, in place.
-
-    Search the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
-    """
+    """Locate the files that the study of an answer's table gives by name and digest, in place."""
     study = table.parent / "study.toml"
     for section in tables_in(data):
         for key in [key for key, name in section.items() if f"{key}_sha256" in section and isinstance(name, str)]:
@@ -114,11 +111,8 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
             existing = (place for place in places if files.without_columns(place)[0].is_file())
             file = next((place for place in existing if _digest(place) == digest), None)
             if file is None:
-                raise InputError(
-                    f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is "
-                    "missing or has changed; it must lie next to the table",
-                    key=key,
-                )
+                fault = f"its file {shortened(name)} with sha256 {shortened(str(digest))} is missing or has changed"
+                raise InputError(f"{shortened(table.name)}: {fault}; it must lie next to the table", key=key)
             section[key] = str(file.resolve())
 
 
@@ -200,10 +194,8 @@ class Study(Section):
     def _check_values(self) -> None:
         stars = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
         if stars and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
-            raise InputError(
-                f"only one of flare.photosphere_temperature_k and star.{stars[0]}.effective_temperature_k may be given",
-                key="flare.photosphere_temperature_k",
-            )
+            key = "flare.photosphere_temperature_k"
+            raise InputError(f"only one of {key} and star.{stars[0]}.effective_temperature_k may be given", key=key)
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -212,11 +204,9 @@ class Study(Section):
         text = read_embedded_study(path) if path.suffix == ".ecsv" else files.read_text(path, "study file")
         data = files.toml(text, f"study file {shortened(path.name)}")
         if not _without_empty(data):
-            raise InputError(
-                f"study file {shortened(path.name)} must set at least one key, such as magnitude in [[star]], but "
-                "sets nothing; a verb without a study file answers the paper's question",
-                key="study_file",
-            )
+            fault = f"study file {shortened(path.name)} must set at least one key, such as magnitude in [[star]]"
+            remedy = "a verb without a study file answers the paper's question"
+            raise InputError(f"{fault}, but sets nothing; {remedy}", key="study_file")
         if path.suffix == ".ecsv":
             locate_files(data, path)
         study = cls.build(read_version(data, path.name), path.name)
@@ -482,11 +472,8 @@ def plain_kind(annotation: Any) -> Any:
 
 
 def values_of(values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
-    """Return the value of each keyword, None where it is not given, and of ``paper``.
-
-    Raises InputError for a keyword of another name; ``ideal`` is another form of ``with_unknowns``, and ``paper`` needs
-    an instrument.
-    """
+    """Return the value of each keyword, None where it is not given, and of ``paper``."""
+    # Another form of a keyword, and one that needs a keyword.
     forms = {"paper": "instrument", "ideal": "with_unknowns"}
     accepted = [*keywords, *(name for name, needed in forms.items() if needed in keywords)]
     for name in values.keys() - accepted:
@@ -510,10 +497,7 @@ StudyOf = TypeVar("StudyOf", bound=Study)
 def with_keywords(
     study: StudyOf, values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str, *, is_default: bool
 ) -> StudyOf:
-    """Return a study changed by the values of keywords, as `values_of` returns them.
-
-    If the study `is_default`, keywords that describe a star must come with one that names it.
-    """
+    """Return a study changed by the values of keywords; one that `is_default` has no star to describe."""
     if values.get("paper"):
         study = study.paper()
     changes: dict[str, dict[str, Any]] = {}
