@@ -42,7 +42,10 @@ def true_runs(flags: Bool) -> NDArray[np.intp]:
 
 
 def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Cache the latest results of a function of arrays and plain values, but no exceptions."""
+    """Cache the latest results of a function of arrays and plain values.
+
+    Arrays among the results are read-only, since callers share them. Exceptions are not cached.
+    """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         thread = threading.local()
@@ -52,7 +55,6 @@ def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
             arguments, keywords = thread.call
             value = function(*arguments, **keywords)
             if isinstance(value, np.ndarray):
-                # Callers share the array.
                 value.setflags(write=False)
             return value
 

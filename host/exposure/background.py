@@ -170,7 +170,10 @@ STEP_DEG = 15.0
 
 @lru_cache(maxsize=1)
 def zodiacal_table() -> Float:
-    """Return the paper's table of longitude and latitude, V mag arcsec^-2; NaN in the solar avoidance zone."""
+    """Return the table of the MauveSim paper, V mag arcsec^-2; NaN in the solar avoidance zone.
+
+    Rows are longitudes from 0 to 180 deg, columns are latitudes from 0 to 90 deg.
+    """
     text = resources.files(__package__).joinpath("zodiacal.ecsv").read_text(encoding="utf-8")
     table = parse_numbers(text, "the embedded table of the zodiacal light")
     return np.stack([table[name] for name in table.columns if name.startswith("latitude_")], axis=1)
@@ -362,9 +365,12 @@ MOST_ROWS = 100_000
 def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[Neighbour, ...], tuple[str, ...]]:
     """Read neighbours, nearest first, and return them with statements on how the table was read.
 
-    Columns have any of the names in this module: a separation, or a position, and for stars within the fibre a
-    magnitude and a spectral type, spectrum file, temperature or Gaia colour. Files of spectra are relative to the
-    table. The target is the name of its own row, which is left out, or coordinates, from which positions are measured.
+    The file is a CSV, ECSV, FITS or VOTable with a row per star. A separation, or right ascension and declination, and
+    for stars within the fibre a magnitude and a spectral type, spectrum file, temperature or Gaia colour, are in
+    columns of any of the names in this module, in any case. Files of spectra are relative to the table. The target is
+    the name of the row that is the target itself, which is left out, or coordinates such as "290.68 +11.12". Positions
+    are measured from it; it is needed if there are no separations. Raises InputError if the table has no separations
+    and no positions, or a cell is invalid.
     """
     # Only questions with such a table load the readers of files.
     from mauvecl.host.tables.opening import read_table

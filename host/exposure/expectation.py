@@ -21,7 +21,7 @@ from mauvecl.host.exposure.response import Order, electrons_per_second, negative
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.stars.source import Source, check_covers, listed_star
-from mauvecl.host.stars.spectrum import SPAN_NM, continued
+from mauvecl.host.stars.spectrum import continued
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, number, table_of
 from mauvecl.schema.errors import InputError, Message, counted, missing_package
@@ -512,11 +512,8 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
 
 def continued_to_reach(source: Source, instrument: Instrument) -> Source:
     """Continue the dark ends of a source as far as the instrument's line spread function reaches."""
-    nm = source.wavelength_nm
-    if nm[0] <= SPAN_NM[0] and nm[-1] >= SPAN_NM[1]:
-        return source
-    range_nm = (instrument.output_min_nm, instrument.output_max_nm)
-    nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, LineSpread.of(instrument))
+    range_nm, line = (instrument.output_min_nm, instrument.output_max_nm), LineSpread.of(instrument)
+    nm, flux, messages = continued(source.name, source.wavelength_nm, source.flux_flam, range_nm, line)
     if not messages:
         return source
     return replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))

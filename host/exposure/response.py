@@ -73,7 +73,10 @@ def response_matrix(instrument: Instrument, wavelength_nm: ArrayLike, order: Ord
 def electrons_per_second(
     instrument: Instrument, wavelength_nm: ArrayLike, flux_flam: ArrayLike, order: Order = "paper"
 ) -> Float:
-    """Return the mean electrons per second in each pixel, (n_pixel,), of any number of nodes; see `response_matrix`."""
+    """Return the mean electrons per second in each pixel, shape (n_pixel,), for a spectrum of any number of nodes.
+
+    The flux at the nodes is in erg s^-1 cm^-2 A^-1; see `response_matrix`.
+    """
     nodes = _nodes(wavelength_nm)
     flux = np.asarray(flux_flam, np.float64)
     if flux.shape != nodes.shape:

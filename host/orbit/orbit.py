@@ -54,7 +54,10 @@ MAX_STEPS = 4_300_000
 @validated
 @dataclass(frozen=True)
 class TimeGrid:
-    """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second)."""
+    """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second).
+
+    Raises InputError if the start is outside 1990-2100 or the number of steps is outside 1 to `MAX_STEPS`.
+    """
 
     start: str  # ISO 8601, UTC
     days: Annotated[float, Unit("d"), Range(0, open_low=True)]  # length of the plan
@@ -185,7 +188,11 @@ class Elements:
 
     @classmethod
     def read(cls, path: str | Path | None = None) -> Elements:
-        """Read the newest set of Mauve in a file, or of its only satellite; by default the set in the package."""
+        """Read the newest set of Mauve in a file, or of its only satellite; titles and comments are ignored.
+
+        Without a path it is the public set that the package contains. Raises InputError if the file has no set or
+        those of several other satellites, or a line's checksum is wrong.
+        """
         if path is None:
             text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
             source, named = "public catalogue, object 66756, embedded", "the embedded elements"

@@ -342,13 +342,15 @@ _NO_FLUX = re.compile(
 
 
 def stated_units(header: str, *, wavelength: bool, flux: bool, is_named: bool) -> tuple[str | None, str | None]:
-    """Return the requested units of wavelength and flux that a header states, as text."""
+    """Return the requested units of wavelength and flux that a header states, as text.
+
+    If the columns have no names (`is_named` is false), counts or magnitudes in a header mean that there is no flux.
+    """
     text = header[:20_000]
     distinct = _distinct([_spelt(match[0].strip()) for match in _FLUX.finditer(text)]) if flux else []
     next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
     if len(distinct) > 1 and next_to is not None:
         distinct = [_spelt(next_to[1].strip())]
-    # Without names of columns, counts or magnitudes in a header mean that there is no flux.
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
         fault = f"its header mentions {match[1] or match[2]!r}, but must state a flux density"
         raise InputError(f"{fault}: `flux_unit` names its unit", key="flux_unit")

@@ -214,7 +214,10 @@ class EmissionLine:
 
     @classmethod
     def named(cls, name: str) -> Self:
-        """Return a line or group of lines by name, or a line at a wavelength of 100 to 1000 nm."""
+        """Return a line or group of lines by name, or a line at a wavelength in nm.
+
+        Raises InputError for an unknown name, or a wavelength outside 100 to 1000 nm.
+        """
         names, key = (*LINE_GROUPS, *LINES_NM), name.strip().casefold().replace("_", " ")
         for title in names:
             if title.casefold() == key:

@@ -44,7 +44,8 @@ def writing(label: str, remedy: str, *, key: str) -> Iterator[None]:
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
     """Write the parts of a file atomically: under a temporary name, flushed to the disk, then renamed.
 
-    Of processes that write a `shared` file at the same time the last one wins.
+    Other processes may write a `shared` file at the same time; the last one wins. Raises InputError if the file cannot
+    be written; an existing file is then kept.
     """
     tail = f".{os.getpid()}-{secrets.token_hex(4)}" if shared else ""
     unfinished = path.with_name(f"{UNFINISHED}{path.name}{tail}")

@@ -75,7 +75,10 @@ def check_sizes(file: IO[bytes]) -> None:
 
 
 def open_fits(file: IO[bytes], label: str = "", *, check: bool = True) -> fits.HDUList:
-    """Open a FITS file, whose data are read on access, after a check of its sizes and, read whole, its checksums."""
+    """Open a FITS file after a check of its sizes and checksums; its data are read on access.
+
+    To `check` the checksums, the whole file is read. Messages name the file by its label.
+    """
     from astropy.io import fits
 
     options: dict[str, Any] = {"mode": "readonly", "memmap": False, "lazy_load_hdus": False}

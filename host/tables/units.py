@@ -65,7 +65,11 @@ def is_stated(text: object) -> bool:
 
 @lru_cache(maxsize=1024)
 def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
-    """Parse a unit in any usual spelling; raise InputError for an unknown one, magnitudes but AB and ST, and counts."""
+    """Parse a unit in any usual spelling.
+
+    It may have capitals, plurals, leading powers of ten, ``A`` for Angstrom, ``FLAM``, typographic superscripts,
+    ``log(...)``, and AB and ST magnitudes. Raises InputError for an unknown unit, other magnitudes, and counts.
+    """
     import astropy.units as u
 
     name = in_brackets(re.sub("[{}]", "", _LATEX.sub(" ", text.translate(_TYPOGRAPHY))).strip().strip("'\""))
@@ -447,7 +451,10 @@ def unit_and_medium(unit: str) -> tuple[str | None, Medium | None]:
 def vacuum_wavelengths(
     nm: Float, column: str, remarks: str, medium: Medium | None, headers: Sequence[Mapping[str, Any]]
 ) -> tuple[Float, tuple[str, ...]]:
-    """Return vacuum wavelengths, nm, and messages about them."""
+    """Return vacuum wavelengths, nm, and messages about them.
+
+    The medium is the stated one, else that in the name of the column, in keywords of headers, or in remarks.
+    """
     in_name, in_remarks = _media_in(column), _media_in(remarks)
     named, remarked = (media[0] if len(media) == 1 else None for media in (in_name, in_remarks))
     medium = medium or named or medium_of(headers) or remarked

@@ -158,9 +158,10 @@ Public = TypeVar("Public", bound=Callable[..., Any])
 
 
 def validated(target: Public) -> Public:
-    """Validate the arguments of a function, or of a class's constructor and public methods, by their annotations.
+    """Validate the arguments of a function, or of a class's constructor and public methods, when they are called.
 
-    `schema_of` and `fields.Unit` state what is converted. Defaults are not checked.
+    Arguments are checked against the annotations; `schema_of` and `fields.Unit` state what is converted. Defaults
+    are not checked. A wrong argument raises InputError.
     """
     if not inspect.isclass(target):
         return _validated(target)

@@ -44,7 +44,10 @@ UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
 
 
 def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> list[str]:
-    """Return a clause on each part of a study that an answer uses, which also varies the quantities `varied`."""
+    """Return the assumptions of a study about the parts that an answer uses, one clause each.
+
+    The answer varies the quantities `varied` in addition to those of the sweep, if it uses that.
+    """
     axes = study.sweep.axes
     swept = {axis.quantity for axis in axes if "sweep" in uses} | set(varied)
     orbit, limits = study.orbit.tle, study.orbit.limits
@@ -173,7 +176,10 @@ MAX_SOURCES = 16
 
 
 class Loader:
-    """Stars, by default those of the study, instruments and skies that its cases share; each is loaded once."""
+    """Stars, instruments and skies that the cases of a study share; each is loaded once.
+
+    `source` returns the spectrum of a star, by default that of the study's section.
+    """
 
     def __init__(self, source: Callable[[Star], Source] | None = None) -> None:
         self._given = source

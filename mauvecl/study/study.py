@@ -472,7 +472,11 @@ def plain_kind(annotation: Any) -> Any:
 
 
 def values_of(values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str) -> dict[str, Any]:
-    """Return the value of each keyword, None where it is not given, and of ``paper``."""
+    """Return the value of each keyword, None where it is not given, and of ``paper``.
+
+    Raises InputError for a keyword of another name; ``ideal`` is another form of ``with_unknowns``, and ``paper`` needs
+    an instrument.
+    """
     # Another form of a keyword, and one that needs a keyword.
     forms = {"paper": "instrument", "ideal": "with_unknowns"}
     accepted = [*keywords, *(name for name, needed in forms.items() if needed in keywords)]

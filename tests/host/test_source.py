@@ -98,6 +98,15 @@ def test_short_spectra_are_used_where_they_suffice() -> None:
     seen = [expect(Source.from_arrays(NM[part], GOOD[part]), narrow, exposure=5.0) for part in parts]
     for x in seen[1:]:
         np.testing.assert_array_equal(x.source_electrons, seen[0].source_electrons)
+    # An instrument that reads further needs light from further, also of spectra that suffice for others.
+    efficiency = MAUVE.grating_efficiency
+    curves = {name: efficiency.flat(0.1) for name, value in vars(MAUVE).items() if isinstance(value, type(efficiency))}
+    wide = MAUVE.with_(output_max_nm=760.0, **curves)
+    ends = [Source.from_arrays(np.linspace(180.0, end, 50), np.full(50, 1e-12)) for end in (765.0, 790.0, 900.0)]
+    with refused("extend", "must reach 810 nm", "ends at 765 nm"):
+        expect(ends[0], wide, exposure=5.0)
+    continued, whole = (expect(star, wide, exposure=5.0).source_electrons for star in ends[1:])
+    np.testing.assert_allclose(continued, whole, rtol=1e-9)
     # A bright star begins at 180.1 nm, from where the line function hardly reaches the pixels.
     hot, finer = Blackbody(30_000.0).flux(NM), np.append(180.1, NM[11:])
     whole, short = Source.from_arrays(NM, hot), Source.from_arrays(finer, np.interp(finer, NM, hot))
