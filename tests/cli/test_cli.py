@@ -175,7 +175,7 @@ def test_heavy_packages_are_loaded_only_where_they_are_needed(code: str) -> None
 @pytest.mark.long
 def test_output_in_another_process_is_plain_json_alone_or_quiet(tmp_path: Path) -> None:
     """Run separate processes, because OpenCL drivers do not print through Python; errors go to standard error."""
-    (tmp_path / "stérn.txt").write_text("170 1e-12\n400 1e-12\n800 1e-12\n")
+    (tmp_path / "stérn.txt").write_text("170 1e-12\n400 1e-12\n1150 1e-12\n")
     words = ("detect", "--star", "stérn.txt", "-m", "8", "-a", "0.1", "-n", "10000", "--fap", "0.01", "--no-pictures")
     how = {"folder": tmp_path, "TERM": "xterm-256color", "PYTHONIOENCODING": "ascii"}
     loud, quiet, alone = (started(*words, *more, **how) for more in ((), ("--quiet",), ("--json",)))

@@ -360,6 +360,7 @@ def completed(typed: str, folder: Path) -> set[str]:
 COMPLETED = toml("completed.toml")
 
 
+@pytest.mark.long
 def test_bash_completes_names_which_are_accepted_and_files(tmp_path: Path) -> None:
     names = completed("detect --star ", tmp_path)
     assert {"AUMic", "YZCMi", "ADLeo", "G2V", "GJ581"} <= names

@@ -99,6 +99,7 @@ def seen(folder: Path, *rows: str, share: float = 1.0, **changes: Any) -> Expect
     return simulate(Study.build(study, "test").paper()).inputs[0]
 
 
+@pytest.mark.long
 def test_light_noise_and_messages_of_neighbours_follow_from_magnitude_share_and_place(tmp_path: Path) -> None:
     far, lone = "D,47.47,1.0,A0V", quiescent("G2V", 7.4)
     x = seen(tmp_path, "twin,1.0,8.4,G2V", "faint,1.0,9.9,G2V", share=0.5)
