@@ -25,7 +25,7 @@ from scenes import study_of_g2v
 from tables import DATA, toml
 
 from mauvecl import Engine, Source, Study, simulate
-from mauvecl.cli.console import Meter
+from mauvecl.cli import app
 
 
 @pytest.mark.parametrize(("magnitude", "seconds"), [(7.4, 50.0), (-0.3, 10.0), (7.4, 1500.0)])
@@ -270,7 +270,7 @@ def test_progress_states_rate_and_time_left(
     clock = SimpleNamespace(now=1e6)
     monkeypatch.setattr(time, "monotonic", lambda: clock.now)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: name == "terminal")
-    with Meter() as meter:
+    with app.Meter() as meter:
         for done, total in PROGRESS[name]["steps"]:
             meter(done, total)
             clock.now += 10.0
