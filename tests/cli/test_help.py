@@ -294,7 +294,7 @@ def all_flags() -> dict[str, dict[str, Any]]:
 
 def test_flags_equal_those_of_the_file() -> None:
     """Compare with the file, flag by flag, and the order of flags as well."""
-    listed, accept = json.loads(FILE.read_text(encoding="utf-8")), "`python tests/cli/test_help.py` accepts a change"
+    listed, accept = json.loads(FILE.read_text("utf-8")), "`PYTHONPATH=tests python tests/cli/test_help.py` accepts it"
     now = all_flags()
     for verb in {**listed, **now}:
         old, new = listed.get(verb, {}), now.get(verb, {})
