@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from probes import Probes
 from scenes import instrument, star
 
 from mauvecl import Engine, Expectation, Instrument, Stares
@@ -33,6 +34,13 @@ def interruptible() -> None:
 def engine() -> Engine:
     """Return the default engine, shared because a build takes a second."""
     return Engine()
+
+
+@pytest.fixture(scope="session", params=["vector forms", "vectors of built-ins", "scalar"])
+def probes(request: pytest.FixtureRequest, engine: Engine) -> Probes:
+    """Return probes of PoCL's fast forms, of the plain vectors for other compilers, and of a GPU's scalars."""
+    width = 1 if request.param == "scalar" else 16
+    return Probes(device=engine.open_device, width=width, vector_forms=request.param == "vector forms")
 
 
 @pytest.fixture(scope="session")

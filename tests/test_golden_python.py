@@ -226,7 +226,7 @@ def expectations(folder: Path) -> Answer:
 def draws(folder: Path) -> Answer:
     """Return digests of drawn exposures, and statistics realisation by realisation, of which all bits are promised.
 
-    `test_selftest.py` has those of the self-test.
+    `test_engine.py` has those of the self-test.
     """
     engine = Engine()
     quiet, flare = star(amplitudes=(0.1,), payload=QUICK)

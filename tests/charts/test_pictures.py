@@ -91,8 +91,16 @@ def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -
             assert any(f"{value} s" in words or "exposure (s)" in words for value in exposures), (name, words)
 
 
-def test_detected_flare_is_visible_and_a_curve_is_listed_by_its_name(engine: Engine) -> None:
+@pytest.mark.long
+def test_detected_flare_is_visible_a_curve_is_listed_by_its_name_and_files_equal_savefig(
+    engine: Engine, tmp_path: Path
+) -> None:
+    """Compare all bytes of the files with those of savefig, which draws the picture twice."""
     answer = detect(paper(*FEW, *ONE, "flare.amplitudes=[0.05]", *ONLY), engine)
+    for name, draw in detect(paper(*FEW), engine).pictures.items():
+        twice = io.BytesIO()
+        draw().savefig(twice, format="png", dpi=160)
+        assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()
     detection = answer.stars[0].detection
     # The 5 % flare, hidden in pixel noise, reaches four sigma of an element in the lower panel.
     figure = answer.pictures["spectra"]()
@@ -103,14 +111,6 @@ def test_detected_flare_is_visible_and_a_curve_is_listed_by_its_name(engine: Eng
     for name, start in (("", "area "), ("own words", "own words: area ")):
         (entry,) = detection.roc("matched").plot(name=name).axes[0].get_legend().get_texts()
         assert entry.get_text().startswith(start)
-
-
-def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
-    """Compare all bytes with those of savefig, which draws the picture twice."""
-    for name, draw in detect(paper(*FEW), engine).pictures.items():
-        twice = io.BytesIO()
-        draw().savefig(twice, format="png", dpi=160)
-        assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()
 
 
 @pytest.mark.parametrize("case", long_but(QUESTIONS["parts"], "detect", "detect, all"))
@@ -128,7 +128,6 @@ def labelled(figure: Any, label: str) -> list[np.ndarray]:
 
 
 def edges(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges of a mesh's cells along x and y."""
     corners = np.asarray(mesh.get_coordinates())
     return corners[0, :, 0], corners[:, 0, 1]
 
@@ -172,11 +171,11 @@ def test_maps_and_sweeps_are_drawn_as_their_tables_have_them(engine: Engine) -> 
 
 
 def words(figure: Any) -> str:
-    """Return all texts of a figure on one line."""
     texts = [text.get_text() for text in figure.findobj(Text)]
     return " ".join(" | ".join(texts).split())
 
 
+@pytest.mark.long
 def test_pictures_are_of_the_cells_of_a_sweep_and_of_their_instrument(engine: Engine, tmp_path: Path) -> None:
     """Exposures and magnitudes of the study are not those of its cells, nor is a calibrated throughput nominal."""
     modes = {"wavelength": [200.0, 700.0] * u.nm, "mode_1": [0.05, 0.05]}
@@ -207,6 +206,7 @@ def test_pictures_are_of_the_cells_of_a_sweep_and_of_their_instrument(engine: En
     assert "10.5" not in spectra
 
 
+@pytest.mark.long
 def test_report_has_every_table_remark_and_picture_and_no_level_is_drawn_in_long_gaps() -> None:
     """Two days are missing, where the level has no line and its range no width, and single frames, where it has."""
     time, rng = np.arange(200) * 120.0, np.random.default_rng(1)

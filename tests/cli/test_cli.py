@@ -1,27 +1,31 @@
-"""The command line as a user meets it: simulations, spectra of files, reruns, interruption, and what it loads."""
+"""The command line as a user meets it: simulations, reruns, interruption, what it loads, and failures in a sentence."""
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
-from commands import SMALL_SHARDS, run, started
+from commands import SMALL_SHARDS, ended, run, started
 from processes import python
+from refusals import refused
 from scenes import study_of_g2v
 from tables import DATA, toml
 
-from mauvecl import Engine, Study, simulate
-from mauvecl.cli.console import Meter
+from mauvecl import Engine, Source, Study, simulate
+from mauvecl.cli import app
 
 
 @pytest.mark.parametrize(("magnitude", "seconds"), [(7.4, 50.0), (-0.3, 10.0), (7.4, 1500.0)])
@@ -139,24 +143,6 @@ def test_stopped_run_is_resumed_to_the_same_bits(verb: str, tmp_path: Path) -> N
         assert left() == FOREIGN
 
 
-INVALID = ["[" * 100_000, "null", "[]", '{"attributes": []}', '{"attributes": {"study": "a = 1e999"}}']
-
-
-@pytest.mark.parametrize("content", [*INVALID, '{"model": "mine"}'])
-def test_foreign_manifest_is_kept_and_a_damaged_one_is_reported(content: str, tmp_path: Path) -> None:
-    """A manifest without shards is foreign; one next to shards is a damaged one of mauvecl."""
-    manifest = tmp_path / "out" / "checkpoint" / "manifest.json"
-    manifest.parent.mkdir(parents=True)
-    manifest.write_text(content)
-    words = ("detect", "--star", "G2V", "-m", "7", "-n", "2000", "--fap", "0.1", "--no-pictures", "-o", "out")
-    for how in ([], ["--resume"], ["--restart"]):
-        assert "manifest.json" in run(*words, *how, folder=tmp_path, code=2).stderr
-        assert manifest.read_text() == content
-    (manifest.parent / f"{'0' * 32}-0-0-10.npz").write_bytes(b"")
-    done = run(*words, "--resume", folder=tmp_path)
-    assert "damaged" in done.stdout + done.stderr
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["f.fits", "f.h5"])
 def test_export_to_a_full_disk_keeps_the_earlier_file(name: str, small_disk: Path, tmp_path: Path) -> None:
@@ -189,9 +175,11 @@ def test_heavy_packages_are_loaded_only_where_they_are_needed(code: str) -> None
 @pytest.mark.long
 def test_output_in_another_process_is_plain_json_alone_or_quiet(tmp_path: Path) -> None:
     """Run separate processes, because OpenCL drivers do not print through Python; errors go to standard error."""
-    words = ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "10000", "--fap", "0.01", "--no-pictures")
-    how = {"folder": tmp_path, "TERM": "xterm-256color"}
+    (tmp_path / "stérn.txt").write_text("170 1e-12\n400 1e-12\n1150 1e-12\n")
+    words = ("detect", "--star", "stérn.txt", "-m", "8", "-a", "0.1", "-n", "10000", "--fap", "0.01", "--no-pictures")
+    how = {"folder": tmp_path, "TERM": "xterm-256color", "PYTHONIOENCODING": "ascii"}
     loud, quiet, alone = (started(*words, *more, **how) for more in ((), ("--quiet",), ("--json",)))
+    assert r"st\xe9rn" in loud.stdout, "names outside of the encoding are escaped"
     assert "detection.ecsv" in loud.stdout + loud.stderr
     assert "\x1b" not in loud.stdout + loud.stderr
     assert "detection.ecsv" not in quiet.stdout
@@ -282,8 +270,121 @@ def test_progress_states_rate_and_time_left(
     clock = SimpleNamespace(now=1e6)
     monkeypatch.setattr(time, "monotonic", lambda: clock.now)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: name == "terminal")
-    with Meter() as meter:
+    with app.Meter() as meter:
         for done, total in PROGRESS[name]["steps"]:
             meter(done, total)
             clock.now += 10.0
     assert capsys.readouterr().err.rstrip("\n").split("\n") == PROGRESS[name]["lines"]
+
+
+OBSERVE = ("simulate", "--no-pictures", "--star", "G2V", "--magnitude", "7.4")
+DETECT = ("detect", "--no-pictures", "--star", "G2V", "-m", "7.4", "-a", "0.2", "-n", "5000", "--fap", "0.05")
+
+
+def test_unexpected_error_writes_a_traceback_file(tmp_path: Path) -> None:
+    def fails_at_the_record(handle: int) -> None:
+        if "run.json" in Path(f"/proc/self/fd/{handle}").readlink().name:
+            raise KeyError("what nobody foresaw")
+
+    with mock.patch.object(os, "fsync", fails_at_the_record):
+        code, _, reported = ended(*OBSERVE, "-o", "there", folder=tmp_path)
+    assert code == 70
+    (line,) = reported.splitlines()
+    file = tmp_path / re.search(r"its traceback is in '(.*?)'", line)[1]
+    assert file.parent == tmp_path / "there", "in the output folder"
+    assert "Traceback" in file.read_text()
+    assert "what nobody foresaw" in file.read_text()
+    # What was written before is kept.
+    assert (tmp_path / "there" / "observation-1.ecsv").exists()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("words", [("--help",), ("library", "--json")])
+def test_unwritable_standard_output_is_reported(words: tuple[str, ...]) -> None:
+    command = [sys.executable, "-m", "mauvecl", *words]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 74
+    assert len(done.stderr.splitlines()) == 1
+    assert "standard output cannot be written" in done.stderr
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as gone:
+        done = subprocess.run(command, stdout=gone, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+NAMES = ("x" * 5000, "\udcff\udcfe", "y" * 300 + ".txt")
+NUMBERS = ("1e-308", "5e-324", "1e-31", "1e31", "1e308", "9" * 5000, str(2**64), "0x" + "f" * 5000, "-" + "9" * 400)
+#: Arrays, tables, a dotted key and a dotted table, which raised RecursionError or took 3.8 GB, and some arrays more
+#: than any study has.
+NESTED = ("a = " + "[" * 20_000 + "]" * 20_000, "a = " + "{b = " * 2000 + "1" + "}" * 2000,
+          ".".join("a" * 50_000) + " = 1", "[" + ".".join("a" * 5000) + "]", "a = " + "[" * 40 + "]" * 40)  # fmt: skip
+#: Manifests of checkpoints that mauvecl has not written.
+MANIFESTS = ("[" * 100_000, "null", "[]", '{"attributes": []}', '{"attributes": {"study": "a = 1e999"}}',
+             '{"model": "mine"}')  # fmt: skip
+ASK = ("exposure", "--snr", "5", "--at", "300", "--no-pictures", "--set")
+KEYS = ("run.fap", "star.0.magnitude", "run.seed", "flare.temperature_k", "signal.snr")
+#: Commands that tables of refusals cannot hold, with the text of the files that they name.
+IMPOSSIBLE = [
+    *(((*words.split(), name), "") for name in NAMES for words in (
+        "simulate --star", "simulate", "simulate --instrument", "detect --flares", "verify", "library add",
+        "detect --star G2V -n 5000 --fap .05 --cluster",
+    )),
+    ((*DETECT, "--cluster", "tcp://\udcff:1"), ""), ((*DETECT, "--cluster", "local:" + "9" * 5000), ""),
+    (("library", "fetch", "ngsl:HD 1", "--from", "http://\udcff/"), ""), (("verify", "deep"), "[" * 100_000),
+    *(((*DETECT, "-o", "deep", *how), text) for text in MANIFESTS for how in ((), ("--resume",), ("--restart",))),
+    *(((*ASK, f"{key}={value}"), "") for value in NUMBERS for key in KEYS),
+    *(((*OBSERVE, "--instrument", "mine.toml"), f"extends = 'mauvesim'\nread_noise_dn = {one}\n") for one in NUMBERS),
+    *((words, text) for text in NESTED for words in (
+        ("simulate", "mine.toml"), ("simulate", "mine"), (*OBSERVE, "--instrument", "mine.toml"),
+        (*OBSERVE, "--set", text.replace("a = ", "run.fap=")),
+    )),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(len(IMPOSSIBLE)))
+def test_impossible_words_and_files_are_refused(number: int, tmp_path: Path) -> None:
+    """Refuse names that no file can have, extreme numbers, whole ones of 5000 digits, nesting, and foreign runs."""
+    words, text = IMPOSSIBLE[number]
+    files = [tmp_path / name for name in ("mine.toml", "mine", "deep/zarr.json", "deep/checkpoint/manifest.json")]
+    files[-1].parent.mkdir(parents=True)
+    for file in files:
+        file.write_text(text)
+    reported = run(*words, folder=tmp_path, code=2).stderr
+    assert (reported[:9], reported.count("\n")) == ("mauvecl: ", 1)
+    assert len(reported) < 1100
+    assert "-o" not in words or "manifest.json" in reported
+    assert {file.read_text() for file in files} == {text}, "nobody's file is changed"
+
+
+def test_stores_larger_than_the_disk_need_insist(tmp_path: Path) -> None:
+    """Refuse `realise -n 1e12`, which needs petabytes."""
+    words = ("realise", "--star", "G2V", "-m", "7", "-a", "0.1", "-t", "5")
+    # Kernels have their folder before the disk is full.
+    run(*words, "-n", "1", "-o", "one.zarr", folder=tmp_path)
+    full = shutil.disk_usage(tmp_path)._replace(free=10 << 20)
+    with mock.patch.object(shutil, "disk_usage", return_value=full):
+        reported = run(*words, "-n", "100000", "-o", "s.zarr", folder=tmp_path, code=2).stderr
+        most = int(re.search(r"give at most (\d+) or", reported)[1])
+        assert "10 MiB" in reported
+        assert str(most + 1) in run(*words, "-n", str(most + 1), "-o", "s.zarr", folder=tmp_path, code=2).stderr
+        assert not (tmp_path / "s.zarr").exists()
+        run(*words, "-n", str(most), "-o", "s.zarr", folder=tmp_path)
+        run(*words, "-n", str(most + 1), "-o", "more.zarr", "--insist", folder=tmp_path)
+
+
+@pytest.mark.long
+def test_uploads_are_read_with_limited_memory_in_limited_time_and_number() -> None:
+    from mauvecl.web import sandboxed_reader
+
+    star = {"upload": b"".join(b"%f 1e-12\n" % nm for nm in np.linspace(170.0, 800.0, 150_000))}
+    # Python itself takes longer to start than this time.
+    for name, most, said in (("MEMORY_MIB", 64, "64 MiB"), ("SECONDS", 0.05, "0.05 s")):
+        with mock.patch.object(sandboxed_reader, name, most), refused("upload", said):
+            sandboxed_reader.read_limited(Source, Source.read, star)
+    with mock.patch.object(sandboxed_reader, "SECONDS", 0), ExitStack() as taken:
+        for _ in range(sandboxed_reader.TOGETHER):
+            taken.enter_context(sandboxed_reader._turns)
+        with refused("upload", "too many"):
+            sandboxed_reader.read_limited(Source, Source.read, star)

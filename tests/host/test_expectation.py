@@ -177,28 +177,22 @@ def test_values_state_their_source_also_in_copies_and_files(tmp_path: Path, mauv
     assert marked == {"temperature_c", "grating_efficiency"}
     assert cold.digest != mauve.digest == mauve.with_(name="renamed").digest
     assert {mauve: 1}[mauve.with_(temperature_c=21.0)] == 1
+    pixels = PixelMap.made_up(2048, seed=3, hot_share=0.01, hot_dark=50.0)
+    assert 5 < np.sum(pixels.dark > 10) < 50
+    pixels.write(tmp_path / "map.ecsv")
+    QTable({"response": [98.0, 102.0] * u.percent}).write(tmp_path / "percent.ecsv", format="ascii.ecsv")
+    np.testing.assert_allclose(PixelMap.read(tmp_path / "percent.ecsv").response, [0.98, 1.02])
     (tmp_path / "mine.toml").write_text(
         f'extends = "mauvesim"\nname = "mine"\nlight_loss = 0.2\ngrating_efficiency = "{DATA / "grating.ecsv"}"\n'
-        'read_noise_dn = { value = 11, tag = "D", source = "lab" }\nwindow_efficiency = 0.9\n'
+        'read_noise_dn = { value = 11, tag = "D", source = "lab" }\nwindow_efficiency = 0.9\npixel_map = "map.ecsv"\n'
     )
     mine = Instrument.load(str(tmp_path / "mine.toml"))
+    assert mine.pixel_map.digest == pixels.digest
     assert (mine.name, mine.light_loss, mine.read_noise_dn, mine.frame_s) == ("mine", 0.2, 11, 5)
     assert (mine.grating_efficiency.at(450.0), mine.window_efficiency.at(450.0)) == pytest.approx((0.3, 0.9))
-    changed = {"read_noise_dn": "D: lab", "grating_efficiency": "D: measured"}
+    changed = {"read_noise_dn": "D: lab", "grating_efficiency": "D: measured", "pixel_map": "A: made up, seed 3"}
     changed |= dict.fromkeys(("light_loss", "window_efficiency"), "A: assumed, no source in mine.toml")
     assert mine.sources == mauve.sources | changed
     # A file may extend a user's own, too.
     (tmp_path / "colder.toml").write_text('extends = "mine.toml"\ntemperature_c = 13\n')
     assert Instrument.load(tmp_path / "colder.toml").with_(temperature_c=21) == mine
-
-
-def test_written_maps_are_read_back(tmp_path: Path) -> None:
-    made = PixelMap.made_up(2048, seed=3, hot_share=0.01, hot_dark=50.0)
-    assert 5 < np.sum(made.dark > 10) < 50
-    made.write(tmp_path / "map.ecsv")
-    QTable({"response": [98.0, 102.0] * u.percent}).write(tmp_path / "percent.ecsv", format="ascii.ecsv")
-    np.testing.assert_allclose(PixelMap.read(tmp_path / "percent.ecsv").response, [0.98, 1.02])
-    (tmp_path / "own.toml").write_text('extends = "mauvesim"\nname = "own"\npixel_map = "map.ecsv"\n')
-    payload = Instrument.load(tmp_path / "own.toml")
-    assert payload.pixel_map.digest == made.digest
-    assert payload.sources["pixel_map"] == made.source == "A: made up, seed 3"

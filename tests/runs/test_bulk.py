@@ -137,7 +137,8 @@ def test_damage_is_found_and_repaired_to_the_bit(made: Path, fault: str) -> None
 
 
 def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, made: Path, other: Path) -> None:
-    """Insert chunk and digest of another seed's store, which are consistent with each other."""
+    """Insert chunk and digest of another seed's store, which are consistent with each other, and its study."""
+    before = tree(made)
     for name in (CHUNK, LISTED):
         shutil.copy(other / name, made / name)
     assert {f.state for f in bulk.verify(made)} == {"foreign"}, "the other chunks do not have the copied digests"
@@ -147,6 +148,19 @@ def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, made: Path, o
     assert {f.state for f in bulk.verify(made, PAINTER, redraw=True, rows=(60, 70))} == {"differs"}
     bulk.verify(made, PAINTER, redraw=True, repair=True)
     assert bulk.verify(made, PAINTER, redraw=True) == []
+    # Repair needs the study that was drawn: every copy is one without its digest, or one with other chunks' digests.
+    for copy in COPIES:
+        relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
+    with refused("store"):
+        bulk.verify(made, PAINTER, repair=True)
+    for copy in COPIES:
+        shutil.copy(other / copy, made / copy)
+    flip(made / CHUNK)
+    with refused("redraw"):
+        bulk.verify(made, PAINTER, repair=True)
+    flip(made / CHUNK)
+    chunks, now = ({name: one for name, one in found.items() if "json" not in name} for found in (before, tree(made)))
+    assert now == chunks
 
 
 @pytest.mark.long
@@ -330,7 +344,6 @@ def test_stores_are_read_back_with_their_metadata(
     np.testing.assert_allclose([curve.flux, curve.error], frames.white_light, rtol=1e-12)
 
 
-#: Stores under attack: wrong studies, other people's files, two processes, absurd sizes.
 def relabelled(place: Path, change: Callable[[str], str]) -> None:
     content = json.loads(place.read_text())
     content["attributes"]["study"] = change(content["attributes"]["study"])
@@ -369,23 +382,6 @@ def test_changed_copy_of_a_study_is_found(made: Path, other: Path, copy: str) ->
         with refused("store", "'zarr.json'"):
             ask(made)
     assert tree(made) == before
-
-
-def test_repair_needs_the_study_that_was_drawn(made: Path, other: Path) -> None:
-    """Replace every copy of the study by one without its digest, and by one whose chunks have other digests."""
-    before = tree(made)
-    for copy in COPIES:
-        relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
-    with refused("store"):
-        bulk.verify(made, PAINTER, repair=True)
-    for copy in COPIES:
-        shutil.copy(other / copy, made / copy)
-    flip(made / CHUNK)
-    with refused("redraw"):
-        bulk.verify(made, PAINTER, repair=True)
-    flip(made / CHUNK)
-    chunks, now = ({name: one for name, one in found.items() if "json" not in name} for found in (before, tree(made)))
-    assert now == chunks
 
 
 def test_locked_store_is_neither_read_nor_removed(made: Path) -> None:
@@ -436,6 +432,7 @@ def test_kill_during_removal_is_recovered(made: Path, other: Path, tmp_path: Pat
     assert not path.exists()
 
 
+@pytest.mark.long
 def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Claim 6e15 rows with one chunk; each question is answered in about a second."""
     path, asked = tmp_path / "vast.zarr", study(6 * 10**15)

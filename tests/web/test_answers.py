@@ -22,7 +22,7 @@ NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 M_DWARF = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2", "exposure_s": "50"}
 DATA = Path(__file__).parents[1] / "data" / "web"
-TEXTS = tomllib.loads((DATA / "texts.toml").read_text(encoding="utf-8"))
+TEXTS, TABS = (tomllib.loads((DATA / f"{name}.toml").read_text(encoding="utf-8")) for name in ("texts", "shown"))
 #: Quantities of studies by their fields.
 QUANTITIES = {
     "magnitude": "magnitude", "amplitude": "amplitude_percent", "exposure": "exposure_s", "sky": "sky_brightness",
@@ -264,26 +264,26 @@ async def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(ta
     assert re.search(f"Simulated: 90 % are detected .*{unit}", told), told
 
 
-async def test_every_picture_has_its_data(talk: Talk, server: Server, words: dict[str, Any]) -> None:
+@pytest.mark.parametrize("tab", long_but(TABS, "detection", "limit"))
+async def test_every_picture_has_its_data(talk: Talk, server: Server, words: dict[str, Any], tab: str) -> None:
     """A figure's sources and the data that come have the same names and columns, in both themes and on all axes."""
-    for tab, seen in words["tabs"].items():
-        drawn = (await talk.answer("", tab))["pictures"]
-        assert [one["name"] for one in seen["pictures"]] == list(drawn)
-        for one in seen["pictures"]:
-            data = drawn[one["name"]]
-            assert data["text"].endswith(".")
-            logs = "".join(one["logs"]).lower()
-            for theme, log in (("light", ""), ("dark", logs), ("light", logs)):
-                status, text = await server.got(f"figures/{theme}/{one['name']}.json?log={log}")
-                assert status == 200
-                figure = json.loads(text)
-                models = list(Document.from_json(figure["item"]["doc"]).models)
-                found = {model.name: model.data.keys() for model in models if isinstance(model, ColumnDataSource)}
-                for source, columns in data["sources"].items():
-                    assert found[source] == columns.keys(), (one["name"], source)
-                assert data["props"].keys() <= {model.name for model in models}
-                # A map explains itself by its colour bar.
-                assert figure["legend"] or any(isinstance(model, ColorBar) for model in models)
+    seen, drawn = words["tabs"][tab], (await talk.answer("", tab))["pictures"]
+    assert [one["name"] for one in seen["pictures"]] == list(drawn)
+    for one in seen["pictures"]:
+        data = drawn[one["name"]]
+        assert data["text"].endswith(".")
+        logs = "".join(one["logs"]).lower()
+        for theme, log in (("light", ""), ("dark", logs), ("light", logs)):
+            status, text = await server.got(f"figures/{theme}/{one['name']}.json?log={log}")
+            assert status == 200
+            figure = json.loads(text)
+            models = list(Document.from_json(figure["item"]["doc"]).models)
+            found = {model.name: model.data.keys() for model in models if isinstance(model, ColumnDataSource)}
+            for source, columns in data["sources"].items():
+                assert found[source] == columns.keys(), (one["name"], source)
+            assert data["props"].keys() <= {model.name for model in models}
+            # A map explains itself by its colour bar.
+            assert figure["legend"] or any(isinstance(model, ColorBar) for model in models)
 
 
 async def test_last_of_several_questions_is_answered(talk: Talk) -> None:
@@ -319,6 +319,7 @@ async def test_chances_are_those_of_the_command_line(talk: Talk, tmp_path: Path)
         assert chances == pytest.approx([one["value"] for one in said["numbers"]], rel=1e-9), star
 
 
+@pytest.mark.long
 async def test_plans_are_those_of_the_command_line(talk: Talk, tmp_path: Path) -> None:
     """Headline, flares, their ideal number and the energy that half of them have, of four targets: twelve numbers."""
     asked = link(targets="\n".join(TARGETS), hours="100", start="2027-01-01", days="30")

@@ -242,6 +242,7 @@ async def taken(talk: Talk, asked: str, tab: str, folder: Path) -> str:
     return printed["command"]
 
 
+@pytest.mark.long
 async def test_own_files_answer_as_on_the_command_line(talk: Talk, tmp_path: Path) -> None:
     """A star with a neighbour, a flare as bright as observed, in Angstrom, and an unknown; both numbers, bit by bit.
 
@@ -398,6 +399,7 @@ async def test_uploaded_frames_are_analysed_as_on_the_command_line(talk: Talk, s
             same_numbers(found[name], table)
 
 
+@pytest.mark.long
 async def test_quality_bits_are_chosen_as_on_the_command_line_and_names_of_files_are_plain(
     talk: Talk, tmp_path: Path
 ) -> None:
@@ -491,6 +493,7 @@ async def test_uploaded_standards_are_fitted_as_on_the_command_line(talk: Talk, 
     np.testing.assert_allclose(shipped.throughput(nm), Instrument.load(own).throughput(nm), rtol=1e-12)
 
 
+@pytest.mark.long
 async def test_missing_broken_and_unbounded_archives_are_refused(talk: Talk, server: Server) -> None:
     contents = standards()
     for name, content, value in UPLOADS["archived"]:

@@ -130,7 +130,7 @@ def test_visitor_changes_values_and_reads_the_answer(visit: Visit) -> None:
     page.answerless()
 
 
-def test_visitor_looks_for_a_star_and_goes_back(page: Window) -> None:
+def test_visitor_looks_for_a_star_by_keys_and_goes_back(page: Window) -> None:
     before, star = page.shown(), page.field("Star")
     star.click()
     star.press_sequentially("hd")
@@ -180,6 +180,16 @@ def test_visitor_looks_for_a_star_and_goes_back(page: Window) -> None:
         # Name and magnitude are one step of the history.
         page.go_back()
         page.says("on G2V V = 8.5")
+    # Tabs stand in groups and turn round; newcomers do the rest by keys.
+    headings = page.locator("[role=tablist] > div > span").all_inner_texts()
+    assert headings == ["Plan observations", "Simulate observations", "Analyse observations", "Tools"]
+    for name, number in (("detection", 0), ("visibility", 0), ("snr", 1), ("calibrate", 2), ("compare", 3)):
+        described = page.locator(f"#tab-{name}").get_attribute("aria-describedby")
+        assert page.locator(f"#{described}").inner_text() == headings[number], name
+    page.locator("#tab-detection").focus()
+    for key, name in (("ArrowRight", "limit"), ("ArrowLeft", "detection"), ("ArrowLeft", "compare")):
+        page.keyboard.press(key)
+        assert page.evaluate("document.activeElement.id") == f"tab-{name}"
 
 
 def test_visitor_studies_and_keeps_pictures(page: Window) -> None:
@@ -479,7 +489,6 @@ def test_visitor_uploads_spectra(browser: Browser, page: Window) -> None:
 
 
 def flat(first: int, end: int) -> bytes:
-    """Return a flat spectrum over wavelengths in Angstrom."""
     angstrom = np.arange(first, end, 10)
     return rows_of(angstrom, np.full(angstrom.size, 1e-12))
 
@@ -567,19 +576,6 @@ def test_visitor_with_a_phone(visit: Visit) -> None:
     page.field("First day").fill("2026-11-01")
     page.settled()
     assert page.get_by_role("status").inner_text() == "", "nothing is done of another plan"
-
-
-def test_visitor_with_a_keyboard(page: Window) -> None:
-    """Tabs stand in groups and turn round; newcomers do the rest by keys."""
-    headings = page.locator("[role=tablist] > div > span").all_inner_texts()
-    assert headings == ["Plan observations", "Simulate observations", "Analyse observations", "Tools"]
-    for name, number in (("detection", 0), ("visibility", 0), ("snr", 1), ("calibrate", 2), ("compare", 3)):
-        described = page.locator(f"#tab-{name}").get_attribute("aria-describedby")
-        assert page.locator(f"#{described}").inner_text() == headings[number], name
-    page.locator("#tab-detection").focus()
-    for key, name in (("ArrowRight", "limit"), ("ArrowLeft", "detection"), ("ArrowLeft", "compare")):
-        page.keyboard.press(key)
-        assert page.evaluate("document.activeElement.id") == f"tab-{name}"
 
 
 def test_visitor_pastes_and_opens_targets(visit: Visit) -> None:
@@ -736,7 +732,6 @@ class Keys:
         self.page, self.clicks = page, 0
 
     def reach(self, control: Locator) -> None:
-        """Go from stop to stop until this one."""
         for _ in range(MOST_STOPS):
             if control.count() and control.evaluate("e => e === document.activeElement"):
                 assert control.evaluate("e => getComputedStyle(e).outlineStyle") != "none"

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from marks import long_but
 from refusals import says_what_is_accepted
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 
@@ -208,6 +209,7 @@ async def test_first_load_is_small_and_compressed(talk: Talk, server: Server, wo
 KINDS = ("detection", "map", "limit", "measure", "change", "periods", "completeness", "visible", "plan")
 
 
+@pytest.mark.long
 async def test_cancel_ends_work_in_libraries_that_catch_exceptions(talk: Talk, strict: Server) -> None:
     """Some libraries turn every exception into another, by chance the interruption as well."""
     n = await talk.say("simulate", kind="visible", link=link(targets="Vega"))
@@ -219,8 +221,7 @@ async def test_cancel_ends_work_in_libraries_that_catch_exceptions(talk: Talk, s
     assert reported["ended"] == "Cancelled."
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", long_but(KINDS, "detection"))
 async def test_cancel_ends_every_computation(talk: Talk, server: Server, kind: str) -> None:
     """Cancel each computation once it has started, and compute the next one; progress never falls."""
     bands = ",".join(f"{start}-{start + 150}" for start in range(210, 450, 12))

@@ -163,7 +163,6 @@ class Talk:
         return dict((await self.ask("answer", "faults", link=link, tab=tab))["faults"])
 
     async def chances(self, link: str) -> list[float]:
-        """Return both chances of the card."""
         return [one["value"] for one in (await self.answer(link))["answer"]["numbers"]]
 
     async def solved(self, link: str) -> tuple[str, str]:
@@ -292,7 +291,6 @@ class Window:
 
     @contextmanager
     def exporting(self) -> Iterator[None]:
-        """Open the dialog of exports, and close it."""
         self.button("Share, export, cite").click()
         self.locator("#export[open]").wait_for()
         yield
@@ -332,5 +330,4 @@ class Window:
         return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
     def script(self, name: str, given: Any = None) -> Any:
-        """Return the value of a script of the folder `scripts`."""
         return self.evaluate((Path(__file__).parent / "scripts" / f"{name}.js").read_text(encoding="utf-8"), given)
