@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Area, Dots, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, pictures_of
+from mauvecl.charts.chart import Area, Dots, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 
@@ -24,12 +24,11 @@ if TYPE_CHECKING:
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.answers.visible import VisibleAnswer
 
-#: Largest number of targets with a calendar each; more targets are rows of one picture.
-MOST_CALENDARS = 6
-#: Largest number of months whose names fit side by side.
-MOST_MONTHS = 8
+MOST_CALENDARS = 6  # targets with a calendar each; more targets are rows of one picture
+MOST_MONTHS = 8  # whose names fit side by side
 
 
+@picture_of("PlanAnswer", "plan")
 def overview(answer: PlanAnswer) -> Picture:
     """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
     planned, nothing = answer.planned, [np.nan] * 3
@@ -59,10 +58,6 @@ def _bars(values: Any, colour: str) -> list[Series]:
     x, y = np.column_stack([values[:, :2], np.full(len(values), np.nan)]).ravel(), np.arange(len(values))
     bars = Line("", colour, width=3.3, alpha=0.5, at=(x, np.repeat(y, 3)))
     return [bars, Dots("", colour, size=7, at=(values[:, 2], y))]
-
-
-# Reports draw it in figures of their own.
-picture_of("PlanAnswer", "plan")(overview)
 
 
 @picture_of("PlanAnswer", "visible", given=lambda answer: (answer.seen,))
@@ -116,8 +111,7 @@ def _month(day: str) -> str:
     return f"{months_of_years.month_abbr[int(day[5:7])]} {day[:4]}"
 
 
-#: A4, and its margin, inches.
-PAGE, MARGIN = (8.27, 11.69), 0.6
+PAGE, MARGIN = (8.27, 11.69), 0.6  # A4, and its margin, inches
 #: Approximate width of a letter divided by its size, for line breaks; that of bold letters over it; line spacing over
 #: the size.
 LETTER, BOLD, LINE = 0.53, 1.1, 1.4
@@ -126,8 +120,7 @@ SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86
 TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
 #: Sizes of text on a page: of tables with many columns, and of others; number of columns that are many.
 SMALL, NORMAL, MANY = 5.5, 7.0, 9
-#: Number of colours kept in the pictures of an HTML report.
-COLOURS_KEPT = 64
+COLOURS_KEPT = 64  # in the pictures of an HTML report
 #: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
 PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 0.09, "hspace": 0.35, "wspace": 0.3}
 
@@ -148,29 +141,6 @@ class ReportPart:
     text: str = ""  # the picture in words
     height_in: float = 0.0  # of the picture on a page; 0 for a page of its own
     new_page: bool = False
-
-
-def pdf_bytes(title: str, parts: Sequence[ReportPart]) -> bytes:
-    """Return a report as PDF; without a date, so that equal answers give equal files."""
-    from matplotlib.backends.backend_pdf import PdfPages
-
-    content, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
-    with style(), PdfPages(content, metadata=about) as pages:
-        sheets = TextPages()
-        for part in parts:
-            sheets.add(part)
-        for figure in sheets.pages:
-            pages.savefig(figure)
-    return content.getvalue()
-
-
-def html_bytes(title: str, parts: Sequence[ReportPart]) -> bytes:
-    """Return a report as a page, with pictures if matplotlib is installed."""
-    from mako.template import Template
-
-    options = {"default_filters": ["str", "escape"], "imports": ["from html import escape"], "strict_undefined": True}
-    template = Template(filename=str(Path(__file__).with_name("reports.html.mako")), **options)
-    return str(template.render(title=title, parts=parts, html_image=html_image)).encode()
 
 
 def html_image(draw: Callable[[Any], Any], text: str) -> str:
@@ -388,10 +358,27 @@ def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[ReportPart]]:
     parts = [ReportPart(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
     parts += [ReportPart(view.title, (), *view.texts(empty=False)) for view in answer.all_views]
     parts.append(ReportPart(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
-    return title, parts + [ReportPart(picture=draw, text=name) for name, draw in pictures_of(answer).items()]
+    return title, parts + [ReportPart(picture=draw, text=name) for name, draw in answer.pictures.items()]
 
 
 def report(answer: Any, form: str) -> bytes:
-    """Return the report of a plan or an analysis as "html" or "pdf"."""
+    """Return the report of a plan or an analysis as "html", with pictures if matplotlib is installed, or as "pdf"."""
     title, parts = plan_report(answer) if hasattr(answer, "planned") else analysis_report(answer)
-    return (html_bytes if form == "html" else pdf_bytes)(title, parts)
+    if form == "html":
+        from mako.template import Template
+
+        path = Path(__file__).with_name("reports.html.mako")
+        filters, imports = ["str", "escape"], ["from html import escape"]
+        template = Template(filename=str(path), default_filters=filters, imports=imports, strict_undefined=True)
+        return str(template.render(title=title, parts=parts, html_image=html_image)).encode()
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    # Without a date, so that equal answers give equal files.
+    content, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
+    with style(), PdfPages(content, metadata=about) as pages:
+        sheets = TextPages()
+        for part in parts:
+            sheets.add(part)
+        for figure in sheets.pages:
+            pages.savefig(figure)
+    return content.getvalue()

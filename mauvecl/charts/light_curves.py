@@ -32,10 +32,14 @@ SIZES = {
     "energy": "bolometric energy (erg)",
     "band_energy": "energy in the band (erg)",
 }
-#: Largest number of half-widths with a curve each.
-MOST_CURVES = 6
-#: Largest number of maps in a picture.
-MOST_MAPS = 6
+# Largest numbers of half-widths with a curve each, and of maps in a picture.
+MOST_CURVES, MOST_MAPS = 6, 6
+#: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
+MOST_POINTS, MOST_ROWS = 4000, 600
+LONG_GAP = 0.005  # shortest gap in which the level is not drawn, as a share of the whole time
+BRIGHT = 30.0  # flux in standard deviations above which the light curve has a second panel near the level
+#: Units of time: longest duration that is shown in it, its length, s, and its name.
+TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 HALF_WIDTH = PlotAxis("half-width (s)", log=True)
 
 
@@ -102,12 +106,6 @@ def energies(answer: InjectAnswer) -> Picture:
         return Panel(HALF_WIDTH, PlotAxis(SIZES[star.size], log=True), meshes, star.title)
 
     return _stars(answer, panel, "medians; grey: none found")
-
-
-#: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
-MOST_POINTS, MOST_ROWS = 4000, 600
-#: Units of time: longest duration that is shown in it, its length, s, and its name.
-TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 
 
 @picture_of("StareAnswer", "light-curve", each=lambda answer: [(star,) for star in answer.stares])
@@ -232,10 +230,6 @@ def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
 #: Verdicts on events, with their colours, and these in words.
 VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
 WORDS = {"star": "blue", "drawn": "grey", "own": "red", "dark": "pink"}
-#: Shortest gap in which the level is not drawn, as a share of the whole time.
-LONG_GAP = 0.005
-#: Flux in standard deviations above which the light curve has a second panel near the level.
-BRIGHT = 30.0
 LIGHT_CURVE = Chart(
     "frames", "Light curve", PlotAxis("time from the first frame (min)"), PlotAxis("flux"),
     (

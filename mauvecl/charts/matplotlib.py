@@ -1,18 +1,22 @@
-"""Matplotlib figures: style, axes, and files."""
+"""Matplotlib figures: the registry of pictures by class, style, axes, and files."""
 
 from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Sequence
-from functools import wraps
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from itertools import cycle
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from pkgutil import iter_modules
+from typing import Any, TypeVar
 
 import numpy as np
 
-from mauvecl.charts import chart
 from mauvecl.charts.chart import INK, Area, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
@@ -21,19 +25,12 @@ from mauvecl.schema.errors import InputError
 #: lightness as well.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
 NULL = INK["drawn"]
-#: Wavelengths that are shown, nm.
-RANGE_NM = (200.0, 700.0)
-#: Cells of a mesh above which vector files hold it as pixels.
-MANY = 5000
-#: Panels side by side.
-MAX_COLUMNS = 3
-#: Width of one column of a journal, inches.
-COLUMN = 3.5
-#: No-break space.
-UNBROKEN = "\N{NO-BREAK SPACE}"
-MINUS = "\N{MINUS SIGN}"
-#: Size of the labels of ticks that are names.
-SMALL = 8
+RANGE_NM = (200.0, 700.0)  # wavelengths that are shown
+MANY = 5000  # cells of a mesh above which vector files hold it as pixels
+MAX_COLUMNS = 3  # panels side by side
+COLUMN = 3.5  # width of one column of a journal, inches
+UNBROKEN, MINUS = "\N{NO-BREAK SPACE}", "\N{MINUS SIGN}"
+SMALL = 8  # size of the labels of ticks that are names
 #: Largest fractions of a figure's width for legends, and for titles, of whose letters the mean width is known.
 INSIDE, TITLE = 0.97, 0.93
 #: The same for titles of panels, of the width that matplotlib gives a panel before the layout, which leaves less room
@@ -142,39 +139,67 @@ def in_figure(unit: str) -> str:
     return str(Unit(unit).to_string("latex_inline"))
 
 
-def styled_picture(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a function that returns a picture or a panel: draw it in the common style, and save it.
+@dataclass(frozen=True)
+class PictureFunction:
+    """Function that returns a picture, or its only panel, of the objects of a class."""
 
-    The decorated function also takes the `path` of the file, without which it returns the figure, and the axes `ax` to
-    draw in, which it then returns.
-    """
-
-    @wraps(draw)
-    def picture(*arguments: Any, path: str | Path | None = None, ax: Any = None, **keywords: Any) -> Any:
-        if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
-            raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
-        with style():
-            description = draw(*arguments, **keywords)
-            picture = Picture([[description]]) if isinstance(description, Panel) else description
-            saved = save_or_return(draw_picture(picture, ax=ax), path)
-        return saved if ax is None else ax
-
-    return picture
+    name: str  # name of the file
+    draw: Callable[..., Picture | Panel]
+    given: Callable[[Any], tuple[Any, ...]] = lambda instance: (instance,)  # arguments of `draw` for an object
+    #: Arguments of `draw` for each of several numbered pictures of an object.
+    each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
+    when: Callable[[Any], object] = lambda instance: True  # whether an object has the picture
 
 
-def picture_of(kind: str, name: str, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
+#: Entries by class name, since importing the classes would import every answer.
+ENTRIES: defaultdict[str, list[PictureFunction]] = defaultdict(list)
+Draw = TypeVar("Draw", bound=Callable[..., Picture | Panel])
+
+
+def picture_of(kind: str, name: str, **options: Any) -> Callable[[Draw], Draw]:
+    """Return a decorator that registers a function as a picture of a class; `plot` draws the first.
 
     `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `options` are as
-    for `chart.PictureFunction`. A function that is a picture of several classes is decorated once.
+    for `PictureFunction`.
     """
 
-    def registered(draw: Callable[..., Any]) -> Callable[..., Any]:
-        styled = draw if hasattr(draw, "__wrapped__") else styled_picture(draw)
-        chart.ENTRIES[kind].append(chart.PictureFunction(name, styled, **options))
-        return styled
+    def registered(draw: Draw) -> Draw:
+        ENTRIES[kind].append(PictureFunction(name, draw, **options))
+        return draw
 
     return registered
+
+
+def load() -> None:
+    """Import all modules of pictures, so that they register their functions."""
+    for module in iter_modules([str(Path(__file__).parent)]):
+        import_module(f"{__package__}.{module.name}")
+
+
+def pictures_of(instance: Any) -> dict[str, Callable[..., Any]]:
+    """Return every picture of an object by file name, numbered ones by number, as functions of `path` and `ax`."""
+    load()
+    entries = next((ENTRIES[kind.__name__] for kind in type(instance).__mro__ if kind.__name__ in ENTRIES), [])
+    numbered = list[tuple[int, str, Callable[..., Any]]]()
+    for entry in filter(lambda entry: entry.when(instance), entries):
+        if entry.each is None:
+            numbered.append((1, entry.name, partial(entry.draw, *entry.given(instance))))
+        for number, arguments in enumerate(entry.each(instance) if entry.each else (), 1):
+            numbered.append((number, f"{entry.name}-{number}", partial(entry.draw, *arguments)))
+    return {name: partial(drawn, draw) for _, name, draw in sorted(numbered, key=itemgetter(0))}
+
+
+def drawn(
+    draw: Callable[..., Picture | Panel], path: str | Path | None = None, *, ax: Any = None, **options: Any
+) -> Any:
+    """Draw a function's picture in the common style; return its figure, the path if it is saved, or the axes `ax`."""
+    if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
+        raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
+    with style():
+        described = draw(**options)
+        picture = Picture([[described]]) if isinstance(described, Panel) else described
+        saved = save_or_return(draw_picture(picture, ax=ax), path)
+    return saved if ax is None else ax
 
 
 def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any:

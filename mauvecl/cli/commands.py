@@ -170,8 +170,7 @@ class Session(flags.Options):
 
         def prepare() -> None:
             # Modules for tables and pictures are imported in advance, which saves 0.75 s at the end.
-            from mauvecl.charts.chart import load
-            from mauvecl.charts.matplotlib import available, style
+            from mauvecl.charts.matplotlib import available, load, style
 
             for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
                 import_module(name)

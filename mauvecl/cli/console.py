@@ -42,8 +42,6 @@ EXIT_CODES = (
     f"(a fault of mauvecl; a file with its traceback is named), {OUTPUT_FULL} standard output cannot be written, "
     f"{INTERRUPTED} interrupted, {READER_GONE} the reader of standard output went away, 143 terminated."
 )
-#: Largest number of characters of a message.
-LONGEST = 1000
 #: Error numbers of full disks and quotas, which name no file.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
@@ -53,12 +51,17 @@ REMOVED = {
     "--keep-after": "leave it out, since finished parts of a run are saved after 20 s",
     "--trials": "give --set change.trials=NUMBER",
 }
-#: Libraries that write to standard output for mauvecl.
-PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
-#: The running command line, whose flags messages name.
-_app: typer.Typer | None = None
-#: Output folder of the verb, once known, to which tracebacks are written.
-folder: Path | None = None
+PRINTERS = ("click", "typer", "rich", "mauvecl.cli")  # libraries that write to standard output for mauvecl
+LONGEST = 1000  # characters of a message
+WIDEST = 100_000  # width of a table in a pipe or file, characters
+PATIENCE_S = 2.0  # work that is shorter shows no progress
+CLEARED = "\r\x1b[K"  # clears the line of a terminal
+#: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
+TOLD_FROM = 0.01
+#: Units of the remaining time, s; smaller times than three of them are in the next one.
+UNITS = (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0))
+_app: typer.Typer | None = None  # the running command line, whose flags messages name
+folder: Path | None = None  # output folder of the verb, once known, to which tracebacks are written
 
 
 def guarded(app: typer.Typer) -> int:
@@ -194,18 +197,6 @@ def _write_traceback(error: Exception) -> Path | str:
                 file.write(text)
             return Path(name)
     return "no file, since none can be written"
-
-
-#: Work shorter than this shows no progress, s.
-PATIENCE_S = 2.0
-#: Largest width of a table in a pipe or file, characters.
-WIDEST = 100_000
-#: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
-TOLD_FROM = 0.01
-#: Units of the remaining time, s; smaller times than three of them are in the next one.
-UNITS = (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0))
-#: Clears the line of a terminal.
-CLEARED = "\r\x1b[K"
 
 
 class Meter:

@@ -35,8 +35,7 @@ PaperFlag = Annotated[
         "--paper", text="Ask with the conventions of the MauveSim paper: dark drawn in DN, all but the noise known."
     ),
 ]
-#: Key of a context that shows all flags.
-SHOWS_ALL = "mauvecl.help_all"
+SHOWS_ALL = "mauvecl.help_all"  # key of a context that shows all flags
 
 
 def _show_all(context: typer.Context, is_set: bool) -> None:

@@ -35,7 +35,12 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
 
-
+Answers = Mapping[str, Any]  # simulated answers to one question, by name
+OTHER = "detection otherwise"  # name of the detection with the other choice of unknowns; the card shows both
+#: Labels of the choices of the field "unknown".
+TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everything but the noise known"}
+#: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
+THROUGHPUT = 0.3
 #: Names of uploaded spectra by field, in the folder of their study.
 SPECTRA = {
     "star": "star.ecsv", "flare_file": "flare.ecsv", "flare_quiescent": "quiescent.ecsv", "change_file": "added.ecsv",
@@ -120,10 +125,6 @@ class FieldValues:
         return [value] if page_field.path[-1] == "amplitudes" else value
 
 
-#: Light other than the star's in an expectation.
-BEHIND = ("sky_electrons", "neighbour_electrons")
-
-
 class InterpolatedForm:
     """Closed form that is exact at some points and interpolated in the probit between them."""
 
@@ -143,12 +144,6 @@ class InterpolatedForm:
     def isf(self, probability: Float) -> Float:
         """Return the values that are exceeded with given probabilities."""
         return np.asarray(self._inverse(-special.ndtri(probability)))
-
-
-#: Simulated answers to one question, by name.
-Answers = Mapping[str, Any]
-#: Name of the detection with the other choice of unknowns; the card shows both.
-OTHER = "detection otherwise"
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +240,10 @@ class ClosedForms:
         """
         q, base = self.question, self.quiet
         statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
-        behind = {name: getattr(base, name) * (light if others else 1.0) for name in BEHIND}
-        quiet = replace(base, source_electrons=light * base.source_electrons, **behind)
+        behind = light if others else 1.0
+        sky, neighbours = behind * base.sky_electrons, behind * base.neighbour_electrons
+        star = light * base.source_electrons
+        quiet = replace(base, source_electrons=star, sky_electrons=sky, neighbour_electrons=neighbours)
         setting = self.case.setting(quiet)
         if not setting.used.any():
             return []
@@ -262,12 +259,6 @@ class ClosedForms:
 def short(value: float) -> str:
     """Format a number with three significant digits and no power of ten."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-#: Labels of the choices of the field "unknown".
-TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everything but the noise known"}
-#: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
-THROUGHPUT = 0.3
 
 
 class Chance(NamedTuple):

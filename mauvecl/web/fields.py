@@ -40,20 +40,25 @@ REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000
 
 #: Choices of what is unknown: the usual unknowns, and nothing but the noise.
 REALISTIC, IDEAL = UNKNOWN = ("realistic", "ideal")
+SKIES = ("brightness", "target and time", "none")
 #: Values of fields in links of version 1, which have other names today, with these names.
 FORMER_VALUES = {
     "unknown": {"nothing": IDEAL, "the usual": REALISTIC},
     "instrument": {"mauve": FORMERLY_MAUVE} | FORMER_NAMES,
 }
-SKIES = ("brightness", "target and time", "none")
-#: Largest number of characters of a field.
-MOST_CHARACTERS = 200
-#: Largest number of a visitor's targets.
-MOST_TARGETS = 30
-#: Largest number of characters of a table of neighbours, which is a part of links.
-MOST_TABLE = 3000
-#: Largest number of points of an unknown spectrum, which the study in every table contains.
-MOST_POINTS = 4000
+#: Headings of fields by the section of their key, unless they state another; fields of other sections show at once.
+HEADINGS = {
+    "flare.spectrum": "Flare's spectrum", "sky": "Sky", "run": "Detection", "limit": "Limit", "search": "Search",
+    "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
+    "calibrate": "Standards", "change": "Change",
+}  # fmt: skip
+MOST_CHARACTERS, MOST_TABLE = 200, 3000  # of a field, and of a table of neighbours, which is a part of links
+MOST_TARGETS = 30  # of a visitor
+MOST_POINTS = 4000  # of an unknown spectrum, which the study in every table contains
+NO_KEYS: Mapping[str, str] = MappingProxyType({})
+_FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")  # a flag of the command line
+#: A key within a message; words of prose contain no underscore.
+_KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
 
 
 @dataclass(frozen=True)
@@ -222,14 +227,6 @@ class Field(Widget):
         return self.own_keys or (".".join(self.path),)
 
 
-#: Headings of fields by the section of their key, unless they state another; fields of other sections show at once.
-HEADINGS = {
-    "flare.spectrum": "Flare's spectrum", "sky": "Sky", "run": "Detection", "limit": "Limit", "search": "Search",
-    "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
-    "calibrate": "Standards", "change": "Change",
-}  # fmt: skip
-
-
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
     default, unit = field.get_default(), first(field, Unit) or Unit("")
@@ -346,8 +343,7 @@ ADVANCED = {
     for name in ("Star", "Detection", "Flare's spectrum", "Measurement", "Detector", "Sky", "Unknown", "Change",
                  "Search", "Neighbours", "Pointing")
 }  # fmt: skip
-#: Fields of the card.
-SOLVED = _group("Limit")
+SOLVED = _group("Limit")  # fields of the card
 #: Fields that apply only with the file of another field, below which they stand.
 WITH_FILE = {"star": _group("Own spectrum"), "flare_file": _group("Own flare"), "change_file": _group("Added spectrum")}
 #: Fields of forms of their own, which stand in the panels of the tabs that read them.
@@ -367,13 +363,6 @@ PRESETS: dict[str, dict[str, str]] = {
     "M dwarf": {"star": "GJ 581", "magnitude": "10.6", "amplitude_percent": "10"},
     "Active G star": {"star": "G8V", "magnitude": "6.5", "amplitude_percent": "0.5", "exposure_s": "100"},
 }
-
-
-NO_KEYS: Mapping[str, str] = MappingProxyType({})
-#: A flag of the command line.
-_FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
-#: A key within a message; words of prose contain no underscore.
-_KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
 
 
 @cache

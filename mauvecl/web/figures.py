@@ -30,15 +30,11 @@ from mauvecl.host.stars.flare import EmissionLine
 if TYPE_CHECKING:
     from mauvecl.charts.chart import Chart, PlotAxis, Series
 
-#: Wavelengths that are shown, nm.
-SHOWN_NM = (195.0, 705.0)
+SHOWN_NM = (195.0, 705.0)  # wavelengths that are shown
 #: Spectral lines, and the Balmer jump at 4 / R_H with Rydberg's constant for hydrogen, nm in vacuum.
 MARKS = {name: EmissionLine.named(name).wavelengths_nm for name in ("Mg II", "Ca II", "H alpha")}
 MARKS["Balmer jump"] = (364.7,)
-#: Marks that are hidden by default.
-MORE_MARKS = ("H alpha",)
-
-
+MORE_MARKS = ("H alpha",)  # marks that are hidden by default
 #: Colours of the light and the dark theme by name, lighter on dark ground.
 INKS = {
     "light": INK,
@@ -54,8 +50,7 @@ PINS = {
     "light": (("#A21CAF", "6 3"), ("#7C4A03", "9 3 2 3"), ("#0E7490", "2 2")),
     "dark": (("#F0ABFC", "6 3"), ("#D9AE76", "9 3 2 3"), ("#67E8F9", "2 2")),
 }
-#: Colours of the curves of several targets.
-TARGETS = ("star", "flare", "sky", "own", "dark", "read", "bias", "drawn")
+TARGETS = ("star", "flare", "sky", "own", "dark", "read", "bias", "drawn")  # colours of several targets' curves
 
 
 class Canvas:

@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from mauvecl.web.figures import Canvas
     from mauvecl.web.uploads import Observations
 
-
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
-#: Colours of the dynamic spectrum, from low to high.
-BLUE, MIDDLE, RED = "#0072B2", "#F7F7F7", "#D55E00"
+BLUE, MIDDLE, RED = "#0072B2", "#F7F7F7", "#D55E00"  # colours of the dynamic spectrum, from low to high
+#: Limits of the energy axes, erg, the same for all questions; columns of `PlannedTarget.by_energy` in the pictures.
+ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
 
 
@@ -256,10 +256,6 @@ PERIODS = Tab(
     never=("power", "fap"),
     files={"periods": "periods"},
 )
-
-
-#: Limits of the energy axes, erg, the same for all questions; columns of `PlannedTarget.by_energy` in the pictures.
-ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 
 
 def _energy(value: Any) -> str:

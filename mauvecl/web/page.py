@@ -31,6 +31,12 @@ from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PL
 from mauvecl.web.tab import Tab
 from mauvecl.web.uploads import UPLOADS
 
+WITH_MESSAGES = ("detection", "measure")  # answers whose messages are shown, which include those of the others
+NOMINAL = "The throughput is nominal"  # start of the message about it, which the page shows once
+#: Kinds of messages that change the answer, which are shown in red.
+CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
+            "outside the prior"}  # fmt: skip
+MOST_LINKED = 8192  # characters of a link that are parsed
 #: Tabs with pictures, in the order of their group.
 DRAWN = (DETECTION, SPECTRUM, SIGNAL, NOISE, LIMIT, MEASUREMENT, UNKNOWN, CHANGE, PERIODS, COMPLETENESS, ANALYSE,
          CALIBRATE, VISIBILITY, PLAN)  # fmt: skip
@@ -53,7 +59,6 @@ TABS: dict[str, Tab] = {
     if tab.group == group
 }
 
-
 #: Questions that a button simulates, with the first tab that has the button.
 SIMULATIONS = {name: tab for tab in reversed(TABS.values()) for name in tab.simulations}
 
@@ -61,15 +66,6 @@ SIMULATIONS = {name: tab for tab in reversed(TABS.values()) for name in tab.simu
 def reads_of(simulation: str) -> frozenset[str]:
     """Return the fields on which the answers of a simulation depend."""
     return SIMULATIONS[simulation].reads_of(simulation)
-
-
-#: Part of the message about the throughput, which the page shows once.
-NOMINAL = "The throughput is nominal"
-#: Kinds of messages that change the answer, which are shown in red.
-CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
-            "outside the prior"}  # fmt: skip
-#: Answers whose messages are shown, since they include those of the others.
-WITH_MESSAGES = ("detection", "measure")
 
 
 def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
@@ -159,8 +155,6 @@ def _simulation_names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-#: Largest number of characters of a link that are parsed.
-MOST_LINKED = 8192
 #: Entries of a link in addition to the question.
 SEEN = {
     "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),

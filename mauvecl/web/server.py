@@ -47,8 +47,30 @@ from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, content_of, releas
 if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
 
-#: Largest number of simultaneous visitors, with some megabytes each (assumed to suffice for a team).
-MAX_VISITORS = 100
+# Limits of the server; sizes in bytes.
+MAX_VISITORS = 100  # at the same time, with some megabytes each (assumed to suffice for a team)
+MAX_CONNECTIONS = 512  # beyond which the oldest without a page is closed; browsers open up to six
+MESSAGE = 17 * 2**20  # from a page: an upload with a margin
+BODY = 2**16  # of a request, of which the page has none
+REQUEST_S = 20.0  # for the headers and the body of each request
+IDLE_S, SWEEP_S = 3600, 5  # after which unused pages are disconnected, and interval of this check
+PING_S = 20  # between pings of a connection, which is closed if it does not reply
+CLOSED_FORMS = 2  # threads, besides the event loop, that compute closed forms, pictures and files for all visitors
+MOST_LOGGED = 1200  # characters of a line of the log
+ASSETS = Path(__file__).parent / "assets"
+#: The page connects to its own server only, and runs only its own code. Browsers ask whether a file has changed, unless
+#: its address states its version.
+HEADERS = {
+    "Cache-Control": "no-cache",
+    "Content-Security-Policy": (
+        "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+#: Columns of the page's table of targets that have other names in tables, with the keys of targets.
+HEADINGS = {"name": "name", "spectral_type": "spectral_type", "V": "magnitude", "coordinates": "coordinates"}
 #: A host as browsers write it: name, IPv4 address or IPv6 address in brackets; and a port.
 HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
 
@@ -129,16 +151,12 @@ class BoundedServer(HTTPServer):
         super().handle_stream(stream, address)
 
 
-#: Largest number of characters of a line.
-MOST = 1200
-
-
 class OneLine(logging.Formatter):
     """Formatter that writes one line of bounded length, with the lines of mauvecl in the traceback of an exception."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        return printable(" ".join(super().format(record).split()), MOST)
+        return printable(" ".join(super().format(record).split()), MOST_LOGGED)
 
     def formatException(self, ei: Any) -> str:  # noqa: N802
         """Return kind and message of an exception, and modules and lines of its traceback: ours, or the last one."""
@@ -147,20 +165,6 @@ class OneLine(logging.Formatter):
         frames = [(frame.f_globals.get("__name__", "?"), line) for frame, line in traceback.walk_tb(ei[2])]
         ours = [frame for frame in frames if frame[0].startswith("mauvecl.")] or frames[-1:]
         return f"({ei[0].__name__}: {ei[1]}; {', '.join(f'{name} line {line}' for name, line in ours)})"
-
-
-#: Largest size in bytes of a message, an upload with a margin, and of a request's body, of which the page has none.
-MESSAGE, BODY = 17 * 2**20, 2**16
-#: Seconds that a connection may take for the headers and the body of each request.
-REQUEST_S = 20.0
-#: Largest number of open connections, beyond which the oldest without a page is closed; browsers open up to six.
-MAX_CONNECTIONS = 512
-#: Seconds after which unused pages are disconnected, and interval of this check.
-IDLE_S, SWEEP_S = 3600, 5
-#: Threads, besides the event loop, that compute closed forms, pictures and files for all visitors.
-CLOSED_FORMS = 2
-#: Seconds between pings of a connection, which is closed if it does not reply.
-PING_S = 20
 
 
 def make(address: str, port: int, allowed: Sequence[str]) -> Any:
@@ -258,20 +262,6 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     asyncio.run(run())
 
 
-#: The page connects to its own server only, and runs only its own code. Browsers ask whether a file has changed, unless
-#: its address states its version.
-HEADERS = {
-    "Cache-Control": "no-cache",
-    "Content-Security-Policy": (
-        "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-}
-ASSETS = Path(__file__).parent / "assets"
-
-
 @cache
 def front() -> bytes:
     """Return the page."""
@@ -286,10 +276,6 @@ def front() -> bytes:
         titles=TITLES, digest=digest, words=json.dumps(_words()).replace("<", "\\u003c"),
     )  # fmt: skip
     return str(text).encode()
-
-
-#: Columns of the page's table of targets that have other names in tables, with the keys of targets.
-HEADINGS = {"name": "name", "spectral_type": "spectral_type", "V": "magnitude", "coordinates": "coordinates"}
 
 
 def _words() -> dict[str, Any]:

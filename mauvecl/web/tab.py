@@ -44,6 +44,16 @@ MAP_STEPS, MAP_REALISATIONS = 8, 20_000
 INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
 #: Largest number of simulated fits, and of those of two temperatures, which take fifty times as long.
 MOST_FITS, MOST_OF_TWO = 10_000, 1000
+DRAWN_UNITS = ("realisations", "steps", "cells")  # of the progress of verbs that use the pool's devices
+FIXED = ("star", "amplitude")  # columns that the page does not show: its question has one star and one flare
+#: Keys that are stated even at their default, so that readers see what was assumed.
+STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
+          "run.realisations", "run.seed")  # fmt: skip
+#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
+ALWAYS_USED = ("nuisances.", "observation.temperature_c")
+MOST_CHARACTERS = 500  # of a value in a command; a longer one is in the study file
+ANYTHING = TypeAdapter(Any)
+_drawing = threading.Lock()  # held while matplotlib draws
 
 
 def _map_around(study: Study) -> Study:
@@ -86,8 +96,6 @@ QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
     "completeness": Simulation(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
     "periods": Simulation(("change",), partial(_changed, change={"periods": True})),
 }
-#: Units of the progress of verbs that use the pool's devices.
-DRAWN_UNITS = ("realisations", "steps", "cells")
 
 
 def simulate(
@@ -113,10 +121,6 @@ def simulate(
             if key != OTHER:
                 raise
     return answers
-
-
-#: Columns that the page does not show: its question has one star and one flare.
-FIXED = ("star", "amplitude")
 
 
 def target_words(question: FieldValues) -> str:
@@ -199,14 +203,6 @@ class Tab:
         return [headings, *cells] if headings else []
 
 
-#: Keys that are stated even at their default, so that readers see what was assumed.
-STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
-          "run.realisations", "run.seed")  # fmt: skip
-#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
-ALWAYS_USED = ("nuisances.", "observation.temperature_c")
-#: Longest value in a command; a longer one is in the study file.
-MOST_CHARACTERS = 500
-
 PROGRAM = """from mauvecl import Engine, Study, {verb}
 
 study = Study.build(
@@ -216,9 +212,6 @@ study = Study.build(
 answer = {verb}(study, Engine(){options})
 print(next(iter(answer.tables.values())))
 """
-
-
-ANYTHING = TypeAdapter(Any)
 
 
 def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -295,10 +288,6 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
 def _text(value: str | float) -> str:
     """Return a value as it is typed, with every digit of a number."""
     return value if isinstance(value, str) else str(value).removesuffix(".0")
-
-
-#: Held while matplotlib draws.
-_drawing = threading.Lock()
 
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
