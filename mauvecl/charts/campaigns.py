@@ -41,16 +41,11 @@ def overview(answer: PlanAnswer) -> Picture:
     logs = np.log10(energies[np.isfinite(energies)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, flare_axis = (
-        PlotAxis(limits=(len(planned) - 0.5, -0.5), ticks=names),
-        PlotAxis("flares recovered", True, (0.05, None)),
-    )
-    energy_axis, above = PlotAxis("bolometric energy (erg)", True, decades), "mean (dot), and 95 % of campaigns"
-    row = [
-        Panel(flare_axis, y, _bars(np.maximum(flares, 0.05), "star"), above),
-        Panel(energy_axis, y, _bars(energies, "flare"), "recovered in 50 % (dot) to 90 %"),
-    ]
-    return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
+    y, x = PlotAxis(limits=(len(planned) - 0.5, -0.5), ticks=names), PlotAxis("flares recovered", True, (0.05, None))
+    left = Panel(x, y, _bars(np.maximum(flares, 0.05), "star"), "mean (dot), and 95 % of campaigns")
+    x = PlotAxis("bolometric energy (erg)", True, decades)
+    right = Panel(x, y, _bars(energies, "flare"), "recovered in 50 % (dot) to 90 %")
+    return Picture([[left, right]], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
 
 
 def _bars(values: Any, colour: str) -> list[Series]:
@@ -324,12 +319,10 @@ def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
         row, x = target.by_energy, PlotAxis("bolometric energy (erg)", log=True)
         energy, often = row["energy"], row["rate_above"] * target.hours / 24
         share = Line("", "star", at=(energy, row["recovered"]))
-        limits = [Rule("", dash=dash, at=target.energy_at(p)) for p, dash in ((0.5, "--"), (0.9, ":"))]
-        shares = (
-            PlotAxis("share recovered", limits=(0, 1.02)),
-            [share, *(limit for limit in limits if np.isfinite(limit.at))],
-        )
-        rows.append([Panel(x, *shares, "flares recovered (E50 dashed, E90 dotted)", _plain_decades)])
+        limits = [(target.energy_at(p), dash) for p, dash in ((0.5, "--"), (0.9, ":"))]
+        series = [share, *(Rule("", dash=dash, at=at) for at, dash in limits if np.isfinite(at))]
+        y = PlotAxis("share recovered", limits=(0, 1.02))
+        rows.append([Panel(x, y, series, "flares recovered (E50 dashed, E90 dotted)", _plain_decades)])
         if target.rates is not None:
             rate = Line("", "flare", at=(energy, np.where(often > 0, often, np.nan)))
             above = PlotAxis(f"flares above this energy in {target.hours:.0f} h", log=True)
@@ -341,14 +334,12 @@ def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
 
 def _plain_decades(axes: Any) -> None:
     """Label whole decades as 1e33, since minor ticks and formulas take most of the drawing time."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import LogLocator, NullLocator
 
     for axis in (axis for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
         axis.set_major_locator(LogLocator())
         axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(
-            FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}")
-        )
+        axis.set_major_formatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}")
 
 
 def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[ReportPart]]:

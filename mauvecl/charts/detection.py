@@ -141,9 +141,8 @@ def _asinh(axis: Any, ends: tuple[float, float]) -> None:
 def roc_columns(curve: Roc) -> tuple[Any, ...]:
     """Return false-alarm and detection probabilities with the ends of their intervals, where there are alarms."""
     points = curve.points()
-    return tuple(
-        points[name][points["fap"] > 0] for name in ("fap", "probability", "probability_low", "probability_high")
-    )
+    alarms = points[points["fap"] > 0]
+    return tuple(alarms[name] for name in ("fap", "probability", "probability_low", "probability_high"))
 
 
 @picture_of("Roc", "roc")
@@ -339,12 +338,9 @@ def limits(answer: LimitAnswer) -> Picture:
         f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
         f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise"
     )
-    x, y = (
-        quantity_axis(answer.study, of, log=of != "magnitude"),
-        PlotAxis("detection probability", limits=(-0.02, 1.02)),
-    )
-    notes = (chart.throughput_of(answer.inputs),)
-    return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, notes, below=True)
+    y, notes = PlotAxis("detection probability", limits=(-0.02, 1.02)), (chart.throughput_of(answer.inputs),)
+    panel = Panel(quantity_axis(answer.study, of, log=of != "magnitude"), y, series)
+    return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, notes, below=True)
 
 
 #: Noise by origin, as on the page and in files.

@@ -255,7 +255,7 @@ def _finish(axis: Any, panel: Panel) -> None:
 
     Logarithmic ticks are plain numbers (0.1, 20, 500), with intermediate ones only over few decades.
     """
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
         limits, name = RANGE_NM if of.kind == "wavelength" and of.limits is None else of.limits, side.axis_name
@@ -272,7 +272,7 @@ def _finish(axis: Any, panel: Panel) -> None:
             most = 1 if name == "x" and (low < 1e-4 or high > 1e5) else 2
             side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
         if decades < 4:
-            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
+            side.set_major_formatter(lambda value, _: written(value))
         side.set_minor_formatter(NullFormatter())
     if panel.finish is not None:
         panel.finish(axis)
@@ -330,10 +330,8 @@ def _draw_series(axis: Any, item: Series) -> Any:
             form = "o" if item.marker == "circle" else item.marker or "none"
             axis.errorbar(*at, fmt=form, markersize=0.6 * item.size, elinewidth=0.6 * item.width, **look)
         case Line():
-            step = "steps-mid" if item.step else "default"
-            axis.plot(
-                *at, linestyle=item.dash or "-", marker=item.marker, markersize=3, drawstyle=step, **look, **width
-            )
+            look |= {"marker": item.marker, "markersize": 3, "drawstyle": "steps-mid" if item.step else "default"}
+            axis.plot(*at, linestyle=item.dash or "-", **look, **width)
     return None
 
 

@@ -379,9 +379,8 @@ def joint(star: MeasuredStare, fit: JointFit) -> Picture:
     off = Dots("", "star", size=4, at=(time, (drawn - mean)[near]))
     true, fitted = fit.true.kelvin[near], fit.fitted.kelvin[near]
     simulated = Line("simulated flare", "text", dash="dashed", at=(time, true))
-    kelvin = PlotAxis(
-        "temperature (K)", limits=(0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max()))
-    )
+    limits = 0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max())
+    kelvin = PlotAxis("temperature (K)", limits=limits)
     rows = [
         [Panel(x, PlotAxis("light (DN per frame)"), [dots, Line("joint fit", "star", at=(time, mean[near]))])],
         [Panel(x, PlotAxis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],

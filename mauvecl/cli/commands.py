@@ -141,10 +141,8 @@ class Session(flags.Options):
         with report_interrupts(saved), checkpoint:
             self.say(checkpoint.messages)
             yield checkpoint
-            if checkpoint.damaged:
-                self.say(
-                    [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
-                )
+            if damaged := checkpoint.damaged:
+                self.say([f"{damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."])
         self._checkpoint = checkpoint
 
     def say(self, lines: Sequence[str]) -> None:
@@ -250,9 +248,8 @@ class Session(flags.Options):
         about: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "files": self.files}
         about |= {"seconds": time.perf_counter() - self.started, "messages": [*answer.messages, *answer.remarks]}
         # Only a complete answer replaces another's files.
-        self.write_file(
-            lambda: write_record(self.verb, data, answer.inputs, self.folder, whole=not self._lost, **about)
-        )
+        about["whole"] = not self._lost
+        self.write_file(partial(write_record, self.verb, data, answer.inputs, self.folder, **about))
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
@@ -359,9 +356,7 @@ class Command:
         detects = {"fap", "realisations"} <= keywords.keys()
         question_values(study, detects=detects, draws=self.draws, insist=options.get("insist", False))
         with ExitStack() as resources:
-            session = Session(
-                self.verb.name, study, flag_values, resources, draws=self.draws, notes=messages, **options
-            )
+            session = Session(self.verb.name, study, flag_values, resources, self.draws, messages, **options)
             try:
                 self.run(session, **values)
             except InputError:
@@ -382,9 +377,7 @@ class Command:
         }
 
 
-RowsFlag = Annotated[
-    str | None, flags.option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")
-]
+Rows = Annotated[str | None, flags.option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")]
 
 
 def realise(session: Session) -> None:
@@ -451,7 +444,7 @@ def verify(
     redraw: Annotated[
         bool, typer.Option("--redraw", help="Redraw and compare every spectrum, not only the digests.")
     ] = False,
-    rows: RowsFlag = None,
+    rows: Rows = None,
     device: flags.DeviceFlag = None,
     as_json: flags.JsonFlag = False,
     quiet: flags.QuietFlag = False,
@@ -502,7 +495,7 @@ def export(
     array: Annotated[
         list[str] | None, flags.option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all].")
     ] = None,
-    rows: RowsFlag = None,
+    rows: Rows = None,
     replace: flags.ReplaceFlag = False,
     quiet: flags.QuietFlag = False,
 ) -> None:

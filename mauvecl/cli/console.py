@@ -176,9 +176,8 @@ def _not_written(error: OSError) -> int:
         os.close(nowhere)
     if isinstance(error, BrokenPipeError):
         return READER_GONE
-    return _say(
-        f"standard output cannot be written ({error.strerror}); use one with room (files are kept)", OUTPUT_FULL
-    )
+    reason = error.strerror
+    return _say(f"standard output cannot be written ({reason}); use one with room (files are kept)", OUTPUT_FULL)
 
 
 def _write_traceback(error: Exception) -> Path | str:

@@ -201,10 +201,8 @@ SPECTRUM = Tab(
 def excess(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the flare minus quiet in standard deviations of the noise."""
     x, saturated = closed.quiet, closed.quiet.saturated | closed.flare.saturated
-    rise, noise2 = (
-        np.where(x.saturated, 0.0, values) for values in (closed.flare.signal_dn - x.signal_dn, x.variance_dn2)
-    )
-    noise = np.sqrt(x.per_element(noise2))
+    rise = np.where(x.saturated, 0.0, closed.flare.signal_dn - x.signal_dn)
+    noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
     element = np.divide(x.per_element(rise), noise, out=np.zeros(noise.size), where=noise > 0)
     series: dict[str, Any] = {
         "pixel": (x.wavelength_nm, rise / np.sqrt(x.variance_dn2)),

@@ -105,9 +105,8 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
 
 def read_frames(question: FieldValues) -> dict[str, Any]:
     """Read the frames."""
-    frames = read_frames_of(
-        question.uploads["frames"], question.uploads.get("mapping"), quality_bits=question.quality_bits
-    )
+    files = question.uploads
+    frames = read_frames_of(files["frames"], files.get("mapping"), quality_bits=question.quality_bits)
     if frames.flux.size > MOST_VALUES:
         raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
     return {"frames": frames}
@@ -181,10 +180,8 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
         lines = spectra.along_magnitude(answer, units)
         return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(finite), finite)})
 
-    axis, lines = (
-        PlotAxis(f"smallest change ({label})", log=True),
-        (Targets(name, tips=(label,)), OwnMarker("this star")),
-    )
+    axis = PlotAxis(f"smallest change ({label})", log=True)
+    lines = Targets(name, tips=(label,)), OwnMarker("this star")
     changes = Chart(name, title, PlotAxis("magnitude"), axis, lines, sets="magnitude=x")
     return changes.data("change", "Change computes which differences between visits are detected.")(along)
 

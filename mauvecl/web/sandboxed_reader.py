@@ -80,9 +80,7 @@ def _read_apart(
         for file, contained in files.items():
             (Path(folder) / file).write_bytes(contained)
         try:
-            process = subprocess.run(
-                command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
-            )
+            process = subprocess.run(command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment)
         except subprocess.TimeoutExpired as error:
             raise InputError(f"the upload takes more than {SECONDS} s to read; give {smaller}", key="upload") from error
         except OSError as error:

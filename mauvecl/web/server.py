@@ -80,12 +80,10 @@ def local(address: str) -> bool:
     if not address.strip():
         raise InputError.of("address", address, "one such as 127.0.0.1, ::1 or 0.0.0.0")
     try:
-        addresses = {
-            str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)
-        }
+        infos = socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
         raise InputError.of("address", address, "one such as 127.0.0.1") from error
-    return all(ipaddress.ip_address(address).is_loopback for address in addresses)
+    return all(ipaddress.ip_address(str(info[4][0]).split("%")[0]).is_loopback for info in infos)
 
 
 def netloc(address: str, port: int) -> str:
@@ -286,9 +284,7 @@ def _words() -> dict[str, Any]:
         "sliders": {name: vars(field.slider) for name, field in fields.FIELDS.items() if field.slider is not None},
         "stars": all_names(),
         "example": "AU Mic\nYZ CMi\neps Eri",
-        "headings": {
-            column: [name.lower() for name in (key, *TARGET_COLUMNS[key])] for column, key in HEADINGS.items()
-        },
+        "headings": {name: [text.lower() for text in (key, *TARGET_COLUMNS[key])] for name, key in HEADINGS.items()},
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
         "uploads": {
             name: {"entered": upload.entered, "options": upload.fields, "most": upload.most}

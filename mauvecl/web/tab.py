@@ -181,10 +181,8 @@ class Tab:
 
     def reads_of(self, *questions: str) -> frozenset[str]:
         """Return the fields on which questions depend, by the keys that the flags of their verbs set."""
-        verbs = [VERBS[verb] for question in questions for verb in QUESTIONS[question].verbs]
-        names = (
-            name for name, field in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in field.keys)
-        )
+        accepts = [VERBS[verb].accepts for question in questions for verb in QUESTIONS[question].verbs]
+        names = (name for name, field in FIELDS.items() if any(takes(key) for takes in accepts for key in field.keys))
         return frozenset({*names, *self.also}).difference(self.never)
 
     def offers(self, name: str, answers: Answers) -> bool:

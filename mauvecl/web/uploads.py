@@ -87,10 +87,8 @@ class Observations:
         """Keep an archive, which must hold one study with observations, and all files that it names."""
         files = unzipped(content)
         studies = [rows for file, text in files.items() if file.endswith(".toml") and (rows := _rows_of(file, text))]
-        if len(studies) != 1:
-            raise refusal(
-                f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}"
-            )
+        if (n := len(studies)) != 1:
+            raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], but holds {n}")
         (rows,) = studies
         if len(rows) > MOST_FILES:
             raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")

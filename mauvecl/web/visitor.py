@@ -400,10 +400,9 @@ class Visitor(WebSocketHandler):
             raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
         unit = VERBS[main].counts
+        ask = partial(simulate, kind, closed.case.study, inputs=closed.inputs)
         # Several verbs count the realisations of all in the pool.
-        job = self.job = Job(
-            partial(simulate, kind, closed.case.study, inputs=closed.inputs), unit in DRAWN_UNITS, "" if more else unit
-        )
+        job = self.job = Job(ask, unit in DRAWN_UNITS, "" if more else unit)
         answers = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([answers], timeout=REPORT_S))[0]:
