@@ -26,6 +26,22 @@ if TYPE_CHECKING:
 
 MOST_CALENDARS = 6  # targets with a calendar each; more targets are rows of one picture
 MOST_MONTHS = 8  # whose names fit side by side
+PAGE, MARGIN = (8.27, 11.69), 0.6  # A4, and its margin, inches
+LETTER, BOLD, LINE = 0.53, 1.1, 1.4  # over the size: width of a letter, factor of a bold one, and line spacing
+#: Starts of the columns of the summary, of a target and of the assumptions, as fractions of the text width.
+SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
+TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
+SMALL, NORMAL, MANY = 5.5, 7.0, 9  # text of wide tables and of others, and columns of a wide one
+COLOURS_KEPT = 64  # in the pictures of an HTML report
+#: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
+PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 0.09, "hspace": 0.35, "wspace": 0.3}
+#: Explanation of the summary's columns.
+LEGEND = (
+    "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
+    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
+    "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
+    "P(>= 1): probability of recovering any. False alarms: expected from noise. Numbers are those of plan.ecsv."
+)
 
 
 @picture_of("PlanAnswer", "plan")
@@ -104,20 +120,6 @@ def _first_days(answer: VisibleAnswer, most: int) -> tuple[list[int], list[str]]
 
 def _month(day: str) -> str:
     return f"{months_of_years.month_abbr[int(day[5:7])]} {day[:4]}"
-
-
-PAGE, MARGIN = (8.27, 11.69), 0.6  # A4, and its margin, inches
-#: Approximate width of a letter divided by its size, for line breaks; that of bold letters over it; line spacing over
-#: the size.
-LETTER, BOLD, LINE = 0.53, 1.1, 1.4
-#: Starts of the columns of the summary, of a target and of the assumptions, as fractions of the text width.
-SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
-TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
-#: Sizes of text on a page: of tables with many columns, and of others; number of columns that are many.
-SMALL, NORMAL, MANY = 5.5, 7.0, 9
-COLOURS_KEPT = 64  # in the pictures of an HTML report
-#: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
-PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 0.09, "hspace": 0.35, "wspace": 0.3}
 
 
 @dataclass(frozen=True)
@@ -256,20 +258,8 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[ReportPart]]:
     return f"{answer.instrument_name}: {answer.heading}", parts
 
 
-#: Explanation of the columns.
-LEGEND = (
-    "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
-    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
-    "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
-    "P(>= 1): probability of recovering any. False alarms: expected from noise. Numbers are those of plan.ecsv."
-)
-
-
 def _target_lines(answer: PlanAnswer, k: int, cells: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Return the lines on a target: quantity, value, and the file and column of the value.
-
-    `cells` has the texts of the target in the table of the plan, by column.
-    """
+    """Return the lines on a target: quantity, value, and its file and column; `cells` are those of the plan's table."""
     target, observation = answer.planned[k], answer.planned[k].observation
     place, star, visible = observation.target, observation.case.star, answer.seen
     lines = [

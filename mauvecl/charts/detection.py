@@ -41,6 +41,11 @@ MARKS = "osD^vPX"  # markers of limits with the same colour
 MARGIN = 0.04  # share of the axis of a statistic that stays empty on either side
 #: Length of the axis of a weighted sum, in the inverse hyperbolic sine, above which few of its ticks have a number.
 WIDE = 5.0
+#: Components of a raw spectrum, as in the paper's figure.
+COMPONENTS = {
+    "raw": "raw spectrum", "source": "star", "sky": "zodiacal light", "photon_noise": "photon noise",
+    "dark": "dark current", "bias": "bias", "read_noise": "read noise",
+}  # fmt: skip
 #: A star: title, findings, and its flares' names.
 Shown = tuple[str, "Detection", Sequence[str]]
 
@@ -141,8 +146,8 @@ def _asinh(axis: Any, ends: tuple[float, float]) -> None:
 def roc_columns(curve: Roc) -> tuple[Any, ...]:
     """Return false-alarm and detection probabilities with the ends of their intervals, where there are alarms."""
     points = curve.points()
-    alarms = points[points["fap"] > 0]
-    return tuple(alarms[name] for name in ("fap", "probability", "probability_low", "probability_high"))
+    alarms = points["fap"] > 0
+    return tuple(points[name][alarms] for name in ("fap", "probability", "probability_low", "probability_high"))
 
 
 @picture_of("Roc", "roc")
@@ -190,18 +195,6 @@ def _complete_elements(x: Expectation) -> NDArray[np.bool_]:
     """Return the complete elements; the last one of the spectrum may have fewer pixels."""
     pixels = np.bincount(x.element, minlength=x.element_wavelength_nm.size)
     return np.asarray(pixels >= np.median(pixels) - 1)
-
-
-#: Components of a raw spectrum, as in the paper's figure.
-COMPONENTS = {
-    "raw": "raw spectrum",
-    "source": "star",
-    "sky": "zodiacal light",
-    "photon_noise": "photon noise",
-    "dark": "dark current",
-    "bias": "bias",
-    "read_noise": "read noise",
-}
 
 
 @picture_of("SimulateAnswer", "observation", each=lambda answer: answer.observations)

@@ -27,11 +27,9 @@ if TYPE_CHECKING:
 
 #: Labels of the size axes.
 SIZES = {
-    "amplitude": "flare amplitude",
-    "duration": "equivalent duration (s)",
-    "energy": "bolometric energy (erg)",
+    "amplitude": "flare amplitude", "duration": "equivalent duration (s)", "energy": "bolometric energy (erg)",
     "band_energy": "energy in the band (erg)",
-}
+}  # fmt: skip
 # Largest numbers of half-widths with a curve each, and of maps in a picture.
 MOST_CURVES, MOST_MAPS = 6, 6
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
@@ -175,10 +173,7 @@ def dynamic_spectrum(star: StarStare) -> Picture:
 def spectra_panel(
     stare: Stare, spectra: NDArray[Any], sd: NDArray[Any], wavelength_nm: Float, marks: Sequence[tuple[Any, str]] = ()
 ) -> tuple[Panel, float]:
-    """Return spectra, of shape (n_frame, n_pixel), in standard deviations from their median, and the s of a column.
-
-    The ends of events in time are marked above the spectra in colours.
-    """
+    """Return spectra, (n_frame, n_pixel), in standard deviations from their median, and the seconds of a column."""
     scale, unit = shown_time_unit(stare.duration_s)
     # The stare is shown on a regular grid with empty gaps.
     numbers = stare.numbers - stare.numbers[0]
@@ -205,10 +200,7 @@ def spectra_panel(
 
 
 def column_sums(values: Float, numbers: NDArray[np.int64], most: int) -> tuple[Float, Float, int]:
-    """Return sums of the finite values of rows by their numbers, their counts, and the numbers in each of `most` sums.
-
-    Sums and counts have the shape (n_sum, n_column).
-    """
+    """Return sums of finite values of rows by number, (n_sum, n_column), their counts, and the numbers in each sum."""
     step = -(-(int(numbers[-1]) + 1) // most)
     sums, counts = np.zeros((2, int(numbers[-1]) // step + 1, values.shape[1]))
     finite = np.isfinite(values)
@@ -291,10 +283,7 @@ def light_curve_series(
 
 @picture_of("AnalyseAnswer", "light-curve")
 def observed_light_curve(answer: AnalyseAnswer) -> Picture:
-    """Plot the observed light curve with its level and the level's band of 95 %, events, and frames not searched.
-
-    If there are bright events, a second panel shows the flux less the level.
-    """
+    """Plot the observed light curve with its level and events, and the flux less the level if events are bright."""
     analysis, used = answer.analysis, answer.analysis.level.used
     frames, flux, error = analysis.frames, analysis.flux, analysis.level.error
     unit_s, unit = shown_time_unit(float(np.ptp(frames.time_s)))

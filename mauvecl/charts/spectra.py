@@ -337,10 +337,7 @@ def errors(answer: MeasureAnswer) -> Picture:
 
 @picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(star,) for star in answer.stares if star.perfect])
 def temperatures(star: MeasuredStare) -> Picture:
-    """Plot temperature, size and light of the flares of a stare against time, with 95 % intervals.
-
-    Lines are the fits to the same frames without noise.
-    """
+    """Plot temperature, size and light of flares along a stare with 95 % intervals, and fits without noise as lines."""
     drawn, perfect, rows = star.drawn, star.perfect, list[list[Panel]]()
     assert drawn is not None
     assert perfect is not None

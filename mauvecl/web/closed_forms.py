@@ -41,6 +41,12 @@ OTHER = "detection otherwise"  # name of the detection with the other choice of 
 TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everything but the noise known"}
 #: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
 THROUGHPUT = 0.3
+#: Words for a limit by its quantity: before its value, the value, without a limit, and for one that takes a simulation.
+LIMITS: dict[str, tuple[str, Callable[[float], str], str, str]] = {
+    "amplitude": ("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude", "of an amplitude"),
+    "magnitude": ("to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude"),
+    "exposure": ("in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure"),
+}
 #: Names of uploaded spectra by field, in the folder of their study.
 SPECTRA = {
     "star": "star.ecsv", "flare_file": "flare.ecsv", "flare_quiescent": "quiescent.ecsv", "change_file": "added.ecsv",
@@ -159,10 +165,7 @@ class ClosedForms:
     def of(
         cls, question: FieldValues, folder: Path, *, chance: bool = True, inputs: Mapping[str, Any] | None = None
     ) -> ClosedForms:
-        """Answer a question; `folder` holds the visitor's files for the study, and `inputs` their contents.
-
-        Without the `chance` of detection, the star may be too bright for a detection.
-        """
+        """Answer a question with files in `folder`; without the `chance`, no flare needs to be detectable."""
         case = question.case(folder)
         # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.
         values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
@@ -209,14 +212,9 @@ class ClosedForms:
         return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
     @cached_property
-    def null(self) -> InterpolatedForm:
-        """Distribution of the statistic without a flare, for pictures."""
-        return InterpolatedForm(self.odds.null)
-
-    @cached_property
-    def flaring(self) -> InterpolatedForm:
-        """Distribution of the statistic with the flare, for pictures."""
-        return InterpolatedForm(self.odds.flaring)
+    def forms(self) -> tuple[InterpolatedForm, InterpolatedForm]:
+        """Distributions of the statistic without and with the flare, for pictures."""
+        return InterpolatedForm(self.odds.null), InterpolatedForm(self.odds.flaring)
 
     @cached_property
     def messages(self) -> list[str]:
@@ -234,10 +232,7 @@ class ClosedForms:
         return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
     def at(self, light: float, rises: Float, *, others: bool = False) -> list[DetectionForms]:
-        """Return the closed forms for factors on the light, with `others` all light's, and on the amplitude, (n_rise,).
-
-        The list is empty if the star saturates every pixel.
-        """
+        """Return closed forms for factors on light (`others`: on all light) and amplitude; none if all saturates."""
         q, base = self.question, self.quiet
         statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
         behind = light if others else 1.0
@@ -294,14 +289,6 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             value, origin = float("nan"), sentence(error)
         all_chances.append(Chance(unknown, value, origin))
     return all_chances
-
-
-#: Words for a limit by its quantity: before its value, the value, without a limit, and for one that takes a simulation.
-LIMITS: dict[str, tuple[str, Callable[[float], str], str, str]] = {
-    "amplitude": ("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude", "of an amplitude"),
-    "magnitude": ("to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude"),
-    "exposure": ("in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure"),
-}
 
 
 def solved(closed: ClosedForms) -> str:

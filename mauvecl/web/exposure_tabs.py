@@ -245,8 +245,8 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
 def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the distributions of the statistic without and with the flare, and the threshold."""
     q, threshold, chance = closed.question, closed.odds.threshold, closed.chance
-    series: dict[str, Any] = {}
-    for name, form in (("null", closed.null), ("flare", closed.flaring)):
+    series, (null, flaring) = dict[str, Any](), closed.forms
+    for name, form in (("null", null), ("flare", flaring)):
         edges = np.linspace(form.mean - 5 * form.std, form.mean + 5 * form.std, 161)
         beyond = form.sf(edges)
         density = np.maximum(beyond[:-1] - beyond[1:], 0.0)
@@ -263,8 +263,8 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
     series["threshold"] = threshold if threshold == threshold else None
     share = f"{chance_text(chance)} of flares lie above the threshold of {threshold:.4g}"
     text = (
-        f"Without a flare {q.statistic} lies at {with_error(closed.null.mean, closed.null.std)}, with it at "
-        f"{with_error(closed.flaring.mean, closed.flaring.std)}; "
+        f"Without a flare {q.statistic} lies at {with_error(null.mean, null.std)}, with it at "
+        f"{with_error(flaring.mean, flaring.std)}; "
         f"{share if threshold == threshold else 'no threshold has this false-alarm probability'}."
     )
     return ChartData(text, series, {"x axis": {"axis_label": statistic_label(q.statistic)}})
@@ -283,9 +283,9 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
 ).data()  # fmt: skip
 def trade(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the detection probability against the false-alarm probability."""
-    q = closed.question
+    q, (null, flaring) = closed.question, closed.forms
     faps = np.logspace(-6, 0, 121)[:-1]
-    chances = closed.flaring.sf(closed.null.isf(faps))
+    chances = flaring.sf(null.isf(faps))
     series: dict[str, Any] = {"closed form": (faps, chances), "own": ([q.fap], [closed.chance])}
     if "detection" in answers:
         fap, _, *ends = roc_columns(answers["detection"].stars[0].detection.roc(q.statistic))

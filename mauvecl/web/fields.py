@@ -150,10 +150,7 @@ def star_name(text: str) -> str:
 
 
 def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
-    """Parse targets: a name or coordinates in each line, or a CSV table with a header of keys of `PlanTarget`.
-
-    With a check their positions must be known, and all must differ.
-    """
+    """Parse targets: a name or coordinates a line, or a CSV table; a check requires known positions that all differ."""
     from mauvecl.study.plan import PlanTarget, targets_in
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]

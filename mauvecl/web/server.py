@@ -166,11 +166,7 @@ class OneLine(logging.Formatter):
 
 
 def make(address: str, port: int, allowed: Sequence[str]) -> Any:
-    """Return a listening server.
-
-    Raises InputError if the address is invalid or accepts other machines without an origin, and OSError if the port is
-    taken.
-    """
+    """Return a listening server; raises InputError as `hosts` does, and OSError if the port is taken."""
     application = PageApplication(
         [
             (r"/", FrontHandler),

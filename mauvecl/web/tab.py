@@ -101,10 +101,7 @@ QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
 def simulate(
     name: str, study: Study, pool: Pool, progress: Progress = None, *, inputs: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Return the answers to a question by name; its first verb reports its progress and takes the contents of files.
-
-    A detection also has the answer with the other choice of unknowns, unless that is refused.
-    """
+    """Return the answers to a question by name, of a detection also with the other choice of unknowns if it has one."""
     question = QUESTIONS[name]
     study, (main, *more) = question.study(study), question.verbs
     questions = [(name, main, study), *((verb, verb, study) for verb in more)]
@@ -306,10 +303,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
-    """Return file name and content of one of a tab's `files` or `documents`, or of the study that reproduces it.
-
-    The ending is "ecsv", "fits" or "study", and empty for a document.
-    """
+    """Return name and content of one of a tab's `documents`, without `ending`, or of its `files` or their study."""
     if name not in tab.documents and (name not in tab.files or ending not in ("ecsv", "fits", "study")):
         raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}; use one of its own", key="name")
     if not tab.offers(name, answers):
