@@ -249,10 +249,7 @@ def light_curve_series(
     frames: Frames, answer: AnalyseAnswer | None = None, unit_s: float = 60.0, most: int | None = None, *,
     in_noise: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the data of `LIGHT_CURVE`, with at most `most` points in each series.
-
-    Only an analysis has events and a level. With `in_noise` the flux is that above the level, in units of the noise.
-    """
+    """Return the data of `LIGHT_CURVE`, at most `most` points each; `in_noise`: flux above the level over the noise."""
     time, series = (frames.time_s - frames.time_s[0]) / unit_s, dict[str, Any]()
     flux, used = frames.white_light[0], frames.faults == 0
     if answer is not None:
@@ -293,9 +290,8 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     # Frames that are left out may be far off.
     reach = around[1] - around[0]
     beside = [value for value in flux[~used & np.isfinite(flux)] if around[0] - reach < value < around[1] + reach]
-    shown = [
-        (PlotAxis(label, limits=(min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach)), False)
-    ]
+    limits = min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach
+    shown = [(PlotAxis(label, limits=limits), False)]
     if ((flux - analysis.level.level) / error)[used].max() > BRIGHT:
         shown.append((PlotAxis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2)), True))
     rows = []

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from itertools import cycle
 from operator import itemgetter
 from pathlib import Path
@@ -56,8 +57,6 @@ STYLE = {
 
 def available() -> bool:
     """Return whether matplotlib is installed."""
-    from importlib.util import find_spec
-
     return find_spec("matplotlib") is not None
 
 
@@ -154,11 +153,7 @@ Draw = TypeVar("Draw", bound=Callable[..., Picture | Panel])
 
 
 def picture_of(kind: str, name: str, **options: Any) -> Callable[[Draw], Draw]:
-    """Return a decorator that registers a function as a picture of a class; `plot` draws the first.
-
-    `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `options` are as
-    for `PictureFunction`.
-    """
+    """Return a decorator that registers a picture of a class, by name, for a file; `plot` draws the first of them."""
 
     def registered(draw: Draw) -> Draw:
         ENTRIES[kind].append(PictureFunction(name, draw, **options))
@@ -330,10 +325,7 @@ def _draw_series(axis: Any, item: Series) -> Any:
 
 
 def save_or_return(figure: Any, path: str | Path | None) -> Any:
-    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path.
-
-    Raises InputError, without changing an existing file, if the figure cannot be written.
-    """
+    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path."""
     if path is None:
         return figure
     content, place, parent = io.BytesIO(), Path(path), figure.figure

@@ -199,10 +199,7 @@ def _write_traceback(error: Exception) -> Path | str:
 
 
 class Meter:
-    """Progress with rate and time left, on standard error, for work longer than two seconds.
-
-    On a terminal and in a notebook it is one line that changes; elsewhere a line every ten seconds.
-    """
+    """Progress with rate and time left on standard error, on a terminal in one line; none for work of two seconds."""
 
     # Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     standing: Callable[[], PoolProgress] | None = None

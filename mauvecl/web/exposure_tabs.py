@@ -11,20 +11,8 @@ from mauvecl.answers.closed_forms import Cost, spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
 from mauvecl.answers.signal import simulate
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Area,
-    Bars,
-    Chart,
-    ChartData,
-    Custom,
-    Dots,
-    LegendEntry,
-    Line,
-    OwnMarker,
-    PlotAxis,
-    Rule,
-)
+from mauvecl.charts import chart
+from mauvecl.charts.chart import WAVELENGTH, Area, Bars, Chart, ChartData, Dots, Line, OwnMarker, PlotAxis, Rule
 from mauvecl.charts.detection import BUDGET, budget_series, roc_columns
 from mauvecl.detection.requests import statistic_label
 from mauvecl.noise.unknowns import NUISANCES
@@ -233,7 +221,7 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
     (
         Bars("simulated", "star", "null bars", listed=False),
         Bars("simulated", "flare", "flare bars", listed=False),
-        LegendEntry("simulated", form="bars", show="if any"),
+        chart.LegendEntry("simulated", form="bars", show="if any"),
         Area("no flare", "star", "null area", alpha=0.18, listed=False),
         Line("no flare", "star", "null", width=2, tips=("statistic", "density")),
         Area("flare", "flare", "flare area", alpha=0.18, listed=False),
@@ -342,7 +330,7 @@ def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
 
 @Chart(
     "cost", "What each unknown costs: the flare's S/N by the matched statistic", PlotAxis("S/N of the flare"),
-    PlotAxis(kind="names"), (Custom("bars", columns=("name", "plain", "marginal", "known"), draw=_bars),),
+    PlotAxis(kind="names"), (chart.Custom("bars", columns=("name", "plain", "marginal", "known"), draw=_bars),),
 ).data()  # fmt: skip
 def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the matched S/N with each unknown, plain and marginalised."""

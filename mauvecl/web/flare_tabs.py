@@ -14,19 +14,8 @@ from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from mauvecl.answers.measure import COLUMNS, expected_measurements, models_of
-from mauvecl.charts.chart import (
-    Area,
-    Chart,
-    ChartData,
-    Contours,
-    Custom,
-    Dots,
-    LegendEntry,
-    Line,
-    OwnMarker,
-    PlotAxis,
-    Rule,
-)
+from mauvecl.charts import chart
+from mauvecl.charts.chart import Area, Chart, ChartData, Custom, Dots, Line, OwnMarker, PlotAxis, Rule
 from mauvecl.charts.spectra import FACTORS, RISES
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.host.arrays import Float
@@ -191,12 +180,12 @@ def _draw_labels(canvas: Canvas, source: ColumnDataSource) -> None:
     PlotAxis("flare amplitude", limits=tuple(np.log10(PERCENTS))),
     (
         Custom("map", columns=("image", "percent", "x", "y", "dw", "dh"), draw=_draw_map),
-        Contours("contours", "#ffffff", width=1.2, listed=False),
-        Contours("half", "#ffffff", width=2.2, listed=False),
+        chart.Contours("contours", "#ffffff", width=1.2, listed=False),
+        chart.Contours("half", "#ffffff", width=2.2, listed=False),
         Custom("simulated", columns=("x", "y", "p"), draw=_draw_cells),
         Custom("labels", columns=("x", "y", "text"), draw=_draw_labels),
-        LegendEntry("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
-        LegendEntry("simulated", "#8a8678", show="if any", form="dot", name="entry"),
+        chart.LegendEntry("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
+        chart.LegendEntry("simulated", "#8a8678", show="if any", form="dot", name="entry"),
         OwnMarker(),
     ),
     sets="magnitude=x,amplitude_percent=10^y", pins="half", alike=("band",),
