@@ -309,11 +309,11 @@ def _words() -> dict[str, Any]:
 
 
 @cache
-def figure(theme: str, name: str, logs: str) -> bytes | None:
-    """Return an empty figure with its legend."""
+def figure(theme: str, name: str, logs: str) -> bytes:
+    """Return an empty figure with its legend; unknown ones raise HTTPError, which is not cached."""
     picture = next((p for tab in TABS.values() for p in tab.pictures if p.name == name), None)
     if picture is None or theme not in INKS or not set(logs) <= {axis.lower() for axis in picture.logs}:
-        return None
+        raise HTTPError(404)
     canvas = Canvas(picture, theme, frozenset(logs))
     return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
 
@@ -354,8 +354,6 @@ class FigureHandler(PageHandler):
     def get(self, theme: str, name: str) -> None:
         """Send a figure, with the axes of the argument `log` in logarithms."""
         content = figure(theme, name, "".join(sorted(set(self.get_query_argument("log", ""))))[:2])
-        if content is None:
-            raise HTTPError(404)
         self.set_header("Content-Type", "application/json")
         if "v" in self.request.arguments:
             self.set_header("Cache-Control", f"max-age={StaticFileHandler.CACHE_MAX_AGE}")
