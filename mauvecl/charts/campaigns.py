@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.charts.chart import Area, Dots, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, pictures_of
+from mauvecl.charts.chart import Area, Dots, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series
 from mauvecl.charts.matplotlib import COLOURS, NULL, available, draw_picture, in_rows, new_figure, picture_of, style
 from mauvecl.host import VERSION
 
@@ -24,12 +24,27 @@ if TYPE_CHECKING:
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.answers.visible import VisibleAnswer
 
-#: Largest number of targets with a calendar each; more targets are rows of one picture.
-MOST_CALENDARS = 6
-#: Largest number of months whose names fit side by side.
-MOST_MONTHS = 8
+MOST_CALENDARS = 6  # targets with a calendar each; more targets are rows of one picture
+MOST_MONTHS = 8  # whose names fit side by side
+PAGE, MARGIN = (8.27, 11.69), 0.6  # A4, and its margin, inches
+LETTER, BOLD, LINE = 0.53, 1.1, 1.4  # over the size: width of a letter, factor of a bold one, and line spacing
+#: Starts of the columns of the summary, of a target and of the assumptions, as fractions of the text width.
+SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
+TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
+SMALL, NORMAL, MANY = 5.5, 7.0, 9  # text of wide tables and of others, and columns of a wide one
+COLOURS_KEPT = 64  # in the pictures of an HTML report
+#: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
+PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 0.09, "hspace": 0.35, "wspace": 0.3}
+#: Explanation of the summary's columns.
+LEGEND = (
+    "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
+    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
+    "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
+    "P(>= 1): probability of recovering any. False alarms: expected from noise. Numbers are those of plan.ecsv."
+)
 
 
+@picture_of("PlanAnswer", "plan")
 def overview(answer: PlanAnswer) -> Picture:
     """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
     planned, nothing = answer.planned, [np.nan] * 3
@@ -42,16 +57,11 @@ def overview(answer: PlanAnswer) -> Picture:
     logs = np.log10(energies[np.isfinite(energies)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, flare_axis = (
-        PlotAxis(limits=(len(planned) - 0.5, -0.5), ticks=names),
-        PlotAxis("flares recovered", True, (0.05, None)),
-    )
-    energy_axis, above = PlotAxis("bolometric energy (erg)", True, decades), "mean (dot), and 95 % of campaigns"
-    row = [
-        Panel(flare_axis, y, _bars(np.maximum(flares, 0.05), "star"), above),
-        Panel(energy_axis, y, _bars(energies, "flare"), "recovered in 50 % (dot) to 90 %"),
-    ]
-    return Picture([row], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
+    y, x = PlotAxis(limits=(len(planned) - 0.5, -0.5), ticks=names), PlotAxis("flares recovered", True, (0.05, None))
+    left = Panel(x, y, _bars(np.maximum(flares, 0.05), "star"), "mean (dot), and 95 % of campaigns")
+    x = PlotAxis("bolometric energy (erg)", True, decades)
+    right = Panel(x, y, _bars(energies, "flare"), "recovered in 50 % (dot) to 90 %")
+    return Picture([[left, right]], (7.4, 0.24 * len(planned) + 1.5), share_y=True)
 
 
 def _bars(values: Any, colour: str) -> list[Series]:
@@ -59,10 +69,6 @@ def _bars(values: Any, colour: str) -> list[Series]:
     x, y = np.column_stack([values[:, :2], np.full(len(values), np.nan)]).ravel(), np.arange(len(values))
     bars = Line("", colour, width=3.3, alpha=0.5, at=(x, np.repeat(y, 3)))
     return [bars, Dots("", colour, size=7, at=(values[:, 2], y))]
-
-
-# Reports draw it in figures of their own.
-picture_of("PlanAnswer", "plan")(overview)
 
 
 @picture_of("PlanAnswer", "visible", given=lambda answer: (answer.seen,))
@@ -116,22 +122,6 @@ def _month(day: str) -> str:
     return f"{months_of_years.month_abbr[int(day[5:7])]} {day[:4]}"
 
 
-#: A4, and its margin, inches.
-PAGE, MARGIN = (8.27, 11.69), 0.6
-#: Approximate width of a letter divided by its size, for line breaks; that of bold letters over it; line spacing over
-#: the size.
-LETTER, BOLD, LINE = 0.53, 1.1, 1.4
-#: Starts of the columns of the summary, of a target and of the assumptions, as fractions of the text width.
-SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
-TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
-#: Sizes of text on a page: of tables with many columns, and of others; number of columns that are many.
-SMALL, NORMAL, MANY = 5.5, 7.0, 9
-#: Number of colours kept in the pictures of an HTML report.
-COLOURS_KEPT = 64
-#: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
-PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 0.09, "hspace": 0.35, "wspace": 0.3}
-
-
 @dataclass(frozen=True)
 class ReportPart:
     """Part of a report, from top to bottom: heading, sentences, a table with a note on it, and a picture."""
@@ -148,29 +138,6 @@ class ReportPart:
     text: str = ""  # the picture in words
     height_in: float = 0.0  # of the picture on a page; 0 for a page of its own
     new_page: bool = False
-
-
-def pdf_bytes(title: str, parts: Sequence[ReportPart]) -> bytes:
-    """Return a report as PDF; without a date, so that equal answers give equal files."""
-    from matplotlib.backends.backend_pdf import PdfPages
-
-    content, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
-    with style(), PdfPages(content, metadata=about) as pages:
-        sheets = TextPages()
-        for part in parts:
-            sheets.add(part)
-        for figure in sheets.pages:
-            pages.savefig(figure)
-    return content.getvalue()
-
-
-def html_bytes(title: str, parts: Sequence[ReportPart]) -> bytes:
-    """Return a report as a page, with pictures if matplotlib is installed."""
-    from mako.template import Template
-
-    options = {"default_filters": ["str", "escape"], "imports": ["from html import escape"], "strict_undefined": True}
-    template = Template(filename=str(Path(__file__).with_name("reports.html.mako")), **options)
-    return str(template.render(title=title, parts=parts, html_image=html_image)).encode()
 
 
 def html_image(draw: Callable[[Any], Any], text: str) -> str:
@@ -291,20 +258,8 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[ReportPart]]:
     return f"{answer.instrument_name}: {answer.heading}", parts
 
 
-#: Explanation of the columns.
-LEGEND = (
-    "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
-    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
-    "Poisson's scatter and that of a star's rate; ideal: by the closed form if everything but the noise were known; "
-    "P(>= 1): probability of recovering any. False alarms: expected from noise. Numbers are those of plan.ecsv."
-)
-
-
 def _target_lines(answer: PlanAnswer, k: int, cells: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Return the lines on a target: quantity, value, and the file and column of the value.
-
-    `cells` has the texts of the target in the table of the plan, by column.
-    """
+    """Return the lines on a target: quantity, value, and its file and column; `cells` are those of the plan's table."""
     target, observation = answer.planned[k], answer.planned[k].observation
     place, star, visible = observation.target, observation.case.star, answer.seen
     lines = [
@@ -354,12 +309,10 @@ def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
         row, x = target.by_energy, PlotAxis("bolometric energy (erg)", log=True)
         energy, often = row["energy"], row["rate_above"] * target.hours / 24
         share = Line("", "star", at=(energy, row["recovered"]))
-        limits = [Rule("", dash=dash, at=target.energy_at(p)) for p, dash in ((0.5, "--"), (0.9, ":"))]
-        shares = (
-            PlotAxis("share recovered", limits=(0, 1.02)),
-            [share, *(limit for limit in limits if np.isfinite(limit.at))],
-        )
-        rows.append([Panel(x, *shares, "flares recovered (E50 dashed, E90 dotted)", _plain_decades)])
+        limits = [(target.energy_at(p), dash) for p, dash in ((0.5, "--"), (0.9, ":"))]
+        series = [share, *(Rule("", dash=dash, at=at) for at, dash in limits if np.isfinite(at))]
+        y = PlotAxis("share recovered", limits=(0, 1.02))
+        rows.append([Panel(x, y, series, "flares recovered (E50 dashed, E90 dotted)", _plain_decades)])
         if target.rates is not None:
             rate = Line("", "flare", at=(energy, np.where(often > 0, often, np.nan)))
             above = PlotAxis(f"flares above this energy in {target.hours:.0f} h", log=True)
@@ -371,14 +324,12 @@ def _panels(answer: PlanAnswer, k: int, figure: Any) -> Any:
 
 def _plain_decades(axes: Any) -> None:
     """Label whole decades as 1e33, since minor ticks and formulas take most of the drawing time."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import LogLocator, NullLocator
 
     for axis in (axis for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() == "log"):
         axis.set_major_locator(LogLocator())
         axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(
-            FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}")
-        )
+        axis.set_major_formatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e4 else f"{value:.0e}")
 
 
 def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[ReportPart]]:
@@ -388,10 +339,27 @@ def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[ReportPart]]:
     parts = [ReportPart(title, [f"Analysed by mauvecl {VERSION}. {answer.assumed}", *answer.messages])]
     parts += [ReportPart(view.title, (), *view.texts(empty=False)) for view in answer.all_views]
     parts.append(ReportPart(lines=answer.remarks, note="Every number is a row of the tables next to this report."))
-    return title, parts + [ReportPart(picture=draw, text=name) for name, draw in pictures_of(answer).items()]
+    return title, parts + [ReportPart(picture=draw, text=name) for name, draw in answer.pictures.items()]
 
 
 def report(answer: Any, form: str) -> bytes:
-    """Return the report of a plan or an analysis as "html" or "pdf"."""
+    """Return the report of a plan or an analysis as "html", with pictures if matplotlib is installed, or as "pdf"."""
     title, parts = plan_report(answer) if hasattr(answer, "planned") else analysis_report(answer)
-    return (html_bytes if form == "html" else pdf_bytes)(title, parts)
+    if form == "html":
+        from mako.template import Template
+
+        path = Path(__file__).with_name("reports.html.mako")
+        filters, imports = ["str", "escape"], ["from html import escape"]
+        template = Template(filename=str(path), default_filters=filters, imports=imports, strict_undefined=True)
+        return str(template.render(title=title, parts=parts, html_image=html_image)).encode()
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    # Without a date, so that equal answers give equal files.
+    content, about = io.BytesIO(), {"Title": title, "Creator": f"mauvecl {VERSION}", "CreationDate": None}
+    with style(), PdfPages(content, metadata=about) as pages:
+        sheets = TextPages()
+        for part in parts:
+            sheets.add(part)
+        for figure in sheets.pages:
+            pages.savefig(figure)
+    return content.getvalue()

@@ -1,15 +1,9 @@
-"""Descriptions of charts, which matplotlib and Bokeh draw, and the registry of pictures by class."""
+"""Descriptions of charts, which matplotlib and Bokeh draw."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from importlib import import_module
-from operator import itemgetter
-from pathlib import Path
-from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -21,8 +15,7 @@ INK = {
     "drawn": "#6b7785", "dark": "#7b4ea3", "read": "#B8860B", "bias": "#A65082", "total": "#1b2733",
     "threshold": "#1b2733", "own": "#C2185B", "shortest": "#E8801F", "middle": "#B34700", "longest": "#5C2200",
 }  # fmt: skip
-#: Largest number of curves of targets on the page; further targets are in the table alone.
-MOST_TARGETS = 8
+MOST_TARGETS = 8  # curves of targets on the page; further targets are in the table alone
 
 
 @dataclass(frozen=True)
@@ -198,7 +191,7 @@ class Chart:
     sets: str = ""  # fields that a click on the page sets, with the axis that gives each, as in "magnitude=x"
     pins: str = ""  # series that pinned scenarios have, too; empty if they are not drawn
     alike: tuple[str, ...] = ()  # fields in which a pinned scenario must agree with the question
-    fill: Callable[[Any, Any], ChartData] | None = None  # see `data`
+    fill: Callable[[Any, Any], ChartData] = lambda closed, answers: ChartData("")  # see `data`, as for what follows
     of: str = ""
     before: str = ""
 
@@ -217,13 +210,12 @@ class Chart:
 
     def series_of(self, answer: Any) -> dict[str, Any]:
         """Return the data of the series for the answer that the chart is of."""
-        assert self.fill is not None
         return dict(self.fill(None, answer).series)
 
     def drawn(self, closed: Any, answers: Mapping[str, Any]) -> dict[str, Any]:
         """Return the text, the columns of the page's data sources, properties of models, and entries of the legend."""
         data = ChartData(self.before)
-        if self.fill is not None and (not self.of or self.of in answers):
+        if not self.of or self.of in answers:
             data = self.fill(closed, answers[self.of] if self.of else answers)
         assert data.series.keys() <= {item.key for item in self.series}
         sources, props, names = dict[str, Any](), dict(data.props), dict[str, str]()
@@ -270,44 +262,6 @@ class Picture:
     widths: tuple[float, ...] | None = None
 
 
-@dataclass(frozen=True)
-class PictureFunction:
-    """Function that draws a picture of the objects of a class."""
-
-    name: str  # name of the file
-    draw: Callable[..., Any]
-    given: Callable[[Any], tuple[Any, ...]] = lambda instance: (instance,)  # arguments of `draw` for an object
-    #: Arguments of `draw` for each of several numbered pictures of an object.
-    each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
-    when: Callable[[Any], object] = lambda instance: True  # whether an object has the picture
-
-
 def throughput_of(expectations: Iterable[Expectation]) -> str:
     """Return whether the throughput of expectations is nominal or calibrated, for the notes of pictures."""
     return " and ".join(dict.fromkeys(filter(None, (x.notice.kind for x in expectations))))
-
-
-#: Entries by class name, since importing the classes would import every answer.
-ENTRIES: defaultdict[str, list[PictureFunction]] = defaultdict(list)
-
-
-def load() -> None:
-    """Import all modules of pictures, so that they register their functions."""
-    for module in iter_modules([str(Path(__file__).parent)]):
-        import_module(f"{__package__}.{module.name}")
-
-
-def pictures_of(instance: Any) -> dict[str, Callable[..., Any]]:
-    """Return every picture of an object by file name, numbered ones by number, as functions of `path` and `ax`."""
-    load()
-    entries = next((ENTRIES[kind.__name__] for kind in type(instance).__mro__ if kind.__name__ in ENTRIES), [])
-    numbered = list[tuple[int, str, Callable[..., Any]]]()
-    for entry in filter(lambda entry: entry.when(instance), entries):
-        if entry.each is None:
-            numbered.append((1, entry.name, partial(entry.draw, *entry.given(instance))))
-        for number, arguments in enumerate(entry.each(instance) if entry.each else (), 1):
-            numbered.append((number, f"{entry.name}-{number}", partial(entry.draw, *arguments)))
-    return {
-        name: lambda path=None, draw=draw, **options: draw(path=path, **options)
-        for _, name, draw in sorted(numbered, key=itemgetter(0))
-    }

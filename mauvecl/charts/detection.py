@@ -13,16 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
-from mauvecl.charts.matplotlib import (
-    COLOURS,
-    COLUMN,
-    MAX_COLUMNS,
-    UNBROKEN,
-    cell_edges,
-    in_rows,
-    picture_of,
-    written,
-)
+from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, cell_edges, in_rows, picture_of, written
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.requests import statistic_label
@@ -44,16 +35,19 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.study import Study
 
-#: Flares of a star in one picture.
-MOST_FLARES = 16
-#: A star: title, findings, and its flares' names.
-Shown = tuple[str, "Detection", Sequence[str]]
-#: Largest number of stars in a picture.
-MOST_STARS = 6
-#: Share of the axis of a statistic that stays empty on either side.
-MARGIN = 0.04
+# Largest numbers of stars, of flares of a star, and of panels of noise budgets in a picture.
+MOST_STARS, MOST_FLARES, MOST_BUDGETS = 6, 16, 12
+MARKS = "osD^vPX"  # markers of limits with the same colour
+MARGIN = 0.04  # share of the axis of a statistic that stays empty on either side
 #: Length of the axis of a weighted sum, in the inverse hyperbolic sine, above which few of its ticks have a number.
 WIDE = 5.0
+#: Components of a raw spectrum, as in the paper's figure.
+COMPONENTS = {
+    "raw": "raw spectrum", "source": "star", "sky": "zodiacal light", "photon_noise": "photon noise",
+    "dark": "dark current", "bias": "bias", "read_noise": "read noise",
+}  # fmt: skip
+#: A star: title, findings, and its flares' names.
+Shown = tuple[str, "Detection", Sequence[str]]
 
 
 def _few(answer: DetectAnswer) -> FirstItems[Shown]:
@@ -152,9 +146,8 @@ def _asinh(axis: Any, ends: tuple[float, float]) -> None:
 def roc_columns(curve: Roc) -> tuple[Any, ...]:
     """Return false-alarm and detection probabilities with the ends of their intervals, where there are alarms."""
     points = curve.points()
-    return tuple(
-        points[name][points["fap"] > 0] for name in ("fap", "probability", "probability_low", "probability_high")
-    )
+    alarms = points["fap"] > 0
+    return tuple(points[name][alarms] for name in ("fap", "probability", "probability_low", "probability_high"))
 
 
 @picture_of("Roc", "roc")
@@ -202,18 +195,6 @@ def _complete_elements(x: Expectation) -> NDArray[np.bool_]:
     """Return the complete elements; the last one of the spectrum may have fewer pixels."""
     pixels = np.bincount(x.element, minlength=x.element_wavelength_nm.size)
     return np.asarray(pixels >= np.median(pixels) - 1)
-
-
-#: Components of a raw spectrum, as in the paper's figure.
-COMPONENTS = {
-    "raw": "raw spectrum",
-    "source": "star",
-    "sky": "zodiacal light",
-    "photon_noise": "photon noise",
-    "dark": "dark current",
-    "bias": "bias",
-    "read_noise": "read noise",
-}
 
 
 @picture_of("SimulateAnswer", "observation", each=lambda answer: answer.observations)
@@ -290,10 +271,6 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     return Picture([above, below], (2.6 * len(stars) + 1.6, 5.6), title, below=True)
 
 
-#: Markers of limits with the same colour.
-MARKS = "osD^vPX"
-
-
 def quantity_axis(study: Study, name: str, **options: Any) -> PlotAxis:
     """Return the axis of a quantity, with the band of magnitudes if all stars have the same."""
     bands = {star.band for star in study.star}
@@ -354,16 +331,11 @@ def limits(answer: LimitAnswer) -> Picture:
         f"Limits at a detection probability of {power:g}{exposure}, false-alarm probability "
         f"{answer.study.run.fap:g} per test; points: simulated, 95 %; lines: Gaussian noise"
     )
-    x, y = (
-        quantity_axis(answer.study, of, log=of != "magnitude"),
-        PlotAxis("detection probability", limits=(-0.02, 1.02)),
-    )
-    notes = (chart.throughput_of(answer.inputs),)
-    return Picture([[Panel(x, y, series)]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, notes, below=True)
+    y, notes = PlotAxis("detection probability", limits=(-0.02, 1.02)), (chart.throughput_of(answer.inputs),)
+    panel = Panel(quantity_axis(answer.study, of, log=of != "magnitude"), y, series)
+    return Picture([[panel]], (COLUMN, 3.0 + 0.17 * len(answer.limits)), title, notes, below=True)
 
 
-#: Panels of noise budgets in a picture.
-MOST_BUDGETS = 12
 #: Noise by origin, as on the page and in files.
 BUDGET = Chart(
     "budget", "Noise of a pixel by origin", WAVELENGTH, PlotAxis("noise (DN rms per pixel)", log=True),

@@ -27,15 +27,17 @@ if TYPE_CHECKING:
 
 #: Labels of the size axes.
 SIZES = {
-    "amplitude": "flare amplitude",
-    "duration": "equivalent duration (s)",
-    "energy": "bolometric energy (erg)",
+    "amplitude": "flare amplitude", "duration": "equivalent duration (s)", "energy": "bolometric energy (erg)",
     "band_energy": "energy in the band (erg)",
-}
-#: Largest number of half-widths with a curve each.
-MOST_CURVES = 6
-#: Largest number of maps in a picture.
-MOST_MAPS = 6
+}  # fmt: skip
+# Largest numbers of half-widths with a curve each, and of maps in a picture.
+MOST_CURVES, MOST_MAPS = 6, 6
+#: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
+MOST_POINTS, MOST_ROWS = 4000, 600
+LONG_GAP = 0.005  # shortest gap in which the level is not drawn, as a share of the whole time
+BRIGHT = 30.0  # flux in standard deviations above which the light curve has a second panel near the level
+#: Units of time: longest duration that is shown in it, its length, s, and its name.
+TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 HALF_WIDTH = PlotAxis("half-width (s)", log=True)
 
 
@@ -102,12 +104,6 @@ def energies(answer: InjectAnswer) -> Picture:
         return Panel(HALF_WIDTH, PlotAxis(SIZES[star.size], log=True), meshes, star.title)
 
     return _stars(answer, panel, "medians; grey: none found")
-
-
-#: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
-MOST_POINTS, MOST_ROWS = 4000, 600
-#: Units of time: longest duration that is shown in it, its length, s, and its name.
-TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 
 
 @picture_of("StareAnswer", "light-curve", each=lambda answer: [(star,) for star in answer.stares])
@@ -177,10 +173,7 @@ def dynamic_spectrum(star: StarStare) -> Picture:
 def spectra_panel(
     stare: Stare, spectra: NDArray[Any], sd: NDArray[Any], wavelength_nm: Float, marks: Sequence[tuple[Any, str]] = ()
 ) -> tuple[Panel, float]:
-    """Return spectra, of shape (n_frame, n_pixel), in standard deviations from their median, and the s of a column.
-
-    The ends of events in time are marked above the spectra in colours.
-    """
+    """Return spectra, (n_frame, n_pixel), in standard deviations from their median, and the seconds of a column."""
     scale, unit = shown_time_unit(stare.duration_s)
     # The stare is shown on a regular grid with empty gaps.
     numbers = stare.numbers - stare.numbers[0]
@@ -207,10 +200,7 @@ def spectra_panel(
 
 
 def column_sums(values: Float, numbers: NDArray[np.int64], most: int) -> tuple[Float, Float, int]:
-    """Return sums of the finite values of rows by their numbers, their counts, and the numbers in each of `most` sums.
-
-    Sums and counts have the shape (n_sum, n_column).
-    """
+    """Return sums of finite values of rows by number, (n_sum, n_column), their counts, and the numbers in each sum."""
     step = -(-(int(numbers[-1]) + 1) // most)
     sums, counts = np.zeros((2, int(numbers[-1]) // step + 1, values.shape[1]))
     finite = np.isfinite(values)
@@ -232,10 +222,6 @@ def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
 #: Verdicts on events, with their colours, and these in words.
 VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
 WORDS = {"star": "blue", "drawn": "grey", "own": "red", "dark": "pink"}
-#: Shortest gap in which the level is not drawn, as a share of the whole time.
-LONG_GAP = 0.005
-#: Flux in standard deviations above which the light curve has a second panel near the level.
-BRIGHT = 30.0
 LIGHT_CURVE = Chart(
     "frames", "Light curve", PlotAxis("time from the first frame (min)"), PlotAxis("flux"),
     (
@@ -263,10 +249,7 @@ def light_curve_series(
     frames: Frames, answer: AnalyseAnswer | None = None, unit_s: float = 60.0, most: int | None = None, *,
     in_noise: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the data of `LIGHT_CURVE`, with at most `most` points in each series.
-
-    Only an analysis has events and a level. With `in_noise` the flux is that above the level, in units of the noise.
-    """
+    """Return the data of `LIGHT_CURVE`, at most `most` points each; `in_noise`: flux above the level over the noise."""
     time, series = (frames.time_s - frames.time_s[0]) / unit_s, dict[str, Any]()
     flux, used = frames.white_light[0], frames.faults == 0
     if answer is not None:
@@ -297,10 +280,7 @@ def light_curve_series(
 
 @picture_of("AnalyseAnswer", "light-curve")
 def observed_light_curve(answer: AnalyseAnswer) -> Picture:
-    """Plot the observed light curve with its level and the level's band of 95 %, events, and frames not searched.
-
-    If there are bright events, a second panel shows the flux less the level.
-    """
+    """Plot the observed light curve with its level and events, and the flux less the level if events are bright."""
     analysis, used = answer.analysis, answer.analysis.level.used
     frames, flux, error = analysis.frames, analysis.flux, analysis.level.error
     unit_s, unit = shown_time_unit(float(np.ptp(frames.time_s)))
@@ -310,9 +290,8 @@ def observed_light_curve(answer: AnalyseAnswer) -> Picture:
     # Frames that are left out may be far off.
     reach = around[1] - around[0]
     beside = [value for value in flux[~used & np.isfinite(flux)] if around[0] - reach < value < around[1] + reach]
-    shown = [
-        (PlotAxis(label, limits=(min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach)), False)
-    ]
+    limits = min(*around, *beside) - 0.05 * reach, max(*around, *beside) + 0.05 * reach
+    shown = [(PlotAxis(label, limits=limits), False)]
     if ((flux - analysis.level.level) / error)[used].max() > BRIGHT:
         shown.append((PlotAxis("(flux \N{MINUS SIGN} level) / noise", limits=(-6, BRIGHT / 2)), True))
     rows = []

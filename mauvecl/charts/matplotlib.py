@@ -1,18 +1,23 @@
-"""Matplotlib figures: style, axes, and files."""
+"""Matplotlib figures: the registry of pictures by class, style, axes, and files."""
 
 from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Sequence
-from functools import wraps
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
 from itertools import cycle
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from pkgutil import iter_modules
+from typing import Any, TypeVar
 
 import numpy as np
 
-from mauvecl.charts import chart
 from mauvecl.charts.chart import INK, Area, Dots, Levels, Line, Mesh, Panel, Picture, Rule, Series, Strips, Targets
 from mauvecl.host.tables.files import write_whole
 from mauvecl.schema.errors import InputError
@@ -21,19 +26,12 @@ from mauvecl.schema.errors import InputError
 #: lightness as well.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
 NULL = INK["drawn"]
-#: Wavelengths that are shown, nm.
-RANGE_NM = (200.0, 700.0)
-#: Cells of a mesh above which vector files hold it as pixels.
-MANY = 5000
-#: Panels side by side.
-MAX_COLUMNS = 3
-#: Width of one column of a journal, inches.
-COLUMN = 3.5
-#: No-break space.
-UNBROKEN = "\N{NO-BREAK SPACE}"
-MINUS = "\N{MINUS SIGN}"
-#: Size of the labels of ticks that are names.
-SMALL = 8
+RANGE_NM = (200.0, 700.0)  # wavelengths that are shown
+MANY = 5000  # cells of a mesh above which vector files hold it as pixels
+MAX_COLUMNS = 3  # panels side by side
+COLUMN = 3.5  # width of one column of a journal, inches
+UNBROKEN, MINUS = "\N{NO-BREAK SPACE}", "\N{MINUS SIGN}"
+SMALL = 8  # size of the labels of ticks that are names
 #: Largest fractions of a figure's width for legends, and for titles, of whose letters the mean width is known.
 INSIDE, TITLE = 0.97, 0.93
 #: The same for titles of panels, of the width that matplotlib gives a panel before the layout, which leaves less room
@@ -59,8 +57,6 @@ STYLE = {
 
 def available() -> bool:
     """Return whether matplotlib is installed."""
-    from importlib.util import find_spec
-
     return find_spec("matplotlib") is not None
 
 
@@ -88,10 +84,7 @@ def new_figure(size: tuple[float, float], **options: Any) -> Any:
 
 
 def _subfigure_of(ax: Any) -> Any:
-    """Return the part of the caller's figure that axes occupy, for a picture of several panels.
-
-    Raises InputError if the axes are not part of a grid.
-    """
+    """Return the part of the caller's figure that axes of a grid occupy, for a picture of several panels."""
     spec = ax.get_subplotspec()
     if spec is None:
         raise InputError(
@@ -142,39 +135,63 @@ def in_figure(unit: str) -> str:
     return str(Unit(unit).to_string("latex_inline"))
 
 
-def styled_picture(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a function that returns a picture or a panel: draw it in the common style, and save it.
+@dataclass(frozen=True)
+class PictureFunction:
+    """Function that returns a picture, or its only panel, of the objects of a class."""
 
-    The decorated function also takes the `path` of the file, without which it returns the figure, and the axes `ax` to
-    draw in, which it then returns.
-    """
-
-    @wraps(draw)
-    def picture(*arguments: Any, path: str | Path | None = None, ax: Any = None, **keywords: Any) -> Any:
-        if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
-            raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
-        with style():
-            description = draw(*arguments, **keywords)
-            picture = Picture([[description]]) if isinstance(description, Panel) else description
-            saved = save_or_return(draw_picture(picture, ax=ax), path)
-        return saved if ax is None else ax
-
-    return picture
+    name: str  # name of the file
+    draw: Callable[..., Picture | Panel]
+    given: Callable[[Any], tuple[Any, ...]] = lambda instance: (instance,)  # arguments of `draw` for an object
+    #: Arguments of `draw` for each of several numbered pictures of an object.
+    each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
+    when: Callable[[Any], object] = lambda instance: True  # whether an object has the picture
 
 
-def picture_of(kind: str, name: str, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a function as a picture of a class, and decorate it as `styled_picture` does; `plot` draws the first.
+#: Entries by class name, since importing the classes would import every answer.
+ENTRIES: defaultdict[str, list[PictureFunction]] = defaultdict(list)
+Draw = TypeVar("Draw", bound=Callable[..., Picture | Panel])
 
-    `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `options` are as
-    for `chart.PictureFunction`. A function that is a picture of several classes is decorated once.
-    """
 
-    def registered(draw: Callable[..., Any]) -> Callable[..., Any]:
-        styled = draw if hasattr(draw, "__wrapped__") else styled_picture(draw)
-        chart.ENTRIES[kind].append(chart.PictureFunction(name, styled, **options))
-        return styled
+def picture_of(kind: str, name: str, **options: Any) -> Callable[[Draw], Draw]:
+    """Return a decorator that registers a picture of a class, by name, for a file; `plot` draws the first of them."""
+
+    def registered(draw: Draw) -> Draw:
+        ENTRIES[kind].append(PictureFunction(name, draw, **options))
+        return draw
 
     return registered
+
+
+def load() -> None:
+    """Import all modules of pictures, so that they register their functions."""
+    for module in iter_modules([str(Path(__file__).parent)]):
+        import_module(f"{__package__}.{module.name}")
+
+
+def pictures_of(instance: Any) -> dict[str, Callable[..., Any]]:
+    """Return every picture of an object by file name, numbered ones by number, as functions of `path` and `ax`."""
+    load()
+    entries = next((ENTRIES[kind.__name__] for kind in type(instance).__mro__ if kind.__name__ in ENTRIES), [])
+    numbered = list[tuple[int, str, Callable[..., Any]]]()
+    for entry in filter(lambda entry: entry.when(instance), entries):
+        if entry.each is None:
+            numbered.append((1, entry.name, partial(entry.draw, *entry.given(instance))))
+        for number, arguments in enumerate(entry.each(instance) if entry.each else (), 1):
+            numbered.append((number, f"{entry.name}-{number}", partial(entry.draw, *arguments)))
+    return {name: partial(drawn, draw) for _, name, draw in sorted(numbered, key=itemgetter(0))}
+
+
+def drawn(
+    draw: Callable[..., Picture | Panel], path: str | Path | None = None, *, ax: Any = None, **options: Any
+) -> Any:
+    """Draw a function's picture in the common style; return its figure, the path if it is saved, or the axes `ax`."""
+    if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
+        raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
+    with style():
+        described = draw(**options)
+        picture = Picture([[described]]) if isinstance(described, Panel) else described
+        saved = save_or_return(draw_picture(picture, ax=ax), path)
+    return saved if ax is None else ax
 
 
 def draw_picture(picture: Picture, figure: Any = None, *, ax: Any = None) -> Any:
@@ -226,11 +243,8 @@ def _wrap(text: Any, width: float) -> None:
 
 
 def _finish(axis: Any, panel: Panel) -> None:
-    """Set ranges and ticks of axes, which may be shared, when all panels are drawn.
-
-    Logarithmic ticks are plain numbers (0.1, 20, 500), with intermediate ones only over few decades.
-    """
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    """Set ranges and ticks of axes, which may be shared, when all is drawn; logarithmic ticks are plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):
         limits, name = RANGE_NM if of.kind == "wavelength" and of.limits is None else of.limits, side.axis_name
@@ -247,7 +261,7 @@ def _finish(axis: Any, panel: Panel) -> None:
             most = 1 if name == "x" and (low < 1e-4 or high > 1e5) else 2
             side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
         if decades < 4:
-            side.set_major_formatter(FuncFormatter(lambda value, _: written(value)))
+            side.set_major_formatter(lambda value, _: written(value))
         side.set_minor_formatter(NullFormatter())
     if panel.finish is not None:
         panel.finish(axis)
@@ -305,18 +319,13 @@ def _draw_series(axis: Any, item: Series) -> Any:
             form = "o" if item.marker == "circle" else item.marker or "none"
             axis.errorbar(*at, fmt=form, markersize=0.6 * item.size, elinewidth=0.6 * item.width, **look)
         case Line():
-            step = "steps-mid" if item.step else "default"
-            axis.plot(
-                *at, linestyle=item.dash or "-", marker=item.marker, markersize=3, drawstyle=step, **look, **width
-            )
+            look |= {"marker": item.marker, "markersize": 3, "drawstyle": "steps-mid" if item.step else "default"}
+            axis.plot(*at, linestyle=item.dash or "-", **look, **width)
     return None
 
 
 def save_or_return(figure: Any, path: str | Path | None) -> Any:
-    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path.
-
-    Raises InputError, without changing an existing file, if the figure cannot be written.
-    """
+    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path."""
     if path is None:
         return figure
     content, place, parent = io.BytesIO(), Path(path), figure.figure

@@ -20,6 +20,14 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
 
+MOST_CHANGES, MOST_FLARES = 3, 4  # in a picture: changes whose periods are drawn, and flares
+BIN, GROUPS = 16, 60  # pixels averaged for a point of the residuals, and values for one of the photon transfer
+AROUND_NM = 15.0  # on both sides of an index that are drawn
+RISES = {"68 %": 2.30, "95 %": 5.99}  # increases of chi-squared that enclose these shares in two dimensions
+FACTORS = np.geomspace(0.1, 10.0, 25)  # on the amplitude, over which errors are plotted
+BEFORE, AFTER = 3.0, 15.0  # half-widths before and after the peak of a flare that are plotted
+MANY_FITS = 1000  # from which histograms of pulls have narrow bins
+
 
 @picture_of("Source", "source")
 def source(star: Source) -> Panel:
@@ -40,8 +48,6 @@ def expectation(x: Expectation) -> Panel:
                  f"{x.name}, {x.exposure_s:g} s")  # fmt: skip
 
 
-#: Pixels that are averaged for a point of the residuals, and values for one of the photon transfer.
-BIN, GROUPS = 16, 60
 NO_OBSERVATIONS = "Choose an archive of observations; Calibrate then fits the instrument."
 
 
@@ -159,12 +165,6 @@ def dark_current(answer: CalibrateAnswer) -> Picture:
     return Picture([[pixel_panel, mean_panel]], (7.2, 2.9), title)
 
 
-#: Changes whose periods are drawn, at most.
-MOST = 3
-#: Nanometres on both sides of an index that are drawn.
-AROUND_NM = 15.0
-
-
 def along_magnitude(answer: ChangeAnswer, scales: Mapping[str, float]) -> list[tuple[str, Any, Any]]:
     """Return name, magnitudes and smallest changes of the first star, times the factor of their unit, where known."""
     from mauvecl.answers.change import MAGNITUDES
@@ -205,7 +205,7 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
 @picture_of("ChangeAnswer", "periods", when=lambda answer: bool(answer.periods))
 def recovered_periods(answer: ChangeAnswer) -> Picture:
     """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
-    first, row = FirstItems(answer.periods, MOST, "changes"), []
+    first, row = FirstItems(answer.periods, MOST_CHANGES, "changes"), []
     for row_of_change in first:
         r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
         shares = 100 * row_of_change.shares("value")
@@ -234,18 +234,6 @@ def line_indices(answer: ChangeAnswer) -> Picture:
         row.append(Panel(PlotAxis("wavelength (nm)"), y, series, index.name))
     title = f"{title}: bands and continua of the line indices in the mean spectrum"
     return Picture([row], (1.0 + 2.3 * len(row), 3.1), title, below=True)
-
-
-#: Increases of chi-squared that enclose 68 and 95 % in two dimensions.
-RISES = {"68 %": 2.30, "95 %": 5.99}
-#: Factors on the amplitude over which errors are plotted.
-FACTORS = np.geomspace(0.1, 10.0, 25)
-#: Half-widths before and after the peak of a flare that are plotted.
-BEFORE, AFTER = 3.0, 15.0
-#: Largest number of flares in a picture.
-MOST_FLARES = 4
-#: Number of fits from which histograms of pulls have narrow bins.
-MANY_FITS = 1000
 
 
 @picture_of("MeasureAnswer", "fit")
@@ -349,10 +337,7 @@ def errors(answer: MeasureAnswer) -> Picture:
 
 @picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(star,) for star in answer.stares if star.perfect])
 def temperatures(star: MeasuredStare) -> Picture:
-    """Plot temperature, size and light of the flares of a stare against time, with 95 % intervals.
-
-    Lines are the fits to the same frames without noise.
-    """
+    """Plot temperature, size and light of flares along a stare with 95 % intervals, and fits without noise as lines."""
     drawn, perfect, rows = star.drawn, star.perfect, list[list[Panel]]()
     assert drawn is not None
     assert perfect is not None
@@ -391,9 +376,8 @@ def joint(star: MeasuredStare, fit: JointFit) -> Picture:
     off = Dots("", "star", size=4, at=(time, (drawn - mean)[near]))
     true, fitted = fit.true.kelvin[near], fit.fitted.kelvin[near]
     simulated = Line("simulated flare", "text", dash="dashed", at=(time, true))
-    kelvin = PlotAxis(
-        "temperature (K)", limits=(0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max()))
-    )
+    limits = 0.8 * min(true.min(), fitted.min()), 1.2 * max(true.max(), fitted.max())
+    kelvin = PlotAxis("temperature (K)", limits=limits)
     rows = [
         [Panel(x, PlotAxis("light (DN per frame)"), [dots, Line("joint fit", "star", at=(time, mean[near]))])],
         [Panel(x, PlotAxis("residual (DN)"), [off, Rule(along="y", dash="-", at=0.0)])],

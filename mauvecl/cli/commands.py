@@ -42,10 +42,7 @@ MOST_SPECTRA = 1e16
 
 
 def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
-    """Raise InputError for values that a later step would reject, or that would keep a hundred cores busy for a year.
-
-    A verb that `detects` needs flares and thresholds; `insist` lets one that `draws` take any time.
-    """
+    """Raise InputError for values that a later step would reject, or a year of draws unless that is insisted on."""
     from mauvecl.detection import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, named_star
@@ -141,10 +138,8 @@ class Session(flags.Options):
         with report_interrupts(saved), checkpoint:
             self.say(checkpoint.messages)
             yield checkpoint
-            if checkpoint.damaged:
-                self.say(
-                    [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
-                )
+            if damaged := checkpoint.damaged:
+                self.say([f"{damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."])
         self._checkpoint = checkpoint
 
     def say(self, lines: Sequence[str]) -> None:
@@ -170,8 +165,7 @@ class Session(flags.Options):
 
         def prepare() -> None:
             # Modules for tables and pictures are imported in advance, which saves 0.75 s at the end.
-            from mauvecl.charts.chart import load
-            from mauvecl.charts.matplotlib import available, style
+            from mauvecl.charts.matplotlib import available, load, style
 
             for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
                 import_module(name)
@@ -187,10 +181,7 @@ class Session(flags.Options):
 
     @contextmanager
     def pool(self, counts: str, **options: Any) -> Iterator[tuple[Pool, Meter]]:
-        """Yield a pool of the workers that the flags name, and its meter; the workers stop if the work ends early.
-
-        The pool reports progress in realisations; the caller reports anything else that the meter `counts`.
-        """
+        """Yield a pool of the workers that the flags name, and the meter of what the verb `counts`."""
         from mauvecl.runs.pool import LocalWorkers, Pool
 
         with Meter(quiet=self.quiet or self.as_json, unit=counts) as meter:
@@ -251,9 +242,8 @@ class Session(flags.Options):
         about: dict[str, Any] = {"pool": self._pool, "opened": self.opened, "files": self.files}
         about |= {"seconds": time.perf_counter() - self.started, "messages": [*answer.messages, *answer.remarks]}
         # Only a complete answer replaces another's files.
-        self.write_file(
-            lambda: write_record(self.verb, data, answer.inputs, self.folder, whole=not self._lost, **about)
-        )
+        about["whole"] = not self._lost
+        self.write_file(partial(write_record, self.verb, data, answer.inputs, self.folder, **about))
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
@@ -360,9 +350,7 @@ class Command:
         detects = {"fap", "realisations"} <= keywords.keys()
         question_values(study, detects=detects, draws=self.draws, insist=options.get("insist", False))
         with ExitStack() as resources:
-            session = Session(
-                self.verb.name, study, flag_values, resources, draws=self.draws, notes=messages, **options
-            )
+            session = Session(self.verb.name, study, flag_values, resources, self.draws, messages, **options)
             try:
                 self.run(session, **values)
             except InputError:
@@ -383,9 +371,7 @@ class Command:
         }
 
 
-RowsFlag = Annotated[
-    str | None, flags.option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")
-]
+Rows = Annotated[str | None, flags.option(metavar="TEXT", text="Realisations, such as 1000:2000, without the last.")]
 
 
 def realise(session: Session) -> None:
@@ -452,7 +438,7 @@ def verify(
     redraw: Annotated[
         bool, typer.Option("--redraw", help="Redraw and compare every spectrum, not only the digests.")
     ] = False,
-    rows: RowsFlag = None,
+    rows: Rows = None,
     device: flags.DeviceFlag = None,
     as_json: flags.JsonFlag = False,
     quiet: flags.QuietFlag = False,
@@ -503,7 +489,7 @@ def export(
     array: Annotated[
         list[str] | None, flags.option("--array", metavar="TEXT", text="Such as star-1/flare-2; may be repeated [all].")
     ] = None,
-    rows: RowsFlag = None,
+    rows: Rows = None,
     replace: flags.ReplaceFlag = False,
     quiet: flags.QuietFlag = False,
 ) -> None:

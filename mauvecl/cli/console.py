@@ -42,8 +42,6 @@ EXIT_CODES = (
     f"(a fault of mauvecl; a file with its traceback is named), {OUTPUT_FULL} standard output cannot be written, "
     f"{INTERRUPTED} interrupted, {READER_GONE} the reader of standard output went away, 143 terminated."
 )
-#: Largest number of characters of a message.
-LONGEST = 1000
 #: Error numbers of full disks and quotas, which name no file.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
@@ -53,12 +51,17 @@ REMOVED = {
     "--keep-after": "leave it out, since finished parts of a run are saved after 20 s",
     "--trials": "give --set change.trials=NUMBER",
 }
-#: Libraries that write to standard output for mauvecl.
-PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
-#: The running command line, whose flags messages name.
-_app: typer.Typer | None = None
-#: Output folder of the verb, once known, to which tracebacks are written.
-folder: Path | None = None
+PRINTERS = ("click", "typer", "rich", "mauvecl.cli")  # libraries that write to standard output for mauvecl
+LONGEST = 1000  # characters of a message
+WIDEST = 100_000  # width of a table in a pipe or file, characters
+PATIENCE_S = 2.0  # work that is shorter shows no progress
+CLEARED = "\r\x1b[K"  # clears the line of a terminal
+#: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
+TOLD_FROM = 0.01
+#: Units of the remaining time, s; smaller times than three of them are in the next one.
+UNITS = (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0))
+_app: typer.Typer | None = None  # the running command line, whose flags messages name
+folder: Path | None = None  # output folder of the verb, once known, to which tracebacks are written
 
 
 def guarded(app: typer.Typer) -> int:
@@ -173,9 +176,8 @@ def _not_written(error: OSError) -> int:
         os.close(nowhere)
     if isinstance(error, BrokenPipeError):
         return READER_GONE
-    return _say(
-        f"standard output cannot be written ({error.strerror}); use one with room (files are kept)", OUTPUT_FULL
-    )
+    reason = error.strerror
+    return _say(f"standard output cannot be written ({reason}); use one with room (files are kept)", OUTPUT_FULL)
 
 
 def _write_traceback(error: Exception) -> Path | str:
@@ -196,23 +198,8 @@ def _write_traceback(error: Exception) -> Path | str:
     return "no file, since none can be written"
 
 
-#: Work shorter than this shows no progress, s.
-PATIENCE_S = 2.0
-#: Largest width of a table in a pipe or file, characters.
-WIDEST = 100_000
-#: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
-TOLD_FROM = 0.01
-#: Units of the remaining time, s; smaller times than three of them are in the next one.
-UNITS = (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0))
-#: Clears the line of a terminal.
-CLEARED = "\r\x1b[K"
-
-
 class Meter:
-    """Progress with rate and time left, on standard error, for work longer than two seconds.
-
-    On a terminal and in a notebook it is one line that changes; elsewhere a line every ten seconds.
-    """
+    """Progress with rate and time left on standard error, on a terminal in one line; none for work of two seconds."""
 
     # Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     standing: Callable[[], PoolProgress] | None = None
@@ -351,10 +338,7 @@ def _divided(columns: list[list[str]], room: int) -> list[list[list[str]]]:
 
 
 def _flags(name: str, *, off: bool = False) -> list[str]:
-    """Return the flags that set a parameter or a key of the study, or turn it off, the long one first.
-
-    They are those of the called command, or else of all keys of the study.
-    """
+    """Return the flags, the long one first, that set a key or turn it off, of the called command or of all."""
     from typer.main import get_command
 
     from mauvecl.study.study import keys_of

@@ -35,8 +35,7 @@ PaperFlag = Annotated[
         "--paper", text="Ask with the conventions of the MauveSim paper: dark drawn in DN, all but the noise known."
     ),
 ]
-#: Key of a context that shows all flags.
-SHOWS_ALL = "mauvecl.help_all"
+SHOWS_ALL = "mauvecl.help_all"  # key of a context that shows all flags
 
 
 def _show_all(context: typer.Context, is_set: bool) -> None:
@@ -86,11 +85,7 @@ WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
 def study_option(keyword: Keyword, defaults: Mapping[str, Any]) -> Any:
-    """Return the annotation of a flag of the study's key for typer: description, accepted words, unit and default.
-
-    Typer leaves numbers as text, which the study converts, so that messages have one style. `defaults` holds defaults
-    of a verb that differ from the study's, by key.
-    """
+    """Return the annotation of a key's flag for typer, with numbers as text; `defaults` are those of the verb."""
     path, field, flag = keyword
     help = flag.help or first(field, Help) or Help("")
     unit = None if flag.help else first(field, Unit)

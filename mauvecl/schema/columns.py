@@ -267,7 +267,7 @@ class Drawable:
     @property
     def pictures(self) -> dict[str, Callable[..., Any]]:
         """Every picture by the name of its file; each is called with a `path`, with axes `ax`, or with neither."""
-        pictures: dict[str, Callable[..., Any]] = import_module("mauvecl.charts.chart").pictures_of(self)
+        pictures: dict[str, Callable[..., Any]] = import_module("mauvecl.charts.matplotlib").pictures_of(self)
         return pictures
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:

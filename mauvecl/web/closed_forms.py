@@ -35,7 +35,18 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
 
-
+Answers = Mapping[str, Any]  # simulated answers to one question, by name
+OTHER = "detection otherwise"  # name of the detection with the other choice of unknowns; the card shows both
+#: Labels of the choices of the field "unknown".
+TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everything but the noise known"}
+#: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
+THROUGHPUT = 0.3
+#: Words for a limit by its quantity: before its value, the value, without a limit, and for one that takes a simulation.
+LIMITS: dict[str, tuple[str, Callable[[float], str], str, str]] = {
+    "amplitude": ("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude", "of an amplitude"),
+    "magnitude": ("to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude"),
+    "exposure": ("in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure"),
+}
 #: Names of uploaded spectra by field, in the folder of their study.
 SPECTRA = {
     "star": "star.ecsv", "flare_file": "flare.ecsv", "flare_quiescent": "quiescent.ecsv", "change_file": "added.ecsv",
@@ -120,10 +131,6 @@ class FieldValues:
         return [value] if page_field.path[-1] == "amplitudes" else value
 
 
-#: Light other than the star's in an expectation.
-BEHIND = ("sky_electrons", "neighbour_electrons")
-
-
 class InterpolatedForm:
     """Closed form that is exact at some points and interpolated in the probit between them."""
 
@@ -145,12 +152,6 @@ class InterpolatedForm:
         return np.asarray(self._inverse(-special.ndtri(probability)))
 
 
-#: Simulated answers to one question, by name.
-Answers = Mapping[str, Any]
-#: Name of the detection with the other choice of unknowns; the card shows both.
-OTHER = "detection otherwise"
-
-
 @dataclass(frozen=True, eq=False)
 class ClosedForms:
     """Closed-form answer to a question."""
@@ -164,10 +165,7 @@ class ClosedForms:
     def of(
         cls, question: FieldValues, folder: Path, *, chance: bool = True, inputs: Mapping[str, Any] | None = None
     ) -> ClosedForms:
-        """Answer a question; `folder` holds the visitor's files for the study, and `inputs` their contents.
-
-        Without the `chance` of detection, the star may be too bright for a detection.
-        """
+        """Answer a question with files in `folder`; without the `chance`, no flare needs to be detectable."""
         case = question.case(folder)
         # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.
         values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
@@ -214,14 +212,9 @@ class ClosedForms:
         return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
     @cached_property
-    def null(self) -> InterpolatedForm:
-        """Distribution of the statistic without a flare, for pictures."""
-        return InterpolatedForm(self.odds.null)
-
-    @cached_property
-    def flaring(self) -> InterpolatedForm:
-        """Distribution of the statistic with the flare, for pictures."""
-        return InterpolatedForm(self.odds.flaring)
+    def forms(self) -> tuple[InterpolatedForm, InterpolatedForm]:
+        """Distributions of the statistic without and with the flare, for pictures."""
+        return InterpolatedForm(self.odds.null), InterpolatedForm(self.odds.flaring)
 
     @cached_property
     def messages(self) -> list[str]:
@@ -239,14 +232,13 @@ class ClosedForms:
         return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
     def at(self, light: float, rises: Float, *, others: bool = False) -> list[DetectionForms]:
-        """Return the closed forms for factors on the light, with `others` all light's, and on the amplitude, (n_rise,).
-
-        The list is empty if the star saturates every pixel.
-        """
+        """Return closed forms for factors on light (`others`: on all light) and amplitude; none if all saturates."""
         q, base = self.question, self.quiet
         statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
-        behind = {name: getattr(base, name) * (light if others else 1.0) for name in BEHIND}
-        quiet = replace(base, source_electrons=light * base.source_electrons, **behind)
+        behind = light if others else 1.0
+        sky, neighbours = behind * base.sky_electrons, behind * base.neighbour_electrons
+        star = light * base.source_electrons
+        quiet = replace(base, source_electrons=star, sky_electrons=sky, neighbour_electrons=neighbours)
         setting = self.case.setting(quiet)
         if not setting.used.any():
             return []
@@ -262,12 +254,6 @@ class ClosedForms:
 def short(value: float) -> str:
     """Format a number with three significant digits and no power of ten."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-#: Labels of the choices of the field "unknown".
-TITLES = {REALISTIC: "realistic: with the usual unknowns", IDEAL: "ideal: everything but the noise known"}
-#: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
-THROUGHPUT = 0.3
 
 
 class Chance(NamedTuple):
@@ -303,14 +289,6 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
             value, origin = float("nan"), sentence(error)
         all_chances.append(Chance(unknown, value, origin))
     return all_chances
-
-
-#: Words for a limit by its quantity: before its value, the value, without a limit, and for one that takes a simulation.
-LIMITS: dict[str, tuple[str, Callable[[float], str], str, str]] = {
-    "amplitude": ("of at least", lambda value: f"{short(100 * value)} %", "of no amplitude", "of an amplitude"),
-    "magnitude": ("to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude"),
-    "exposure": ("in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure"),
-}
 
 
 def solved(closed: ClosedForms) -> str:

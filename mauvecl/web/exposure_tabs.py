@@ -11,20 +11,8 @@ from mauvecl.answers.closed_forms import Cost, spoken, unknown_cost
 from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.detect import power
 from mauvecl.answers.signal import simulate
-from mauvecl.charts.chart import (
-    WAVELENGTH,
-    Area,
-    Bars,
-    Chart,
-    ChartData,
-    Custom,
-    Dots,
-    LegendEntry,
-    Line,
-    OwnMarker,
-    PlotAxis,
-    Rule,
-)
+from mauvecl.charts import chart
+from mauvecl.charts.chart import WAVELENGTH, Area, Bars, Chart, ChartData, Dots, Line, OwnMarker, PlotAxis, Rule
 from mauvecl.charts.detection import BUDGET, budget_series, roc_columns
 from mauvecl.detection.requests import statistic_label
 from mauvecl.noise.unknowns import NUISANCES
@@ -201,10 +189,8 @@ SPECTRUM = Tab(
 def excess(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the flare minus quiet in standard deviations of the noise."""
     x, saturated = closed.quiet, closed.quiet.saturated | closed.flare.saturated
-    rise, noise2 = (
-        np.where(x.saturated, 0.0, values) for values in (closed.flare.signal_dn - x.signal_dn, x.variance_dn2)
-    )
-    noise = np.sqrt(x.per_element(noise2))
+    rise = np.where(x.saturated, 0.0, closed.flare.signal_dn - x.signal_dn)
+    noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
     element = np.divide(x.per_element(rise), noise, out=np.zeros(noise.size), where=noise > 0)
     series: dict[str, Any] = {
         "pixel": (x.wavelength_nm, rise / np.sqrt(x.variance_dn2)),
@@ -235,7 +221,7 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
     (
         Bars("simulated", "star", "null bars", listed=False),
         Bars("simulated", "flare", "flare bars", listed=False),
-        LegendEntry("simulated", form="bars", show="if any"),
+        chart.LegendEntry("simulated", form="bars", show="if any"),
         Area("no flare", "star", "null area", alpha=0.18, listed=False),
         Line("no flare", "star", "null", width=2, tips=("statistic", "density")),
         Area("flare", "flare", "flare area", alpha=0.18, listed=False),
@@ -247,8 +233,8 @@ def excess(closed: ClosedForms, answers: Answers) -> ChartData:
 def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the distributions of the statistic without and with the flare, and the threshold."""
     q, threshold, chance = closed.question, closed.odds.threshold, closed.chance
-    series: dict[str, Any] = {}
-    for name, form in (("null", closed.null), ("flare", closed.flaring)):
+    series, (null, flaring) = dict[str, Any](), closed.forms
+    for name, form in (("null", null), ("flare", flaring)):
         edges = np.linspace(form.mean - 5 * form.std, form.mean + 5 * form.std, 161)
         beyond = form.sf(edges)
         density = np.maximum(beyond[:-1] - beyond[1:], 0.0)
@@ -265,8 +251,8 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
     series["threshold"] = threshold if threshold == threshold else None
     share = f"{chance_text(chance)} of flares lie above the threshold of {threshold:.4g}"
     text = (
-        f"Without a flare {q.statistic} lies at {with_error(closed.null.mean, closed.null.std)}, with it at "
-        f"{with_error(closed.flaring.mean, closed.flaring.std)}; "
+        f"Without a flare {q.statistic} lies at {with_error(null.mean, null.std)}, with it at "
+        f"{with_error(flaring.mean, flaring.std)}; "
         f"{share if threshold == threshold else 'no threshold has this false-alarm probability'}."
     )
     return ChartData(text, series, {"x axis": {"axis_label": statistic_label(q.statistic)}})
@@ -285,9 +271,9 @@ def distributions(closed: ClosedForms, answers: Answers) -> ChartData:
 ).data()  # fmt: skip
 def trade(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the detection probability against the false-alarm probability."""
-    q = closed.question
+    q, (null, flaring) = closed.question, closed.forms
     faps = np.logspace(-6, 0, 121)[:-1]
-    chances = closed.flaring.sf(closed.null.isf(faps))
+    chances = flaring.sf(null.isf(faps))
     series: dict[str, Any] = {"closed form": (faps, chances), "own": ([q.fap], [closed.chance])}
     if "detection" in answers:
         fap, _, *ends = roc_columns(answers["detection"].stars[0].detection.roc(q.statistic))
@@ -344,7 +330,7 @@ def _bars(canvas: Canvas, source: ColumnDataSource) -> None:
 
 @Chart(
     "cost", "What each unknown costs: the flare's S/N by the matched statistic", PlotAxis("S/N of the flare"),
-    PlotAxis(kind="names"), (Custom("bars", columns=("name", "plain", "marginal", "known"), draw=_bars),),
+    PlotAxis(kind="names"), (chart.Custom("bars", columns=("name", "plain", "marginal", "known"), draw=_bars),),
 ).data()  # fmt: skip
 def unknown_costs(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the matched S/N with each unknown, plain and marginalised."""

@@ -40,20 +40,25 @@ REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000
 
 #: Choices of what is unknown: the usual unknowns, and nothing but the noise.
 REALISTIC, IDEAL = UNKNOWN = ("realistic", "ideal")
+SKIES = ("brightness", "target and time", "none")
 #: Values of fields in links of version 1, which have other names today, with these names.
 FORMER_VALUES = {
     "unknown": {"nothing": IDEAL, "the usual": REALISTIC},
     "instrument": {"mauve": FORMERLY_MAUVE} | FORMER_NAMES,
 }
-SKIES = ("brightness", "target and time", "none")
-#: Largest number of characters of a field.
-MOST_CHARACTERS = 200
-#: Largest number of a visitor's targets.
-MOST_TARGETS = 30
-#: Largest number of characters of a table of neighbours, which is a part of links.
-MOST_TABLE = 3000
-#: Largest number of points of an unknown spectrum, which the study in every table contains.
-MOST_POINTS = 4000
+#: Headings of fields by the section of their key, unless they state another; fields of other sections show at once.
+HEADINGS = {
+    "flare.spectrum": "Flare's spectrum", "sky": "Sky", "run": "Detection", "limit": "Limit", "search": "Search",
+    "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
+    "calibrate": "Standards", "change": "Change",
+}  # fmt: skip
+MOST_CHARACTERS, MOST_TABLE = 200, 3000  # of a field, and of a table of neighbours, which is a part of links
+MOST_TARGETS = 30  # of a visitor
+MOST_POINTS = 4000  # of an unknown spectrum, which the study in every table contains
+NO_KEYS: Mapping[str, str] = MappingProxyType({})
+_FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")  # a flag of the command line
+#: A key within a message; words of prose contain no underscore.
+_KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
 
 
 @dataclass(frozen=True)
@@ -145,10 +150,7 @@ def star_name(text: str) -> str:
 
 
 def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
-    """Parse targets: a name or coordinates in each line, or a CSV table with a header of keys of `PlanTarget`.
-
-    With a check their positions must be known, and all must differ.
-    """
+    """Parse targets: a name or coordinates a line, or a CSV table; a check requires known positions that all differ."""
     from mauvecl.study.plan import PlanTarget, targets_in
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -220,14 +222,6 @@ class Field(Widget):
     def keys(self) -> tuple[str, ...]:
         """Keys and sections of the study that it sets."""
         return self.own_keys or (".".join(self.path),)
-
-
-#: Headings of fields by the section of their key, unless they state another; fields of other sections show at once.
-HEADINGS = {
-    "flare.spectrum": "Flare's spectrum", "sky": "Sky", "run": "Detection", "limit": "Limit", "search": "Search",
-    "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
-    "calibrate": "Standards", "change": "Change",
-}  # fmt: skip
 
 
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
@@ -346,8 +340,7 @@ ADVANCED = {
     for name in ("Star", "Detection", "Flare's spectrum", "Measurement", "Detector", "Sky", "Unknown", "Change",
                  "Search", "Neighbours", "Pointing")
 }  # fmt: skip
-#: Fields of the card.
-SOLVED = _group("Limit")
+SOLVED = _group("Limit")  # fields of the card
 #: Fields that apply only with the file of another field, below which they stand.
 WITH_FILE = {"star": _group("Own spectrum"), "flare_file": _group("Own flare"), "change_file": _group("Added spectrum")}
 #: Fields of forms of their own, which stand in the panels of the tabs that read them.
@@ -367,13 +360,6 @@ PRESETS: dict[str, dict[str, str]] = {
     "M dwarf": {"star": "GJ 581", "magnitude": "10.6", "amplitude_percent": "10"},
     "Active G star": {"star": "G8V", "magnitude": "6.5", "amplitude_percent": "0.5", "exposure_s": "100"},
 }
-
-
-NO_KEYS: Mapping[str, str] = MappingProxyType({})
-#: A flag of the command line.
-_FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
-#: A key within a message; words of prose contain no underscore.
-_KEY = re.compile(r"(?<![\w.'])(?:[a-z]+\.)*[a-z0-9]+(?:_[a-z0-9]+)+(?![\w.]*')")
 
 
 @cache

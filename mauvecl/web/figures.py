@@ -3,45 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from bokeh import models
 from bokeh.models.annotations import ColorBar, Label, Span
 from bokeh.plotting import figure
 
-from mauvecl.charts.chart import (
-    INK,
-    Area,
-    Bars,
-    Contours,
-    Custom,
-    Dots,
-    LegendEntry,
-    Line,
-    OwnMarker,
-    Rule,
-    Strips,
-    Targets,
-)
+from mauvecl.charts import chart
 from mauvecl.host.arrays import true_runs
 from mauvecl.host.stars.flare import EmissionLine
 
-if TYPE_CHECKING:
-    from mauvecl.charts.chart import Chart, PlotAxis, Series
-
-#: Wavelengths that are shown, nm.
-SHOWN_NM = (195.0, 705.0)
+SHOWN_NM = (195.0, 705.0)  # wavelengths that are shown
 #: Spectral lines, and the Balmer jump at 4 / R_H with Rydberg's constant for hydrogen, nm in vacuum.
 MARKS = {name: EmissionLine.named(name).wavelengths_nm for name in ("Mg II", "Ca II", "H alpha")}
 MARKS["Balmer jump"] = (364.7,)
-#: Marks that are hidden by default.
-MORE_MARKS = ("H alpha",)
-
-
+MORE_MARKS = ("H alpha",)  # marks that are hidden by default
 #: Colours of the light and the dark theme by name, lighter on dark ground.
 INKS = {
-    "light": INK,
+    "light": chart.INK,
     "dark": {
         "text": "#e6ebf1", "grid": "#34404d", "ground": "#182029", "star": "#56B4E9", "flare": "#FF8C42",
         "sky": "#2fc79a", "drawn": "#9aa7b5", "dark": "#b99be0", "read": "#F0C040", "bias": "#E39BC9",
@@ -54,32 +34,31 @@ PINS = {
     "light": (("#A21CAF", "6 3"), ("#7C4A03", "9 3 2 3"), ("#0E7490", "2 2")),
     "dark": (("#F0ABFC", "6 3"), ("#D9AE76", "9 3 2 3"), ("#67E8F9", "2 2")),
 }
-#: Colours of the curves of several targets.
-TARGETS = ("star", "flare", "sky", "own", "dark", "read", "bias", "drawn")
+TARGETS = ("star", "flare", "sky", "own", "dark", "read", "bias", "drawn")  # colours of several targets' curves
 
 
 class Canvas:
     """Empty figure of a chart, whose data sources have the names of the chart's data."""
 
-    def __init__(self, chart: Chart, theme: str, logs: frozenset[str]) -> None:
-        self.ink, self.chart = INKS[theme], chart
-        offered = {axis.lower() for axis in chart.logs}
-        self.logs = logs | {name for name, axis in (("x", chart.x), ("y", chart.y)) if axis.log and name not in offered}
-        self.plot = self._frame(chart.x, chart.y)
+    def __init__(self, picture: chart.Chart, theme: str, logs: frozenset[str]) -> None:
+        self.ink, self.picture = INKS[theme], picture
+        always = {name for name, axis in (("x", picture.x), ("y", picture.y)) if axis.log}
+        self.logs = logs | (always - {axis.lower() for axis in picture.logs})
+        self.plot = self._frame(picture.x, picture.y)
         #: Entries of the legend: name, colour, form, and the tag that shows or hides each.
         self.legend: list[tuple[str, str, str, str]] = []
-        if chart.x.kind == "wavelength":
+        if picture.x.kind == "wavelength":
             self._mark()
         # A line for each scenario that can be pinned is drawn as the series that it repeats.
         pins = [
             replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
                     tips=(), listed=False)
-            for k, (colour, dash) in enumerate(PINS[theme]) for item in chart.series if item.key == chart.pins
+            for k, (colour, dash) in enumerate(PINS[theme]) for item in picture.series if item.key == picture.pins
         ]  # fmt: skip
-        for series in sorted((*chart.series, *pins), key=lambda item: isinstance(item, OwnMarker)):
+        for series in sorted((*picture.series, *pins), key=lambda item: isinstance(item, chart.OwnMarker)):
             self._add(series)
 
-    def _frame(self, x: PlotAxis, y: PlotAxis) -> Any:
+    def _frame(self, x: chart.PlotAxis, y: chart.PlotAxis) -> Any:
         """Return a figure with axes only."""
         ranges = {f"{name}_range": bounds for name, axis in (("x", x), ("y", y)) if (bounds := self._range(name, axis))}
         plot = figure(
@@ -117,7 +96,7 @@ class Canvas:
         plot.x_range.name, plot.y_range.name = "wavelength" if x.kind == "wavelength" else "x range", "y range"
         return plot
 
-    def _range(self, name: str, axis: PlotAxis) -> Any:
+    def _range(self, name: str, axis: chart.PlotAxis) -> Any:
         """Return the range of an axis, or None for Bokeh's own."""
         if axis.kind == "wavelength":
             # All figures with wavelengths share one range.
@@ -140,37 +119,37 @@ class Canvas:
         self.plot.add_layout(bar, "right")
         return mapper
 
-    def _add(self, series: Series) -> None:
+    def _add(self, series: chart.Series) -> None:
         """Add a series with its data source, entry of the legend, and tooltip."""
-        if isinstance(series, Rule):
+        if isinstance(series, chart.Rule):
             # Its position is set later.
             dimension: Literal["height", "width"] = "height" if series.along == "x" else "width"
             style: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
             self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **style))
-        if isinstance(series, Rule | LegendEntry):
+        if isinstance(series, chart.Rule | chart.LegendEntry):
             self._list(series)
             return
-        if isinstance(series, Targets):
+        if isinstance(series, chart.Targets):
             for k, colour in enumerate(TARGETS):
                 name = f"{series.key} {k}"
-                self._add(Line(f"target {k + 1}", colour, name, width=2, dash=series.dash, tips=series.tips))
+                self._add(chart.Line(f"target {k + 1}", colour, name, width=2, dash=series.dash, tips=series.tips))
             return
         source = models.ColumnDataSource({column: [] for column in series.columns}, name=series.key)
-        if isinstance(series, Custom):
+        if isinstance(series, chart.Custom):
             if series.draw is not None:
                 series.draw(self, source)
             return
         renderer = self._drawn(series, source)
-        hidden = series.show in self.chart.shows
+        hidden = series.show in self.picture.shows
         renderer.name, renderer.visible = series.called, not hidden
         renderer.tags = [series.show] if hidden or series.show == "pins" else []
         self._list(series)
         if series.tips:
             self.tooltips(renderer, *zip(series.tips, ("x", "y")[-len(series.tips) :], strict=True))
-        if isinstance(series, Dots) and series.alone:
+        if isinstance(series, chart.Dots) and series.alone:
             self.plot.y_range.update(renderers=[renderer])
 
-    def _drawn(self, series: Series, source: models.ColumnDataSource) -> Any:
+    def _drawn(self, series: chart.Series, source: models.ColumnDataSource) -> Any:
         """Return the renderer of a series."""
         plot, colour, columns = self.plot, self.ink.get(series.colour, series.colour), series.columns
         line: dict[str, Any] = {
@@ -179,28 +158,28 @@ class Canvas:
         }  # fmt: skip
         fill: dict[str, Any] = {"source": source, "fill_color": colour, "fill_alpha": series.alpha}
         match series:
-            case Area():
+            case chart.Area():
                 return plot.varea(*columns, **fill)
-            case Strips():
+            case chart.Strips():
                 hatch = {"hatch_pattern": "/", "hatch_color": colour, "hatch_alpha": 0.5} if series.hatched else {}
                 return plot.vstrip(*columns, line_color=None, **fill, **hatch)
-            case Bars():
+            case chart.Bars():
                 return plot.quad("left", "right", "top", 1e-9 if "y" in self.logs else 0, line_color=None, **fill)
-            case OwnMarker():
+            case chart.OwnMarker():
                 return plot.scatter(*columns, source=source, size=13, marker="circle", fill_color=colour,
                                     line_color=self.ink["ground"], line_width=2)  # fmt: skip
-            case Dots():
+            case chart.Dots():
                 return plot.scatter(*columns, source=source, size=series.size, color=colour, marker=series.marker)
-            case Contours():
+            case chart.Contours():
                 if series.dash:
                     # A bright edge sets pinned contours off from the map.
                     plot.multi_line(*columns, source=source, line_color="#ffffff", line_width=5, tags=[series.show])
                 return plot.multi_line(*columns, source=source, **line)
-            case Line(step=True):
+            case chart.Line(step=True):
                 return plot.step(*columns, source=source, mode="center", **line)
         return plot.line(*columns, source=source, **line)
 
-    def _list(self, series: Series) -> None:
+    def _list(self, series: chart.Series) -> None:
         """Add an entry to the legend."""
         if series.listed:
             form = "dash" if series.dash else series.form
@@ -244,7 +223,7 @@ class Canvas:
 
 
 #: Pixels that saturate, whose data `strips` returns.
-SATURATED = Strips("saturated", "own", show="if any", alpha=0.18, hatched=True)
+SATURATED = chart.Strips("saturated", "own", show="if any", alpha=0.18, hatched=True)
 
 
 def strips(wavelength_nm: Any, flags: Any) -> tuple[Any, Any]:

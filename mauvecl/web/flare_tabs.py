@@ -14,19 +14,8 @@ from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from mauvecl.answers.measure import COLUMNS, expected_measurements, models_of
-from mauvecl.charts.chart import (
-    Area,
-    Chart,
-    ChartData,
-    Contours,
-    Custom,
-    Dots,
-    LegendEntry,
-    Line,
-    OwnMarker,
-    PlotAxis,
-    Rule,
-)
+from mauvecl.charts import chart
+from mauvecl.charts.chart import Area, Chart, ChartData, Custom, Dots, Line, OwnMarker, PlotAxis, Rule
 from mauvecl.charts.spectra import FACTORS, RISES
 from mauvecl.fits.flare_model import FlareModel
 from mauvecl.host.arrays import Float
@@ -49,14 +38,10 @@ T = TypeVar("T")
 
 #: Ranges of the pictures: magnitudes, and amplitudes in per cent, fixed for all questions.
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
-#: Columns and rows of a map in closed form; smooth quantities are interpolated between them.
-STEPS = 9, 5
-#: Labelled contours, with the part of the line at which the label stands.
-LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}
+STEPS = 9, 5  # columns and rows of a map in closed form; smooth quantities are interpolated between them
+LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}  # contours, with the part of the line at which the label stands
 #: Initial number of points of a curve, number of times that steps are halved, and change above which they are halved.
 FIRST, HALVINGS, CHANGE = 9, 5, 0.1
-
-
 #: Fields on which a map does not depend; an upload is identified by its content.
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours"}
 
@@ -195,12 +180,12 @@ def _draw_labels(canvas: Canvas, source: ColumnDataSource) -> None:
     PlotAxis("flare amplitude", limits=tuple(np.log10(PERCENTS))),
     (
         Custom("map", columns=("image", "percent", "x", "y", "dw", "dh"), draw=_draw_map),
-        Contours("contours", "#ffffff", width=1.2, listed=False),
-        Contours("half", "#ffffff", width=2.2, listed=False),
+        chart.Contours("contours", "#ffffff", width=1.2, listed=False),
+        chart.Contours("half", "#ffffff", width=2.2, listed=False),
         Custom("simulated", columns=("x", "y", "p"), draw=_draw_cells),
         Custom("labels", columns=("x", "y", "text"), draw=_draw_labels),
-        LegendEntry("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
-        LegendEntry("simulated", "#8a8678", show="if any", form="dot", name="entry"),
+        chart.LegendEntry("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
+        chart.LegendEntry("simulated", "#8a8678", show="if any", form="dot", name="entry"),
         OwnMarker(),
     ),
     sets="magnitude=x,amplitude_percent=10^y", pins="half", alike=("band",),
@@ -267,12 +252,9 @@ ASSUMED = {
     "usual unknowns": NuisanceChoice(),
     "dark and star free": NuisanceChoice.model_validate({"usual": False, "dark": "free", "light": "free"}),
 }
-#: Names of the curves.
-NAMES = ("known", "usual", "free")
-#: Half-widths before and after the peak of a flare in a stare that are shown.
-NEAR = (2.0, 6.0)
-#: Largest number of simulated fits that are shown.
-MOST_DOTS = 500
+NAMES = ("known", "usual", "free")  # of the curves
+NEAR = (2.0, 6.0)  # half-widths before and after the peak of a flare in a stare that are shown
+MOST_DOTS = 500  # simulated fits that are shown
 
 
 @lru_cache(maxsize=4)
@@ -436,8 +418,7 @@ MEASUREMENT = Tab(
 )
 
 
-#: Names of the half-widths of injected flares, one per line of the picture.
-LENGTHS = ("shortest", "middle", "longest")
+LENGTHS = ("shortest", "middle", "longest")  # half-widths of injected flares, one per line of the picture
 
 
 @Chart(

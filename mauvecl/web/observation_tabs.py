@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from mauvecl.web.figures import Canvas
     from mauvecl.web.uploads import Observations
 
-
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
-#: Colours of the dynamic spectrum, from low to high.
-BLUE, MIDDLE, RED = "#0072B2", "#F7F7F7", "#D55E00"
+BLUE, MIDDLE, RED = "#0072B2", "#F7F7F7", "#D55E00"  # colours of the dynamic spectrum, from low to high
+#: Limits of the energy axes, erg, the same for all questions; columns of `PlannedTarget.by_energy` in the pictures.
+ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 NO_FRAMES = "Choose a file of frames: a light curve or a sequence of spectra."
 
 
@@ -105,9 +105,8 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
 
 def read_frames(question: FieldValues) -> dict[str, Any]:
     """Read the frames."""
-    frames = read_frames_of(
-        question.uploads["frames"], question.uploads.get("mapping"), quality_bits=question.quality_bits
-    )
+    files = question.uploads
+    frames = read_frames_of(files["frames"], files.get("mapping"), quality_bits=question.quality_bits)
     if frames.flux.size > MOST_VALUES:
         raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
     return {"frames": frames}
@@ -181,10 +180,8 @@ def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, fl
         lines = spectra.along_magnitude(answer, units)
         return ChartData(text, {name: lines, "own": ([closed.question.magnitude] * len(finite), finite)})
 
-    axis, lines = (
-        PlotAxis(f"smallest change ({label})", log=True),
-        (Targets(name, tips=(label,)), OwnMarker("this star")),
-    )
+    axis = PlotAxis(f"smallest change ({label})", log=True)
+    lines = Targets(name, tips=(label,)), OwnMarker("this star")
     changes = Chart(name, title, PlotAxis("magnitude"), axis, lines, sets="magnitude=x")
     return changes.data("change", "Change computes which differences between visits are detected.")(along)
 
@@ -256,10 +253,6 @@ PERIODS = Tab(
     never=("power", "fap"),
     files={"periods": "periods"},
 )
-
-
-#: Limits of the energy axes, erg, the same for all questions; columns of `PlannedTarget.by_energy` in the pictures.
-ENERGIES, BY_ENERGY = (1e28, 1e37), ("energy", "recovered", "rate_above")
 
 
 def _energy(value: Any) -> str:

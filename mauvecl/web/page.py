@@ -1,8 +1,4 @@
-"""The page's tabs, its state, its card, and the stars that it knows.
-
-The state is independent of the page's appearance: the page enters text, and shows `entered` and `faults`. It holds the
-text of all fields, their errors, and the question if all are valid.
-"""
+"""The page's tabs, its state, which a link gives, its card, and the stars that it knows."""
 
 from __future__ import annotations
 
@@ -31,6 +27,12 @@ from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PL
 from mauvecl.web.tab import Tab
 from mauvecl.web.uploads import UPLOADS
 
+WITH_MESSAGES = ("detection", "measure")  # answers whose messages are shown, which include those of the others
+NOMINAL = "The throughput is nominal"  # start of the message about it, which the page shows once
+#: Kinds of messages that change the answer, which are shown in red.
+CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
+            "outside the prior"}  # fmt: skip
+MOST_LINKED = 8192  # characters of a link that are parsed
 #: Tabs with pictures, in the order of their group.
 DRAWN = (DETECTION, SPECTRUM, SIGNAL, NOISE, LIMIT, MEASUREMENT, UNKNOWN, CHANGE, PERIODS, COMPLETENESS, ANALYSE,
          CALIBRATE, VISIBILITY, PLAN)  # fmt: skip
@@ -53,7 +55,6 @@ TABS: dict[str, Tab] = {
     if tab.group == group
 }
 
-
 #: Questions that a button simulates, with the first tab that has the button.
 SIMULATIONS = {name: tab for tab in reversed(TABS.values()) for name in tab.simulations}
 
@@ -63,24 +64,8 @@ def reads_of(simulation: str) -> frozenset[str]:
     return SIMULATIONS[simulation].reads_of(simulation)
 
 
-#: Part of the message about the throughput, which the page shows once.
-NOMINAL = "The throughput is nominal"
-#: Kinds of messages that change the answer, which are shown in red.
-CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
-            "outside the prior"}  # fmt: skip
-#: Answers whose messages are shown, since they include those of the others.
-WITH_MESSAGES = ("detection", "measure")
-
-
 def card(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
-    """Return the contents of the card.
-
-    It holds ``headline``, the sentence of the tab's simulated answer, or before that on the chance if there is one,
-    and ``words``, the question; ``chance`` says whether there are ``numbers``, one for each choice of what is unknown;
-    ``chosen`` and ``shown`` are of the question's choice; ``facts``, pairs of names and values;
-    ``notes``, pairs of sentences and kinds; ``simulated``, names of what is simulated; ``files``, tabs and names of
-    downloads.
-    """
+    """Return the contents of the card, by the names of `Answer` in `protocol.js`."""
     messages = answers[tab.answer].messages if tab.answer in answers else []
     # The first sentence of the command line's output.
     names = (tab.answer, *tab.questions, *tab.simulations)
@@ -159,8 +144,6 @@ def _simulation_names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-#: Largest number of characters of a link that are parsed.
-MOST_LINKED = 8192
 #: Entries of a link in addition to the question.
 SEEN = {
     "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
@@ -172,12 +155,10 @@ FIRST = {name: field.read(field.first) for name, field in ENTRIES.items()}
 
 
 class State:
-    """State of a page that a link gives: the text of each field in `entered`, valid or not, and the visitor's files.
-
-    `stray` is the message on entries of the link that are no fields, or that no field of the page can correct.
-    """
+    """State of a page that a link gives: the text of each field, valid or not, and the visitor's files."""
 
     def __init__(self, link: str = "", uploads: Mapping[str, Any] | None = None) -> None:
+        # The message `stray` is on entries that are no fields, or that no field can correct.
         self.uploads, self.stray, query = dict(uploads or {}), "", link.removeprefix("?")
         if len(query) > MOST_LINKED:
             query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
@@ -243,11 +224,7 @@ class State:
 
 
 def known_values(state: State) -> dict[str, Any]:
-    """Return the known values of the star and of each target, and the values that can be entered for it.
-
-    The star has ``about`` in words, ``given``, texts of fields, and ``offer``, the words of a button that enters them;
-    ``targets`` has texts by the columns of the table for each row.
-    """
+    """Return what is known of the star, with texts that a button can enter, and of each target, by column."""
     known: dict[str, Any] = {"about": "", "given": {}, "offer": ""}
     name = state.entered["star"]
     star = None if name == UPLOADED else resolve(name, own=False)

@@ -22,14 +22,10 @@ from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
 MEMORY_MIB = 1536
-#: Seconds that it may take, by the clock and of processor time.
-SECONDS = 20
-#: Largest size to which a visitor's file may unpack, MiB.
-CONTENT_MIB = 64
-#: Number of readers at the same time; other visitors wait for their turn, but no longer than `SECONDS`.
-TOGETHER = 2
-#: Exit codes of the reading process.
-_REFUSED, _NO_ROOM = 2, 3
+SECONDS = 20  # that it may take, by the clock and of processor time
+CONTENT_MIB = 64  # to which a visitor's file may unpack
+TOGETHER = 2  # readers at the same time; other visitors wait for their turn, but no longer than `SECONDS`
+_REFUSED, _NO_ROOM = 2, 3  # exit codes of the reading process
 T = TypeVar("T")
 #: Expected content of an upload if it is too large, and in general: a spectrum, or frames.
 EXPECTED_SPECTRUM = "a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"
@@ -84,9 +80,7 @@ def _read_apart(
         for file, contained in files.items():
             (Path(folder) / file).write_bytes(contained)
         try:
-            process = subprocess.run(
-                command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
-            )
+            process = subprocess.run(command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment)
         except subprocess.TimeoutExpired as error:
             raise InputError(f"the upload takes more than {SECONDS} s to read; give {smaller}", key="upload") from error
         except OSError as error:

@@ -47,8 +47,30 @@ from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, content_of, releas
 if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
 
-#: Largest number of simultaneous visitors, with some megabytes each (assumed to suffice for a team).
-MAX_VISITORS = 100
+# Limits of the server; sizes in bytes.
+MAX_VISITORS = 100  # at the same time, with some megabytes each (assumed to suffice for a team)
+MAX_CONNECTIONS = 512  # beyond which the oldest without a page is closed; browsers open up to six
+MESSAGE = 17 * 2**20  # from a page: an upload with a margin
+BODY = 2**16  # of a request, of which the page has none
+REQUEST_S = 20.0  # for the headers and the body of each request
+IDLE_S, SWEEP_S = 3600, 5  # after which unused pages are disconnected, and interval of this check
+PING_S = 20  # between pings of a connection, which is closed if it does not reply
+CLOSED_FORMS = 2  # threads, besides the event loop, that compute closed forms, pictures and files for all visitors
+MOST_LOGGED = 1200  # characters of a line of the log
+ASSETS = Path(__file__).parent / "assets"
+#: The page connects to its own server only, and runs only its own code. Browsers ask whether a file has changed, unless
+#: its address states its version.
+HEADERS = {
+    "Cache-Control": "no-cache",
+    "Content-Security-Policy": (
+        "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+#: Columns of the page's table of targets that have other names in tables, with the keys of targets.
+HEADINGS = {"name": "name", "spectral_type": "spectral_type", "V": "magnitude", "coordinates": "coordinates"}
 #: A host as browsers write it: name, IPv4 address or IPv6 address in brackets; and a port.
 HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
 
@@ -58,12 +80,10 @@ def local(address: str) -> bool:
     if not address.strip():
         raise InputError.of("address", address, "one such as 127.0.0.1, ::1 or 0.0.0.0")
     try:
-        addresses = {
-            str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)
-        }
+        infos = socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
         raise InputError.of("address", address, "one such as 127.0.0.1") from error
-    return all(ipaddress.ip_address(address).is_loopback for address in addresses)
+    return all(ipaddress.ip_address(str(info[4][0]).split("%")[0]).is_loopback for info in infos)
 
 
 def netloc(address: str, port: int) -> str:
@@ -129,16 +149,12 @@ class BoundedServer(HTTPServer):
         super().handle_stream(stream, address)
 
 
-#: Largest number of characters of a line.
-MOST = 1200
-
-
 class OneLine(logging.Formatter):
     """Formatter that writes one line of bounded length, with the lines of mauvecl in the traceback of an exception."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        return printable(" ".join(super().format(record).split()), MOST)
+        return printable(" ".join(super().format(record).split()), MOST_LOGGED)
 
     def formatException(self, ei: Any) -> str:  # noqa: N802
         """Return kind and message of an exception, and modules and lines of its traceback: ours, or the last one."""
@@ -149,26 +165,8 @@ class OneLine(logging.Formatter):
         return f"({ei[0].__name__}: {ei[1]}; {', '.join(f'{name} line {line}' for name, line in ours)})"
 
 
-#: Largest size in bytes of a message, an upload with a margin, and of a request's body, of which the page has none.
-MESSAGE, BODY = 17 * 2**20, 2**16
-#: Seconds that a connection may take for the headers and the body of each request.
-REQUEST_S = 20.0
-#: Largest number of open connections, beyond which the oldest without a page is closed; browsers open up to six.
-MAX_CONNECTIONS = 512
-#: Seconds after which unused pages are disconnected, and interval of this check.
-IDLE_S, SWEEP_S = 3600, 5
-#: Threads, besides the event loop, that compute closed forms, pictures and files for all visitors.
-CLOSED_FORMS = 2
-#: Seconds between pings of a connection, which is closed if it does not reply.
-PING_S = 20
-
-
 def make(address: str, port: int, allowed: Sequence[str]) -> Any:
-    """Return a listening server.
-
-    Raises InputError if the address is invalid or accepts other machines without an origin, and OSError if the port is
-    taken.
-    """
+    """Return a listening server; raises InputError as `hosts` does, and OSError if the port is taken."""
     application = PageApplication(
         [
             (r"/", FrontHandler),
@@ -258,20 +256,6 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     asyncio.run(run())
 
 
-#: The page connects to its own server only, and runs only its own code. Browsers ask whether a file has changed, unless
-#: its address states its version.
-HEADERS = {
-    "Cache-Control": "no-cache",
-    "Content-Security-Policy": (
-        "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-}
-ASSETS = Path(__file__).parent / "assets"
-
-
 @cache
 def front() -> bytes:
     """Return the page."""
@@ -288,10 +272,6 @@ def front() -> bytes:
     return str(text).encode()
 
 
-#: Columns of the page's table of targets that have other names in tables, with the keys of targets.
-HEADINGS = {"name": "name", "spectral_type": "spectral_type", "V": "magnitude", "coordinates": "coordinates"}
-
-
 def _words() -> dict[str, Any]:
     """Return the settings of the page's script."""
     return {
@@ -300,9 +280,7 @@ def _words() -> dict[str, Any]:
         "sliders": {name: vars(field.slider) for name, field in fields.FIELDS.items() if field.slider is not None},
         "stars": all_names(),
         "example": "AU Mic\nYZ CMi\neps Eri",
-        "headings": {
-            column: [name.lower() for name in (key, *TARGET_COLUMNS[key])] for column, key in HEADINGS.items()
-        },
+        "headings": {name: [text.lower() for text in (key, *TARGET_COLUMNS[key])] for name, key in HEADINGS.items()},
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
         "uploads": {
             name: {"entered": upload.entered, "options": upload.fields, "most": upload.most}
@@ -331,11 +309,11 @@ def _words() -> dict[str, Any]:
 
 
 @cache
-def figure(theme: str, name: str, logs: str) -> bytes | None:
-    """Return an empty figure with its legend."""
+def figure(theme: str, name: str, logs: str) -> bytes:
+    """Return an empty figure with its legend; unknown ones raise HTTPError, which is not cached."""
     picture = next((p for tab in TABS.values() for p in tab.pictures if p.name == name), None)
     if picture is None or theme not in INKS or not set(logs) <= {axis.lower() for axis in picture.logs}:
-        return None
+        raise HTTPError(404)
     canvas = Canvas(picture, theme, frozenset(logs))
     return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
 
@@ -376,8 +354,6 @@ class FigureHandler(PageHandler):
     def get(self, theme: str, name: str) -> None:
         """Send a figure, with the axes of the argument `log` in logarithms."""
         content = figure(theme, name, "".join(sorted(set(self.get_query_argument("log", ""))))[:2])
-        if content is None:
-            raise HTTPError(404)
         self.set_header("Content-Type", "application/json")
         if "v" in self.request.arguments:
             self.set_header("Cache-Control", f"max-age={StaticFileHandler.CACHE_MAX_AGE}")

@@ -44,6 +44,16 @@ MAP_STEPS, MAP_REALISATIONS = 8, 20_000
 INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
 #: Largest number of simulated fits, and of those of two temperatures, which take fifty times as long.
 MOST_FITS, MOST_OF_TWO = 10_000, 1000
+DRAWN_UNITS = ("realisations", "steps", "cells")  # of the progress of verbs that use the pool's devices
+FIXED = ("star", "amplitude")  # columns that the page does not show: its question has one star and one flare
+#: Keys that are stated even at their default, so that readers see what was assumed.
+STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
+          "run.realisations", "run.seed")  # fmt: skip
+#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
+ALWAYS_USED = ("nuisances.", "observation.temperature_c")
+MOST_CHARACTERS = 500  # of a value in a command; a longer one is in the study file
+ANYTHING = TypeAdapter(Any)
+_drawing = threading.Lock()  # held while matplotlib draws
 
 
 def _map_around(study: Study) -> Study:
@@ -86,17 +96,12 @@ QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
     "completeness": Simulation(("inject",), partial(_changed, injections=INJECTED, search={"nulls": 0})),
     "periods": Simulation(("change",), partial(_changed, change={"periods": True})),
 }
-#: Units of the progress of verbs that use the pool's devices.
-DRAWN_UNITS = ("realisations", "steps", "cells")
 
 
 def simulate(
     name: str, study: Study, pool: Pool, progress: Progress = None, *, inputs: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Return the answers to a question by name; its first verb reports its progress and takes the contents of files.
-
-    A detection also has the answer with the other choice of unknowns, unless that is refused.
-    """
+    """Return the answers to a question by name, of a detection also with the other choice of unknowns if it has one."""
     question = QUESTIONS[name]
     study, (main, *more) = question.study(study), question.verbs
     questions = [(name, main, study), *((verb, verb, study) for verb in more)]
@@ -113,10 +118,6 @@ def simulate(
             if key != OTHER:
                 raise
     return answers
-
-
-#: Columns that the page does not show: its question has one star and one flare.
-FIXED = ("star", "amplitude")
 
 
 def target_words(question: FieldValues) -> str:
@@ -177,10 +178,8 @@ class Tab:
 
     def reads_of(self, *questions: str) -> frozenset[str]:
         """Return the fields on which questions depend, by the keys that the flags of their verbs set."""
-        verbs = [VERBS[verb] for question in questions for verb in QUESTIONS[question].verbs]
-        names = (
-            name for name, field in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in field.keys)
-        )
+        accepts = [VERBS[verb].accepts for question in questions for verb in QUESTIONS[question].verbs]
+        names = (name for name, field in FIELDS.items() if any(takes(key) for takes in accepts for key in field.keys))
         return frozenset({*names, *self.also}).difference(self.never)
 
     def offers(self, name: str, answers: Answers) -> bool:
@@ -199,14 +198,6 @@ class Tab:
         return [headings, *cells] if headings else []
 
 
-#: Keys that are stated even at their default, so that readers see what was assumed.
-STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
-          "run.realisations", "run.seed")  # fmt: skip
-#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
-ALWAYS_USED = ("nuisances.", "observation.temperature_c")
-#: Longest value in a command; a longer one is in the study file.
-MOST_CHARACTERS = 500
-
 PROGRAM = """from mauvecl import Engine, Study, {verb}
 
 study = Study.build(
@@ -216,9 +207,6 @@ study = Study.build(
 answer = {verb}(study, Engine(){options})
 print(next(iter(answer.tables.values())))
 """
-
-
-ANYTHING = TypeAdapter(Any)
 
 
 def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -297,10 +285,6 @@ def _text(value: str | float) -> str:
     return value if isinstance(value, str) else str(value).removesuffix(".0")
 
 
-#: Held while matplotlib draws.
-_drawing = threading.Lock()
-
-
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
     # The visitor's files that the study names, each once.
@@ -319,10 +303,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
-    """Return file name and content of one of a tab's `files` or `documents`, or of the study that reproduces it.
-
-    The ending is "ecsv", "fits" or "study", and empty for a document.
-    """
+    """Return name and content of one of a tab's `documents`, without `ending`, or of its `files` or their study."""
     if name not in tab.documents and (name not in tab.files or ending not in ("ecsv", "fits", "study")):
         raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}; use one of its own", key="name")
     if not tab.offers(name, answers):

@@ -36,6 +36,30 @@ from mauvecl.web.sandboxed_reader import EXPECTED_FRAMES, read_limited
 
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
+# Limits; sizes in bytes.
+MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000  # of an upload, and points of its spectrum
+MOST_KEPT_BYTES = 16 * 2**20  # of a file that is kept unread; a day of resolution elements takes some 8 MiB
+MOST_VALUES = 2**24  # values of frames that an answer reads: the spectra of a day
+MOST_PAIRS_BYTES = 2**18  # of an unknown spectrum
+MOST_FILES, MOST_BYTES = 40, 64 * 2**20  # files and observations of an archive, and to which it unpacks
+MOST_TOML_BYTES, MOST_NAME = 2**18, 100  # of a TOML file in an archive, and characters of a file's name
+#: Compression types that are read to the stated size and no further; others, such as LZMA, unpack to any size.
+BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+MOST_RESULTS = 256 * 2**20  # of closed forms, answers and files that the server keeps for all visitors together
+MOST_UPLOADS = 256 * 2**20  # of the uploads of all visitors together
+MOST_OBJECTS = 20_000  # of a value that are counted; arrays, which take most of the memory, come early
+#: Types of objects that belong to the program and not to a value.
+PROGRAM = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
+#: Keys of a mapping of frames that are chosen from menus of their columns, with labels; the first two are required.
+MAPPED = {"time": "Time", "flux": "Flux", "error": "Error", "quality": "Quality", "temperature": "Temperature"}
+#: Units and dates of times, chosen from a menu next to them.
+TIME_UNITS = ("s", "min", "h", "d", "jd", "mjd", "bjd", "btjd", "bkjd")
+#: Example files that visitors may try in place of their own, by field, with descriptions.
+EXAMPLES: Mapping[str, tuple[str, str]] = {
+    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)")
+}
+refusal = partial(InputError, key="observations")  # error of an archive of observations
+
 
 def content_folder(folder: Path, content: bytes, files: Callable[[], Mapping[str, bytes]]) -> Path:
     """Return the subfolder for some content, named after its digest; the first call writes its files."""
@@ -48,18 +72,6 @@ def content_folder(folder: Path, content: bytes, files: Callable[[], Mapping[str
         with contextlib.suppress(OSError):
             new.rename(home)
     return home
-
-
-#: Largest numbers of files and observations of an archive, and of bytes to which it unpacks.
-MOST_FILES, MOST_BYTES = 40, 64 * 2**20
-#: Largest size of a TOML file in an archive, bytes, and largest number of characters of a file's name.
-MOST_TOML_BYTES, MOST_NAME = 2**18, 100
-#: Compression types that are read to the stated size and no further; others, such as LZMA, unpack to any size.
-BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-
-
-#: Error of an archive of observations.
-refusal = partial(InputError, key="observations")
 
 
 @dataclass(frozen=True)
@@ -75,10 +87,8 @@ class Observations:
         """Keep an archive, which must hold one study with observations, and all files that it names."""
         files = unzipped(content)
         studies = [rows for file, text in files.items() if file.endswith(".toml") and (rows := _rows_of(file, text))]
-        if len(studies) != 1:
-            raise refusal(
-                f"the archive must hold one TOML file with [[calibrate.observations]], but holds {len(studies)}"
-            )
+        if (n := len(studies)) != 1:
+            raise refusal(f"the archive must hold one TOML file with [[calibrate.observations]], but holds {n}")
         (rows,) = studies
         if len(rows) > MOST_FILES:
             raise refusal(f"the archive may list at most {MOST_FILES} observations, but lists {len(rows)}")
@@ -161,16 +171,6 @@ def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> st
 
     content = name.encode() + source.wavelength_nm.tobytes() + source.flux_flam.tobytes()
     return str(content_folder(folder, content, files) / name)
-
-
-#: Largest size of an upload, bytes, and largest number of points of its spectrum.
-MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
-#: Largest size of a file that is kept unread, such as frames; a day of resolution elements takes some 8 MiB.
-MOST_KEPT_BYTES = 16 * 2**20
-#: Largest number of values of frames that an answer reads: the spectra of a day.
-MOST_VALUES = 2**24
-#: Largest size of an unknown spectrum.
-MOST_PAIRS_BYTES = 2**18
 
 
 def _spectrum(
@@ -264,16 +264,6 @@ UPLOADS: Mapping[str, Upload] = {
 }
 
 
-#: Keys of a mapping of frames that are chosen from menus of their columns, with labels; the first two are required.
-MAPPED = {"time": "Time", "flux": "Flux", "error": "Error", "quality": "Quality", "temperature": "Temperature"}
-#: Units and dates of times, chosen from a menu next to them.
-TIME_UNITS = ("s", "min", "h", "d", "jd", "mjd", "bjd", "btjd", "bkjd")
-#: Example files that visitors may try in place of their own, by field, with descriptions.
-EXAMPLES: Mapping[str, tuple[str, str]] = {
-    "frames": ("kepler-example.fits", "12 days of KIC 10002792, a flare star, by Kepler (NASA, in the public domain)")
-}
-
-
 def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bits: str | None = None) -> Frames:
     """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits."""
     files = {file.name: file.content}
@@ -283,14 +273,6 @@ def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, *, quality_bi
         files[mapping_name] = mapping.content
     options = {"mapping": mapping_name, "quality_bits": quality_bits}
     return read_limited(Frames, read_frames, files, expected=EXPECTED_FRAMES, **options)
-
-
-#: Bytes of closed forms, answers and files that the server keeps for all visitors together, and of their uploads.
-MOST_RESULTS, MOST_UPLOADS = 256 * 2**20, 256 * 2**20
-#: Largest number of objects of a value that are counted; arrays, which take most of the memory, come early.
-MOST_OBJECTS = 20_000
-#: Types of objects that belong to the program and not to a value.
-PROGRAM = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
 
 
 class Shelf:
@@ -340,10 +322,6 @@ class Shelf:
         self.size -= self._entries.pop(path, (0, None))[0]
 
 
-#: Results and uploads of all visitors.
-RESULTS, UPLOAD_SHELF = Shelf(MOST_RESULTS), Shelf(MOST_UPLOADS)
-
-
 def size_of(value: object) -> int:
     """Return the approximate size of a value and of the objects to which it refers, bytes."""
     # Breadth first, so that the top is counted before the details.
@@ -357,3 +335,7 @@ def size_of(value: object) -> int:
             if isinstance(item, np.ndarray):
                 waiting.append(item.base)
     return size
+
+
+#: Results and uploads of all visitors.
+RESULTS, UPLOAD_SHELF = Shelf(MOST_RESULTS), Shelf(MOST_UPLOADS)

@@ -44,18 +44,27 @@ if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
     from mauvecl.web.tab import Tab
 
-#: Number of simulations that the server computes at the same time; others wait.
-TOGETHER = 2
-#: Duration of a simulation, s, above which its memory is released; doing so stops all visitors for a moment.
-LONG_S = 1.0
-_threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
-_per_thread = threading.local()
+TOGETHER = 2  # simulations that the server computes at the same time; others wait
+LONG_S = 1.0  # duration of a simulation above which its memory is released, which stops all visitors for a moment
+REPORT_S = 0.25  # between two reports of a simulation's progress
+MOST_ANSWERS = 12  # simulated answers that the server keeps per visitor
+MOST_TASKS = 8  # requests of a visitor that the server works on at the same time
+UNUSED = 4000  # code with which the connection of an unused page is closed
+#: Message about an error of the page itself.
+OWN_FAULT = "the page failed, and there is no answer; this is a fault of mauvecl: please report what was entered"
+#: Entries of the replies to requests that are refused.
+REFUSED: dict[str, dict[str, Any]] = {
+    "solve": {"solved": ""}, "pinned": {"pins": {}}, "columns": {"columns": []}, "file": {"file": ""},
+    "simulate": {"ended": ""},
+}  # fmt: skip
+#: Fields of the section `data`, which state how files of frames are read.
+DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
 #: Uploads are read one after the other, outside the event loop.
 READER = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
-
-
 #: Sets the exception that a thread raises at its next bytecode, or with None clears a pending one.
 _set_pending = ctypes.pythonapi.PyThreadState_SetAsyncExc
+_threads, _per_thread = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page"), threading.local()
+log = logging.getLogger(__name__)
 
 
 def _engine(device: str | None, progress: Callable[[int, int], None]) -> Engine:
@@ -150,27 +159,6 @@ class Job:
             self._remaining_s = min(self._remaining_s, elapsed_s * (total - done) / done)
             duration = f"about {self._remaining_s:.0f} s left"
         return min(done / total, 1.0), f"{done:,} of {total:,} {self.unit or 'realisations'}, {duration}"
-
-
-log = logging.getLogger(__name__)
-#: Seconds between two reports of a simulation's progress.
-REPORT_S = 0.25
-#: Number of simulated answers that the server keeps per visitor.
-MOST_ANSWERS = 12
-#: Number of requests of a visitor that the server works on at the same time.
-MOST_TASKS = 8
-#: Message about an error of the page itself.
-OWN_FAULT = "the page failed, and there is no answer; this is a fault of mauvecl: please report what was entered"
-#: Code with which the connection of an unused page is closed.
-UNUSED = 4000
-
-#: Entries of the replies to requests that are refused.
-REFUSED: dict[str, dict[str, Any]] = {
-    "solve": {"solved": ""}, "pinned": {"pins": {}}, "columns": {"columns": []}, "file": {"file": ""},
-    "simulate": {"ended": ""},
-}  # fmt: skip
-#: Fields of the section `data`, which state how files of frames are read.
-DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
 
 
 class Request(BaseModel):
@@ -412,10 +400,9 @@ class Visitor(WebSocketHandler):
             raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
         unit = VERBS[main].counts
+        ask = partial(simulate, kind, closed.case.study, inputs=closed.inputs)
         # Several verbs count the realisations of all in the pool.
-        job = self.job = Job(
-            partial(simulate, kind, closed.case.study, inputs=closed.inputs), unit in DRAWN_UNITS, "" if more else unit
-        )
+        job = self.job = Job(ask, unit in DRAWN_UNITS, "" if more else unit)
         answers = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([answers], timeout=REPORT_S))[0]:
