@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.answers.visible import VisibleAnswer
 
-MOST_CALENDARS = 6  # targets with a calendar each; more targets are rows of one picture
-MOST_MONTHS = 8  # whose names fit side by side
+MOST_CALENDARS = 6  # largest number of targets with a calendar each; more targets are rows of one picture
+MOST_MONTHS = 8  # largest number of months whose names fit side by side
 PAGE, MARGIN = (8.27, 11.69), 0.6  # A4, and its margin, inches
-LETTER, BOLD, LINE = 0.53, 1.1, 1.4  # over the size: width of a letter, factor of a bold one, and line spacing
+LETTER, BOLD, LINE = 0.53, 1.1, 1.4  # width of a letter and line spacing over the size, and factor for bold letters
 #: Starts of the columns of the summary, of a target and of the assumptions, as fractions of the text width.
 SUMMARY_AT = (0.0, 0.15, 0.215, 0.31, 0.39, 0.47, 0.55, 0.615, 0.69, 0.755, 0.86)
 TARGET_AT, ASSUMED_AT = (0.0, 0.28, 0.72), (0.0, 0.24, 0.5)
-SMALL, NORMAL, MANY = 5.5, 7.0, 9  # text of wide tables and of others, and columns of a wide one
-COLOURS_KEPT = 64  # in the pictures of an HTML report
+SMALL, NORMAL, MANY = 5.5, 7.0, 9  # sizes of text in wide tables and in others, and number of columns of a wide one
+COLOURS_KEPT = 64  # number of colours in the pictures of an HTML report
 #: Height of a target's panels, inches, and their margins as fractions of it: computing them takes longer than drawing.
 PANELS_IN, PANELS = 6.2, {"left": 0.085, "right": 0.98, "top": 0.955, "bottom": 0.09, "hspace": 0.35, "wspace": 0.3}
 #: Explanation of the summary's columns.

@@ -15,7 +15,7 @@ INK = {
     "drawn": "#6b7785", "dark": "#7b4ea3", "read": "#B8860B", "bias": "#A65082", "total": "#1b2733",
     "threshold": "#1b2733", "own": "#C2185B", "shortest": "#E8801F", "middle": "#B34700", "longest": "#5C2200",
 }  # fmt: skip
-MOST_TARGETS = 8  # curves of targets on the page; further targets are in the table alone
+MOST_TARGETS = 8  # largest number of targets with a curve on the page; further ones are in the table alone
 
 
 @dataclass(frozen=True)

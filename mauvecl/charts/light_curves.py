@@ -35,7 +35,7 @@ MOST_CURVES, MOST_MAPS = 6, 6
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
 MOST_POINTS, MOST_ROWS = 4000, 600
 LONG_GAP = 0.005  # shortest gap in which the level is not drawn, as a share of the whole time
-BRIGHT = 30.0  # flux in standard deviations above which the light curve has a second panel near the level
+BRIGHT = 30.0  # flux, in standard deviations, above which the light curve has a second panel near the level
 #: Units of time: longest duration that is shown in it, its length, s, and its name.
 TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 HALF_WIDTH = PlotAxis("half-width (s)", log=True)
@@ -173,7 +173,10 @@ def dynamic_spectrum(star: StarStare) -> Picture:
 def spectra_panel(
     stare: Stare, spectra: NDArray[Any], sd: NDArray[Any], wavelength_nm: Float, marks: Sequence[tuple[Any, str]] = ()
 ) -> tuple[Panel, float]:
-    """Return spectra, (n_frame, n_pixel), in standard deviations from their median, and the seconds of a column."""
+    """Return spectra, of shape (n_frame, n_pixel), in standard deviations from their median, and the s of a column.
+
+    The ends of events in time are marked above the spectra in colours.
+    """
     scale, unit = shown_time_unit(stare.duration_s)
     # The stare is shown on a regular grid with empty gaps.
     numbers = stare.numbers - stare.numbers[0]
@@ -200,7 +203,10 @@ def spectra_panel(
 
 
 def column_sums(values: Float, numbers: NDArray[np.int64], most: int) -> tuple[Float, Float, int]:
-    """Return sums of finite values of rows by number, (n_sum, n_column), their counts, and the numbers in each sum."""
+    """Return sums of the finite values of rows by their numbers, their counts, and the numbers in each of `most` sums.
+
+    Sums and counts have the shape (n_sum, n_column).
+    """
     step = -(-(int(numbers[-1]) + 1) // most)
     sums, counts = np.zeros((2, int(numbers[-1]) // step + 1, values.shape[1]))
     finite = np.isfinite(values)
@@ -249,7 +255,10 @@ def light_curve_series(
     frames: Frames, answer: AnalyseAnswer | None = None, unit_s: float = 60.0, most: int | None = None, *,
     in_noise: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the data of `LIGHT_CURVE`, at most `most` points each; `in_noise`: flux above the level over the noise."""
+    """Return the data of `LIGHT_CURVE`, with at most `most` points in each series.
+
+    Only an analysis has events and a level. With `in_noise` the flux is that above the level, in units of the noise.
+    """
     time, series = (frames.time_s - frames.time_s[0]) / unit_s, dict[str, Any]()
     flux, used = frames.white_light[0], frames.faults == 0
     if answer is not None:
@@ -280,7 +289,10 @@ def light_curve_series(
 
 @picture_of("AnalyseAnswer", "light-curve")
 def observed_light_curve(answer: AnalyseAnswer) -> Picture:
-    """Plot the observed light curve with its level and events, and the flux less the level if events are bright."""
+    """Plot the observed light curve with its level and the level's band of 95 %, events, and frames not searched.
+
+    If there are bright events, a second panel shows the flux less the level.
+    """
     analysis, used = answer.analysis, answer.analysis.level.used
     frames, flux, error = analysis.frames, analysis.flux, analysis.level.error
     unit_s, unit = shown_time_unit(float(np.ptp(frames.time_s)))

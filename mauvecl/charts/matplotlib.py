@@ -27,8 +27,8 @@ from mauvecl.schema.errors import InputError
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#000000")
 NULL = INK["drawn"]
 RANGE_NM = (200.0, 700.0)  # wavelengths that are shown
-MANY = 5000  # cells of a mesh above which vector files hold it as pixels
-MAX_COLUMNS = 3  # panels side by side
+MANY = 5000  # number of cells of a mesh above which vector files hold it as pixels
+MAX_COLUMNS = 3  # largest number of panels side by side
 COLUMN = 3.5  # width of one column of a journal, inches
 UNBROKEN, MINUS = "\N{NO-BREAK SPACE}", "\N{MINUS SIGN}"
 SMALL = 8  # size of the labels of ticks that are names
@@ -153,7 +153,11 @@ Draw = TypeVar("Draw", bound=Callable[..., Picture | Panel])
 
 
 def picture_of(kind: str, name: str, **options: Any) -> Callable[[Draw], Draw]:
-    """Return a decorator that registers a picture of a class, by name, for a file; `plot` draws the first of them."""
+    """Return a decorator that registers a function as a picture of a class; `plot` draws the first.
+
+    `kind` is the name of the class, as in "LimitAnswer", `name` that of the file without its ending; `options` are as
+    for `PictureFunction`.
+    """
 
     def registered(draw: Draw) -> Draw:
         ENTRIES[kind].append(PictureFunction(name, draw, **options))
@@ -325,7 +329,10 @@ def _draw_series(axis: Any, item: Series) -> Any:
 
 
 def save_or_return(figure: Any, path: str | Path | None) -> Any:
-    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path."""
+    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path.
+
+    Raises InputError, without changing an existing file, if the figure cannot be written.
+    """
     if path is None:
         return figure
     content, place, parent = io.BytesIO(), Path(path), figure.figure

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
 
-MOST_CHANGES, MOST_FLARES = 3, 4  # in a picture: changes whose periods are drawn, and flares
-BIN, GROUPS = 16, 60  # pixels averaged for a point of the residuals, and values for one of the photon transfer
-AROUND_NM = 15.0  # on both sides of an index that are drawn
+MOST_CHANGES, MOST_FLARES = 3, 4  # largest numbers of changes whose periods are drawn, and of flares, in a picture
+BIN, GROUPS = 16, 60  # numbers of pixels for a point of the residuals, and of values for one of the photon transfer
+AROUND_NM = 15.0  # range that is drawn on both sides of an index
 RISES = {"68 %": 2.30, "95 %": 5.99}  # increases of chi-squared that enclose these shares in two dimensions
-FACTORS = np.geomspace(0.1, 10.0, 25)  # on the amplitude, over which errors are plotted
+FACTORS = np.geomspace(0.1, 10.0, 25)  # factors on the amplitude over which errors are plotted
 BEFORE, AFTER = 3.0, 15.0  # half-widths before and after the peak of a flare that are plotted
-MANY_FITS = 1000  # from which histograms of pulls have narrow bins
+MANY_FITS = 1000  # number of fits from which histograms of pulls have narrow bins
 
 
 @picture_of("Source", "source")
@@ -337,7 +337,10 @@ def errors(answer: MeasureAnswer) -> Picture:
 
 @picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(star,) for star in answer.stares if star.perfect])
 def temperatures(star: MeasuredStare) -> Picture:
-    """Plot temperature, size and light of flares along a stare with 95 % intervals, and fits without noise as lines."""
+    """Plot temperature, size and light of the flares of a stare against time, with 95 % intervals.
+
+    Lines are the fits to the same frames without noise.
+    """
     drawn, perfect, rows = star.drawn, star.perfect, list[list[Panel]]()
     assert drawn is not None
     assert perfect is not None

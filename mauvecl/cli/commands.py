@@ -42,7 +42,10 @@ MOST_SPECTRA = 1e16
 
 
 def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
-    """Raise InputError for values that a later step would reject, or a year of draws unless that is insisted on."""
+    """Raise InputError for values that a later step would reject, or that would keep a hundred cores busy for a year.
+
+    A verb that `detects` needs flares and thresholds; `insist` lets one that `draws` take any time.
+    """
     from mauvecl.detection import check_fap, check_statistic
     from mauvecl.host.instrument import instrument_path
     from mauvecl.host.stars.library import known_band, named_star
@@ -181,7 +184,10 @@ class Session(flags.Options):
 
     @contextmanager
     def pool(self, counts: str, **options: Any) -> Iterator[tuple[Pool, Meter]]:
-        """Yield a pool of the workers that the flags name, and the meter of what the verb `counts`."""
+        """Yield a pool of the workers that the flags name, and its meter; the workers stop if the work ends early.
+
+        The pool reports progress in realisations; the caller reports anything else that the meter `counts`.
+        """
         from mauvecl.runs.pool import LocalWorkers, Pool
 
         with Meter(quiet=self.quiet or self.as_json, unit=counts) as meter:

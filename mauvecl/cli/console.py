@@ -52,10 +52,10 @@ REMOVED = {
     "--trials": "give --set change.trials=NUMBER",
 }
 PRINTERS = ("click", "typer", "rich", "mauvecl.cli")  # libraries that write to standard output for mauvecl
-LONGEST = 1000  # characters of a message
-WIDEST = 100_000  # width of a table in a pipe or file, characters
-PATIENCE_S = 2.0  # work that is shorter shows no progress
-CLEARED = "\r\x1b[K"  # clears the line of a terminal
+LONGEST = 1000  # largest number of characters of a message
+WIDEST = 100_000  # largest width of a table in a pipe or file, characters
+PATIENCE_S = 2.0  # duration of work below which no progress is shown
+CLEARED = "\r\x1b[K"  # text that clears the line of a terminal
 #: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
 TOLD_FROM = 0.01
 #: Units of the remaining time, s; smaller times than three of them are in the next one.
@@ -199,7 +199,10 @@ def _write_traceback(error: Exception) -> Path | str:
 
 
 class Meter:
-    """Progress with rate and time left on standard error, on a terminal in one line; none for work of two seconds."""
+    """Progress with rate and time left, on standard error, for work longer than two seconds.
+
+    On a terminal and in a notebook it is one line that changes; elsewhere a line every ten seconds.
+    """
 
     # Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     standing: Callable[[], PoolProgress] | None = None

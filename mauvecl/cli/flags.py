@@ -85,7 +85,11 @@ WORKERS = ("device", "cluster", *RESUMING, "insist")
 
 
 def study_option(keyword: Keyword, defaults: Mapping[str, Any]) -> Any:
-    """Return the annotation of a key's flag for typer, with numbers as text; `defaults` are those of the verb."""
+    """Return the annotation of a flag of the study's key for typer: description, accepted words, unit and default.
+
+    Typer leaves numbers as text, which the study converts, so that messages have one style. `defaults` holds defaults
+    of a verb that differ from the study's, by key.
+    """
     path, field, flag = keyword
     help = flag.help or first(field, Help) or Help("")
     unit = None if flag.help else first(field, Unit)

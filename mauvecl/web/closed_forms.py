@@ -165,7 +165,10 @@ class ClosedForms:
     def of(
         cls, question: FieldValues, folder: Path, *, chance: bool = True, inputs: Mapping[str, Any] | None = None
     ) -> ClosedForms:
-        """Answer a question with files in `folder`; without the `chance`, no flare needs to be detectable."""
+        """Answer a question; `folder` holds the visitor's files for the study, and `inputs` their contents.
+
+        Without the `chance` of detection, the star may be too bright for a detection.
+        """
         case = question.case(folder)
         # The amplitude is that of a flare as bright as observed, if the visitor's file gives its brightness.
         values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
@@ -232,7 +235,10 @@ class ClosedForms:
         return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
     def at(self, light: float, rises: Float, *, others: bool = False) -> list[DetectionForms]:
-        """Return closed forms for factors on light (`others`: on all light) and amplitude; none if all saturates."""
+        """Return the closed forms for factors on the light, with `others` all light's, and on the amplitude, (n_rise,).
+
+        The list is empty if the star saturates every pixel.
+        """
         q, base = self.question, self.quiet
         statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
         behind = light if others else 1.0

@@ -52,9 +52,9 @@ HEADINGS = {
     "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
     "calibrate": "Standards", "change": "Change",
 }  # fmt: skip
-MOST_CHARACTERS, MOST_TABLE = 200, 3000  # of a field, and of a table of neighbours, which is a part of links
-MOST_TARGETS = 30  # of a visitor
-MOST_POINTS = 4000  # of an unknown spectrum, which the study in every table contains
+MOST_CHARACTERS, MOST_TABLE = 200, 3000  # lengths of a field, and of a table of neighbours, which is a part of links
+MOST_TARGETS = 30  # largest number of targets of a visitor
+MOST_POINTS = 4000  # largest number of points of an unknown spectrum, which the study in every table contains
 NO_KEYS: Mapping[str, str] = MappingProxyType({})
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")  # a flag of the command line
 #: A key within a message; words of prose contain no underscore.
@@ -150,7 +150,10 @@ def star_name(text: str) -> str:
 
 
 def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
-    """Parse targets: a name or coordinates a line, or a CSV table; a check requires known positions that all differ."""
+    """Parse targets: a name or coordinates in each line, or a CSV table with a header of keys of `PlanTarget`.
+
+    With a check their positions must be known, and all must differ.
+    """
     from mauvecl.study.plan import PlanTarget, targets_in
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]

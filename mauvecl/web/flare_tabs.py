@@ -252,9 +252,9 @@ ASSUMED = {
     "usual unknowns": NuisanceChoice(),
     "dark and star free": NuisanceChoice.model_validate({"usual": False, "dark": "free", "light": "free"}),
 }
-NAMES = ("known", "usual", "free")  # of the curves
+NAMES = ("known", "usual", "free")  # names of the curves
 NEAR = (2.0, 6.0)  # half-widths before and after the peak of a flare in a stare that are shown
-MOST_DOTS = 500  # simulated fits that are shown
+MOST_DOTS = 500  # largest number of simulated fits that are shown
 
 
 @lru_cache(maxsize=4)

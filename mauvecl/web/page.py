@@ -32,7 +32,7 @@ NOMINAL = "The throughput is nominal"  # start of the message about it, which th
 #: Kinds of messages that change the answer, which are shown in red.
 CHANGING = {"saturated", "no answer", "no limit", "no threshold", "no light", "wrong sign", "not marginalised",
             "outside the prior"}  # fmt: skip
-MOST_LINKED = 8192  # characters of a link that are parsed
+MOST_LINKED = 8192  # largest number of characters of a link that are parsed
 #: Tabs with pictures, in the order of their group.
 DRAWN = (DETECTION, SPECTRUM, SIGNAL, NOISE, LIMIT, MEASUREMENT, UNKNOWN, CHANGE, PERIODS, COMPLETENESS, ANALYSE,
          CALIBRATE, VISIBILITY, PLAN)  # fmt: skip
@@ -155,7 +155,10 @@ FIRST = {name: field.read(field.first) for name, field in ENTRIES.items()}
 
 
 class State:
-    """State of a page that a link gives: the text of each field, valid or not, and the visitor's files."""
+    """State of a page that a link gives: the text of each field in `entered`, valid or not, and the visitor's files.
+
+    `stray` is the message on entries of the link that are no fields, or that no field of the page can correct.
+    """
 
     def __init__(self, link: str = "", uploads: Mapping[str, Any] | None = None) -> None:
         # The message `stray` is on entries that are no fields, or that no field can correct.
@@ -224,7 +227,11 @@ class State:
 
 
 def known_values(state: State) -> dict[str, Any]:
-    """Return what is known of the star, with texts that a button can enter, and of each target, by column."""
+    """Return the known values of the star and of each target, and the values that can be entered for it.
+
+    The star has ``about`` in words, ``given``, texts of fields, and ``offer``, the words of a button that enters them;
+    ``targets`` has texts by the columns of the table for each row.
+    """
     known: dict[str, Any] = {"about": "", "given": {}, "offer": ""}
     name = state.entered["star"]
     star = None if name == UPLOADED else resolve(name, own=False)

@@ -22,9 +22,9 @@ from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
 MEMORY_MIB = 1536
-SECONDS = 20  # that it may take, by the clock and of processor time
-CONTENT_MIB = 64  # to which a visitor's file may unpack
-TOGETHER = 2  # readers at the same time; other visitors wait for their turn, but no longer than `SECONDS`
+SECONDS = 20  # longest duration of reading, by the clock and of processor time
+CONTENT_MIB = 64  # largest size to which a visitor's file may unpack
+TOGETHER = 2  # number of readers at the same time; other visitors wait for at most `SECONDS`
 _REFUSED, _NO_ROOM = 2, 3  # exit codes of the reading process
 T = TypeVar("T")
 #: Expected content of an upload if it is too large, and in general: a spectrum, or frames.

@@ -48,15 +48,15 @@ if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
 
 # Limits of the server; sizes in bytes.
-MAX_VISITORS = 100  # at the same time, with some megabytes each (assumed to suffice for a team)
-MAX_CONNECTIONS = 512  # beyond which the oldest without a page is closed; browsers open up to six
-MESSAGE = 17 * 2**20  # from a page: an upload with a margin
-BODY = 2**16  # of a request, of which the page has none
-REQUEST_S = 20.0  # for the headers and the body of each request
-IDLE_S, SWEEP_S = 3600, 5  # after which unused pages are disconnected, and interval of this check
-PING_S = 20  # between pings of a connection, which is closed if it does not reply
-CLOSED_FORMS = 2  # threads, besides the event loop, that compute closed forms, pictures and files for all visitors
-MOST_LOGGED = 1200  # characters of a line of the log
+MAX_VISITORS = 100  # visitors at the same time, with some megabytes each (assumed to suffice for a team)
+MAX_CONNECTIONS = 512  # number above which the oldest one without a page is closed; browsers open up to six
+MESSAGE = 17 * 2**20  # message from a page: an upload with a margin
+BODY = 2**16  # body of a request; those of the page have none
+REQUEST_S = 20.0  # longest time for the headers and the body of each request
+IDLE_S, SWEEP_S = 3600, 5  # time after which unused pages are disconnected, and interval of this check
+PING_S = 20  # time between pings of a connection, which is closed if it does not reply
+CLOSED_FORMS = 2  # number of threads that compute closed forms, pictures and files for all visitors
+MOST_LOGGED = 1200  # largest number of characters of a line of the log
 ASSETS = Path(__file__).parent / "assets"
 #: The page connects to its own server only, and runs only its own code. Browsers ask whether a file has changed, unless
 #: its address states its version.
@@ -166,7 +166,11 @@ class OneLine(logging.Formatter):
 
 
 def make(address: str, port: int, allowed: Sequence[str]) -> Any:
-    """Return a listening server; raises InputError as `hosts` does, and OSError if the port is taken."""
+    """Return a listening server.
+
+    Raises InputError if the address is invalid or accepts other machines without an origin, and OSError if the port is
+    taken.
+    """
     application = PageApplication(
         [
             (r"/", FrontHandler),

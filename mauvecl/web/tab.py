@@ -44,14 +44,14 @@ MAP_STEPS, MAP_REALISATIONS = 8, 20_000
 INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
 #: Largest number of simulated fits, and of those of two temperatures, which take fifty times as long.
 MOST_FITS, MOST_OF_TWO = 10_000, 1000
-DRAWN_UNITS = ("realisations", "steps", "cells")  # of the progress of verbs that use the pool's devices
+DRAWN_UNITS = ("realisations", "steps", "cells")  # units of the progress of verbs that use the pool's devices
 FIXED = ("star", "amplitude")  # columns that the page does not show: its question has one star and one flare
 #: Keys that are stated even at their default, so that readers see what was assumed.
 STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
           "run.realisations", "run.seed")  # fmt: skip
 #: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
 ALWAYS_USED = ("nuisances.", "observation.temperature_c")
-MOST_CHARACTERS = 500  # of a value in a command; a longer one is in the study file
+MOST_CHARACTERS = 500  # longest value in a command; a longer one is in the study file
 ANYTHING = TypeAdapter(Any)
 _drawing = threading.Lock()  # held while matplotlib draws
 
@@ -101,7 +101,10 @@ QUESTIONS = {name: Simulation((name,)) for name in VERBS} | {
 def simulate(
     name: str, study: Study, pool: Pool, progress: Progress = None, *, inputs: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Return the answers to a question by name, of a detection also with the other choice of unknowns if it has one."""
+    """Return the answers to a question by name; its first verb reports its progress and takes the contents of files.
+
+    A detection also has the answer with the other choice of unknowns, unless that is refused.
+    """
     question = QUESTIONS[name]
     study, (main, *more) = question.study(study), question.verbs
     questions = [(name, main, study), *((verb, verb, study) for verb in more)]
@@ -303,7 +306,10 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
-    """Return name and content of one of a tab's `documents`, without `ending`, or of its `files` or their study."""
+    """Return file name and content of one of a tab's `files` or `documents`, or of the study that reproduces it.
+
+    The ending is "ecsv", "fits" or "study", and empty for a document.
+    """
     if name not in tab.documents and (name not in tab.files or ending not in ("ecsv", "fits", "study")):
         raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}; use one of its own", key="name")
     if not tab.offers(name, answers):

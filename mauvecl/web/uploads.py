@@ -37,17 +37,17 @@ from mauvecl.web.sandboxed_reader import EXPECTED_FRAMES, read_limited
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
 
 # Limits; sizes in bytes.
-MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000  # of an upload, and points of its spectrum
-MOST_KEPT_BYTES = 16 * 2**20  # of a file that is kept unread; a day of resolution elements takes some 8 MiB
-MOST_VALUES = 2**24  # values of frames that an answer reads: the spectra of a day
-MOST_PAIRS_BYTES = 2**18  # of an unknown spectrum
-MOST_FILES, MOST_BYTES = 40, 64 * 2**20  # files and observations of an archive, and to which it unpacks
-MOST_TOML_BYTES, MOST_NAME = 2**18, 100  # of a TOML file in an archive, and characters of a file's name
+MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000  # size of an upload, and number of points of its spectrum
+MOST_KEPT_BYTES = 16 * 2**20  # size of a file that is kept unread; a day of resolution elements takes some 8 MiB
+MOST_VALUES = 2**24  # number of values of frames that an answer reads: the spectra of a day
+MOST_PAIRS_BYTES = 2**18  # size of an unknown spectrum
+MOST_FILES, MOST_BYTES = 40, 64 * 2**20  # number of files and observations of an archive, and its unpacked size
+MOST_TOML_BYTES, MOST_NAME = 2**18, 100  # size of a TOML file in an archive, and number of characters of a file's name
 #: Compression types that are read to the stated size and no further; others, such as LZMA, unpack to any size.
 BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-MOST_RESULTS = 256 * 2**20  # of closed forms, answers and files that the server keeps for all visitors together
-MOST_UPLOADS = 256 * 2**20  # of the uploads of all visitors together
-MOST_OBJECTS = 20_000  # of a value that are counted; arrays, which take most of the memory, come early
+MOST_RESULTS = 256 * 2**20  # size of closed forms, answers and files of all visitors together
+MOST_UPLOADS = 256 * 2**20  # size of the uploads of all visitors together
+MOST_OBJECTS = 20_000  # objects of a value that are counted; arrays, which take most of the memory, come early
 #: Types of objects that belong to the program and not to a value.
 PROGRAM = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
 #: Keys of a mapping of frames that are chosen from menus of their columns, with labels; the first two are required.

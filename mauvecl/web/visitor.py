@@ -44,11 +44,11 @@ if TYPE_CHECKING:
     from mauvecl.web.closed_forms import Answers
     from mauvecl.web.tab import Tab
 
-TOGETHER = 2  # simulations that the server computes at the same time; others wait
-LONG_S = 1.0  # duration of a simulation above which its memory is released, which stops all visitors for a moment
-REPORT_S = 0.25  # between two reports of a simulation's progress
-MOST_ANSWERS = 12  # simulated answers that the server keeps per visitor
-MOST_TASKS = 8  # requests of a visitor that the server works on at the same time
+TOGETHER = 2  # number of simulations that the server computes at the same time; others wait
+LONG_S = 1.0  # duration above which the memory of a simulation is released, which stops all visitors for a moment
+REPORT_S = 0.25  # time between two reports of a simulation's progress
+MOST_ANSWERS = 12  # number of simulated answers that the server keeps per visitor
+MOST_TASKS = 8  # number of requests of a visitor that the server works on at the same time
 UNUSED = 4000  # code with which the connection of an unused page is closed
 #: Message about an error of the page itself.
 OWN_FAULT = "the page failed, and there is no answer; this is a fault of mauvecl: please report what was entered"

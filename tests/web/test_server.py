@@ -14,6 +14,7 @@ import pytest
 from marks import long_but
 from refusals import says_what_is_accepted
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
+from tornado.web import HTTPError
 
 from tests.web.visits import Server, Talk, link
 
@@ -309,6 +310,15 @@ def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
 
     served.visited(work)
     served.end()
+
+
+def test_invented_figures_are_not_kept_in_memory() -> None:
+    from mauvecl.web.server import figure
+
+    for name in ("one", "two"):
+        with pytest.raises(HTTPError, match="404"):
+            figure("light", name, "")
+    assert figure.cache_info().currsize == 0
 
 
 @pytest.mark.long
