@@ -313,12 +313,12 @@ def test_memory_of_uploads_and_answers_is_bounded(tmp_path: Path) -> None:
 
 
 def test_invented_figures_are_not_kept_in_memory() -> None:
-    from mauvecl.web.server import figure
+    from mauvecl.web import server
 
     for name in ("one", "two"):
         with pytest.raises(HTTPError, match="404"):
-            figure("light", name, "")
-    assert figure.cache_info().currsize == 0
+            server.figure("light", name, "")
+    assert server.figure.cache_info().currsize == 0
 
 
 @pytest.mark.long
