@@ -11,14 +11,13 @@ from answers import same
 from commands import started
 from marks import long_but
 from reference import statistics as numpy_kernels
-from scenes import instrument, star
+from scenes import instrument, prepare, star
 
 from mauvecl import Comparison, CosmicRays, Engine, Linear, Normal, PixelMap, Processes, Uniform
 from mauvecl.detection import counts, requests
 from mauvecl.device import selftest
 from mauvecl.device.launches import scene_launches
 from mauvecl.noise import layout, reference
-from mauvecl.noise.scene import prepare
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
 PRIORS = Processes(

@@ -7,13 +7,12 @@ import exact
 import numpy as np
 import pytest
 from refusals import refused
-from scenes import instrument, star
+from scenes import instrument, prepare, star
 from scipy import optimize
 
 from mauvecl import Engine, Expectation, InputError, Processes, Uniform
 from mauvecl.device import selftest
 from mauvecl.noise import layout, reference
-from mauvecl.noise.scene import prepare
 
 #: By exact convolution no allowed draw can be distinguished with fewer draws, and the worst hardly needs more.
 SOONEST, BORDER = 4e13, 5.1e13

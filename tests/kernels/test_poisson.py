@@ -4,11 +4,11 @@ import exact
 import numpy as np
 import pytest
 from probes import Probes
+from scenes import prepare
 from scipy import stats
 
 from mauvecl.device import selftest
 from mauvecl.noise import layout, reference
-from mauvecl.noise.scene import prepare
 
 #: From this mean on, counts are drawn by an expansion.
 SMALLEST_EXPANDED = 1000.0

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from probes import Probes
+from scenes import prepare
 from scipy import stats
 
 from mauvecl import Normal, Processes, Uniform
 from mauvecl.device import selftest
 from mauvecl.noise import layout, reference
-from mauvecl.noise.scene import prepare
 
 Prior = Normal | Uniform
 CONDITIONS = {"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.02}

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes import python
-from scenes import instrument, star
+from scenes import instrument, prepare, star
 from scipy import integrate, stats
 
 from mauvecl import CosmicRays, Engine, Normal, Processes, Study, Uniform, simulate
 from mauvecl.device import selftest
 from mauvecl.noise import layout, reference, unknowns
-from mauvecl.noise.scene import changes_of, prepare
+from mauvecl.noise import scene as noise_scene
 
 N = 20_000
 NONE = Processes()
@@ -233,7 +233,7 @@ def test_every_default_prior_has_a_source_or_documentation() -> None:
 def test_changes_are_slopes_of_recorded_moments(magnitude: float) -> None:
     """Compare with a star whose light, or dark, is larger by 1e-5, where no, some and most pixels saturate."""
     quiet, *_ = star("K3V", magnitude, payload=instrument(part=True))
-    means, variances = changes_of(quiet)
+    means, variances = noise_scene.changes_of(quiet)
     step = 1e-5
     light = ("source_electrons", "sky_electrons", "neighbour_electrons")
     for row, names in ((0, light), (1, light[1:2]), (2, ("dark_dn",))):

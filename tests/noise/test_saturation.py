@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from marks import long_but
-from scenes import instrument, star
+from scenes import instrument, prepare, star
 from scipy import stats
 
 from mauvecl import CosmicRays, Engine, Expectation, InputError, Normal, Processes, Uniform
 from mauvecl.noise import reference
-from mauvecl.noise.scene import prepare
 
 N = 4000
 

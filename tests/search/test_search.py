@@ -10,8 +10,8 @@ from scipy import special
 
 from mauvecl import SHAPES, Stare, Study
 from mauvecl.search import completeness, false_alarms
-from mauvecl.search.search import Search
 
+Search = false_alarms.Search
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))
 KNOWN = {"offset": False, "slope": False, "window_s": 0.0}
