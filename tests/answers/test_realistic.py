@@ -66,6 +66,7 @@ def test_plan_by_the_closed_form_is_worse_than_the_ideal() -> None:
     assert target.signal_with(None) == pytest.approx(np.sqrt(np.sum((light**2 / variance)[used])))
 
 
+@pytest.mark.long
 def test_headline_has_the_numbers_of_the_table(engine: Engine) -> None:
     answer = detect(ASKED, engine)
     row = min(answer.table, key=lambda one: abs(one["probability"] - 0.5))

@@ -149,6 +149,7 @@ def test_nominal_payload_is_gaussian(engine: Engine) -> None:
         assert max(abs(d.skew), abs(d.rounding), abs(d.clipping)) < 0.01
 
 
+@pytest.mark.long
 def test_skew_is_predicted(engine: Engine) -> None:
     """Predict Poisson's tail for few dark counts and little read noise, to a fifth of its effect."""
     kind = {"read_noise_dn": 1.0, "dark_scale_dn_per_s": 0.2, "magnitude": 14.0}
@@ -162,6 +163,7 @@ def test_skew_is_predicted(engine: Engine) -> None:
     assert d.skew > 0.3
 
 
+@pytest.mark.long
 def test_clipping_and_rounding_are_predicted(engine: Engine) -> None:
     """Predict the effect of clipping at zero, for a bias of 5 DN and a read noise of 12 DN; two exposures share it."""
     for exposures in (1, 0):

@@ -136,6 +136,7 @@ def test_amplitude_without_a_flare_is_at_its_boundary() -> None:
     assert found.one_sided[0, none, 0].sum() + np.isinf(found.low[0, none, 0]).sum() > 0
 
 
+@pytest.mark.long
 def test_bounded_intervals_agree_with_brute_force() -> None:
     """Compare jump and lines near their bounds with SciPy's non-negative least squares on grids."""
     x, m = quiet(), model(jump=True, lines=("Mg II",))

@@ -218,6 +218,7 @@ def test_mg_ii_of_au_mic_lies_in_the_published_range() -> None:
     assert error.max() < 5e-13
 
 
+@pytest.mark.long
 def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
     rng = np.random.default_rng(299)
     star, blue, shape, loss = np.linspace(100.0, 900.0, 40), np.linspace(300.0, 50.0, 40), np.zeros(300), np.ones(300)

@@ -75,6 +75,7 @@ def test_general_family_has_the_same_bits_in_each_process() -> None:
     assert made[0] == made[1] == made[2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", [SMOOTH, processes.Process((), 1.0)], ids=["smooth", "white"])
 def test_work_of_an_event_does_not_grow_with_the_light_curve(model: processes.Process, monkeypatch: Any) -> None:
     sizes, measured, work, solved, templates = list[tuple[str, int]](), [], [], list[tuple[str, int]](), []

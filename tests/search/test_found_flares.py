@@ -51,6 +51,7 @@ def amplitude_of_one() -> float:
     return 1e-3 / float(stare(paper(*FAINT, "stare.search=false", event)).events["snr"][0])
 
 
+@pytest.mark.long
 def test_bright_flare_is_found_once_and_another_shape_leaves_at_most_a_small_residual() -> None:
     """S/N of 400, and of 120 beside it, which is fitted apart: no further alarm. A false alarm: once in 7e4 runs."""
     events = [Event(3000.0, 60.0, 1.0), Event(3800.0, 60.0, 0.3)]
