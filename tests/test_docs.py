@@ -140,7 +140,7 @@ ALL_PAGES = [*PAGES, ROOT / "CONTRIBUTING.md"]
 DEFINITIONS = {".py": r"^\s*(?:def|class) {0}\b|^{0}\b.* = |^    {0}: ", ".mako": r"^(?:INLINE )?\w+ {0}\("}
 
 
-def test_documented_names_exist() -> None:
+def test_documented_names_exist_and_main_ones_have_examples() -> None:
     named = [(page.name, *found) for page in ALL_PAGES for found in NAMED.findall(page.read_text(encoding="utf-8"))]
     places = {
         file: next((one for top in ("", "mauvecl") for one in (ROOT / top).glob(file)), None) for _, file, _ in named
@@ -161,6 +161,8 @@ def test_documented_names_exist() -> None:
     assert len(imported) > 100
     for name in (*dotted, *imported):
         pkgutil.resolve_name(name)
+    for main in (mauvecl.Source, mauvecl.Sky, mauvecl.Instrument, mauvecl.expect, mauvecl.Engine, mauvecl.Study):
+        assert ">>> " in main.__doc__, main
 
 
 def test_studies_and_instruments_shown_are_valid() -> None:
@@ -221,8 +223,3 @@ EXAMPLES = sorted(
 def test_examples_of_docstrings_run(name: str) -> None:
     failed, attempted = doctest.testmod(importlib.import_module(name))
     assert failed == 0 < attempted
-
-
-def test_main_names_have_examples() -> None:
-    for main in (mauvecl.Source, mauvecl.Sky, mauvecl.Instrument, mauvecl.expect, mauvecl.Engine, mauvecl.Study):
-        assert ">>> " in main.__doc__, main

@@ -29,7 +29,7 @@ def between(function, first: float, last: float, kinks: list[float]) -> float:
     return sum(quad(function, a, b, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(ends))
 
 
-def test_shapes_equal_the_published_formulas():
+def test_shapes_equal_the_published_formulas_and_small_integrals_keep_their_digits():
     # Tovar Mendoza et al. 2022 as printed, with plain exp and erfc.
     shape, tau = SHAPES["tovarmendoza2022"], np.linspace(-1.2, 30, 500)
     a, b, c = shape.A, shape.B, shape.C
@@ -47,6 +47,16 @@ def test_shapes_equal_the_published_formulas():
         assert amplitude == pytest.approx(0.3 * delta**0.6)
         assert amplitude * half_width * FIDUCIAL.equivalent_duration == pytest.approx(delta, rel=1e-12)
         assert amplitude * half_width * FIDUCIAL.BOX == pytest.approx(delta / 1.5, rel=1e-12)
+    # Against quadrature in units of the shape's own value at the end, down to where doubles end.
+    shape = SHAPES["tovarmendoza2022"]
+    for tau in (-0.2513, -0.4, -1.0, -2.0, -4.0, -6.0):
+        scale = float(shape.at(tau))
+        exact, _ = quad(lambda t, unit: float(shape.at(t)) / unit, tau - 1.0, tau, scale, epsrel=1e-12, limit=400)
+        assert float(shape.before(tau)) / scale == pytest.approx(exact, rel=1e-8)
+    # The difference of two integrals from the beginning would have none left here.
+    shape = SHAPES["davenport2014"]
+    exact = sum(a / b * (np.exp(-b * 100) - np.exp(-b * 101)) for a, b in shape.DECAY)
+    assert float(shape.integral(100, 101)) == pytest.approx(exact, rel=1e-10)
 
 
 @every_shape
@@ -85,19 +95,6 @@ def test_frames_sum_to_the_fluence_and_conserve_light_of_any_flare(shape):
         peak, half = rng.uniform(-2000.0, 8000.0), 10 ** rng.uniform(-2.0, 6.0)
         with np.errstate(all="raise", under="ignore"):
             assert (shape.mean_over(np.arange(1201) * 5.0, peak, half) >= 0).all(), (peak, half)
-
-
-def test_small_integrals_keep_their_digits():
-    # Against quadrature in units of the shape's own value at the end, down to where doubles end.
-    shape = SHAPES["tovarmendoza2022"]
-    for tau in (-0.2513, -0.4, -1.0, -2.0, -4.0, -6.0):
-        scale = float(shape.at(tau))
-        exact, _ = quad(lambda t, unit: float(shape.at(t)) / unit, tau - 1.0, tau, scale, epsrel=1e-12, limit=400)
-        assert float(shape.before(tau)) / scale == pytest.approx(exact, rel=1e-8)
-    # The difference of two integrals from the beginning would have none left here.
-    shape = SHAPES["davenport2014"]
-    exact = sum(a / b * (np.exp(-b * 100) - np.exp(-b * 101)) for a, b in shape.DECAY)
-    assert float(shape.integral(100, 101)) == pytest.approx(exact, rel=1e-10)
 
 
 SUN_CM, NM = 6.957e10, np.linspace(200.0, 1200.0, 40_001)

@@ -194,6 +194,9 @@ def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
     streams = [s + e for s in layout.STREAMS.values() for e in (0, layout.REFERENCE)]
     assert len(set(streams)) == len(streams)
     assert max(streams) < 256
+    # Every default prior has a source or documentation.
+    assert all(row.source for row in unknowns.PROCESSES.values() if row.prior is not None)
+    assert all(row.marginalised and row.scatter > 0 for row in unknowns.DOCUMENTED_NUISANCES)
 
 
 @pytest.mark.parametrize("level", [Uniform(0.5, 1.5), Uniform(0.2, 9.0)])
@@ -220,13 +223,6 @@ def test_sky_follows_its_level(engine: Engine, level: Uniform) -> None:
         # A uniform value's variance scatters by less than a normal's; the noise's grows with the light at most.
         wanted = sd**2 + noise[1]
         assert abs(of_sky.var() / wanted - 1) < 5 * error + abs(mean - 1) * noise[1] / wanted
-
-
-def test_every_default_prior_has_a_source_or_documentation() -> None:
-    assert all(row.source for row in unknowns.PROCESSES.values() if row.prior is not None)
-    for row in unknowns.DOCUMENTED_NUISANCES:
-        assert row.marginalised
-        assert row.scatter > 0
 
 
 @pytest.mark.parametrize("magnitude", [-2.0, -1.2, -1.0, 2.0])
