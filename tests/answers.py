@@ -7,7 +7,7 @@ import numpy as np
 from typer.main import get_command
 
 import mauvecl
-from mauvecl import Detection, Engine, Expectation, Study, simulate
+from mauvecl import Detection, Expectation, Study, simulate
 from mauvecl.cli import app
 
 #: Questions, in the order of the command line: commands that are functions in Python, too.
@@ -50,11 +50,6 @@ def same(ours: Detection, theirs: Detection) -> None:
     for key, kept in ours._samples.items():
         np.testing.assert_array_equal(kept.values, theirs._samples[key].values)
         np.testing.assert_array_equal(kept.realisations, theirs._samples[key].realisations)
-
-
-def twice(engine: Engine, quiet: Expectation, flares: list[Expectation], n: int, **how: Any) -> list[Detection]:
-    """Return an answer, and the same with as many further realisations."""
-    return [engine.detect(quiet, flares, realisations=n, start=start, **how) for start in (0, n)]
 
 
 def of_kind(messages: Iterable[str], kind: str) -> list[str]:

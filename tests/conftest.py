@@ -87,7 +87,7 @@ def scene() -> list[Expectation]:
 
 #: Files that take longest: a process that begins one of them last would work alone at the end.
 LONGEST = ("test_page.py", "test_closed_loop.py", "test_unusual_light.py", "test_files.py", "test_spectra.py",
-           "test_real_stars.py", "test_docs_run.py", "test_kernel_cache.py", "test_cluster.py",
+           "test_real_stars.py", "test_docs.py", "test_kernel_cache.py", "test_cluster.py",
            "test_server.py")  # fmt: skip
 
 

@@ -12,9 +12,10 @@ from scipy import stats
 import mauvecl
 from mauvecl import SHAPES, Expectation, Frames, Instrument, Sky, Source, Stare, Study, analyse, expect
 from mauvecl.flares import stare_scene
-from mauvecl.flares.frames import Components
+from mauvecl.noise import scene as noise_scene
 
 Float = NDArray[np.float64]
+Components, prepare = stare_scene.Components, noise_scene.prepare
 
 #: Tables of the bands by name: wavelength in nm, and throughput.
 BANDS = {

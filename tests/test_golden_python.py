@@ -18,11 +18,10 @@ import numpy as np
 import pytest
 from commands import run
 from golden_inputs import DATA, write_inputs
-from scenes import BANDS, MG_II, NEAR, instrument, paper, source, star
+from scenes import BANDS, MG_II, NEAR, Components, instrument, paper, source, star
 
 import mauvecl
 from mauvecl import BalmerFlare, EnergyScale, Engine, Event, FlareModel, Nuisances, Sky, Source, expect, fit
-from mauvecl.flares.frames import Components
 from mauvecl.observations import visits
 
 GOLDEN = Path(__file__).parent / "data" / "golden" / "python"

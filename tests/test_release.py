@@ -1,15 +1,27 @@
-"""What is around the package: version and date, licences, the paper, and recipes that name what the package needs."""
+"""What is around the package: version, licences, paper, recipes, wheel and sdist, benches and the list of mutations."""
 
+import importlib
+import io
+import os
 import re
+import shutil
+import signal
+import subprocess
+import sys
+import tarfile
 import tomllib
+import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
 import yaml
 from astropy.table import Table
 from commands import run
 from scripts import ROOT, tool
 
+import mauvecl
 from mauvecl import __version__
 
 
@@ -122,3 +134,126 @@ def test_workflow_tests_every_python_and_pins_what_it_runs() -> None:
     used = [step["uses"] for job in jobs.values() for step in job["steps"] if "uses" in step]
     assert len(used) > 15
     assert not [one for one in used if not re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", one)]
+
+
+#: What a checkout has, or an unpacked sdist; a working copy has much more beside it.
+FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "paper", "recipe", "tests", "tools")
+FILES = (
+    ".dockerignore", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md",
+    "Dockerfile", "LICENSE", "Makefile", "README.md", "SECURITY.md", "SUPPORT.md", "environment.yml", "pyproject.toml",
+)  # fmt: skip
+MADE = ("__pycache__", "_build", "_generated", "commands", "jupyter_execute", ".ipynb_checkpoints", "*_cache",
+        ".hypothesis", "node_modules")  # fmt: skip
+VERSION = mauvecl.__version__
+WHEEL = f"mauvecl-{VERSION}-py3-none-any.whl"
+SDIST = f"mauvecl-{VERSION}.tar.gz"
+BUILD = """import sys
+from hatchling.build import build_sdist, build_wheel
+build_sdist(sys.argv[1])
+build_wheel(sys.argv[1])
+"""
+
+
+def copied(tree: Path) -> Path:
+    """Copy the sources, links as links."""
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, tree / name, symlinks=True, ignore=shutil.ignore_patterns(*MADE))
+    for name in FILES:
+        shutil.copyfile(ROOT / name, tree / name)
+    return tree
+
+
+def built(tree: Path, out: Path) -> tuple[bytes, bytes]:
+    """Build wheel and sdist without a network: the backend is installed with the tests."""
+    unset = {key: value for key, value in os.environ.items() if key != "SOURCE_DATE_EPOCH"}
+    subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=tree, env=unset, check=True)
+    return (out / WHEEL).read_bytes(), (out / SDIST).read_bytes()
+
+
+def files_below(tree: Path) -> set[str]:
+    """Return the files of a tree, those behind links as well."""
+    return {
+        str((Path(folder) / name).relative_to(tree))
+        for folder, _, names in os.walk(tree, followlinks=True)
+        for name in names
+    }
+
+
+@pytest.mark.long
+def test_packages_are_the_same_for_the_same_files_complete_and_licensed(tmp_path: Path) -> None:
+    tree = copied(tmp_path / "checkout")
+    packages = wheel, sdist = built(tree, tmp_path / "built")
+    with tarfile.open(fileobj=io.BytesIO(sdist)) as archive:
+        archive.extractall(tmp_path, filter="data")
+    unpacked = tmp_path / f"mauvecl-{VERSION}"
+    assert files_below(unpacked) - {"PKG-INFO"} == files_below(tree)
+    assert not [path for path in unpacked.rglob("*") if path.is_symlink()]
+    assert built(unpacked, tmp_path)[0] == wheel
+    # The wheel holds nothing else; the sdist, from which the same wheel is built, has the licences as well.
+    held = zipfile.ZipFile(io.BytesIO(wheel))
+    package = {f"mauvecl/{name}" for name in files_below(tree / "mauvecl")}
+    assert {name for name in held.namelist() if ".dist-info/" not in name} == package
+    texts = [ROOT / "LICENSE", *(ROOT / "host" / "stars" / "library" / "licenses").iterdir()]
+    assert len(texts) == 4
+    for text in texts:
+        assert held.read(f"mauvecl-{VERSION}.dist-info/licenses/{text.relative_to(ROOT)}") == text.read_bytes()
+    # In another folder, with other times and permissions of the files.
+    elsewhere = copied(tmp_path / "elsewhere")
+    for number, path in enumerate(sorted(elsewhere.rglob("*"))):
+        if not path.is_symlink():
+            os.utime(path, (1_000_000_000 + number, 1_000_000_000 + number))
+            path.chmod(path.stat().st_mode & 0o750)
+    assert built(elsewhere, tmp_path / "again") == packages
+
+
+check = tool("mutation_check")
+
+
+def dies_at_start(model: Any) -> Any:
+    """End as a peer does that the system kills while it compiles."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def dies_in_a_run(model: Any) -> Any:
+    """Return a peer that dies when its time is taken, after the check of its mean."""
+    from peers import Peer
+
+    return Peer("mortal", "1", 10, lambda n: dies_at_start(model) if n == 10 else np.full(n, 10.0))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("make", [dies_at_start, dies_in_a_run])
+def test_death_of_a_peer_raises(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Its child processes import the module, too.
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    peers = importlib.import_module("peers")
+    signal.signal(signal.SIGALRM, lambda *_: pytest.fail("waits for a process that has ended"))
+    signal.alarm(60)
+    try:
+        with pytest.raises(ChildProcessError, match="ended with exit code -9"):
+            peers.Child(make, peers.Model(*[np.ones(10, np.float32)] * 5)).seconds()
+    finally:
+        signal.alarm(0)
+
+
+def test_every_mutation_has_its_texts_and_its_test() -> None:
+    sources, tests = check.files_of(ROOT, *check.SOURCES), check.files_of(ROOT, "tests")
+    assert len(check.MUTATIONS) >= 70
+    for name, (test, *edits) in check.MUTATIONS.items():
+        assert edits, name
+        for text, changed in edits:
+            assert text != changed, name
+            place = check.place_of(text, sources)
+            if place.suffix == ".py":
+                # A mutant that cannot be imported proves nothing.
+                compile(sources[place].replace(text, changed), name, "exec")
+        check.node_of(test, tests)
+    # Texts and tests that are missing or occur twice are refused.
+    files = {Path("a.py"): "def test_a(\nx = 1\n", Path("b.py"): "def test_b(\ny = 1\nx = 1\n\ndef test_a(\n"}
+    assert check.node_of("test_b[0.1]", files) == "b.py::test_b[0.1]"
+    for find, one, words in (
+        (check.place_of, "z = 1", "occurs 0 times"), (check.place_of, "x = 1", r"occurs 2 times \(a.py, b.py\)"),
+        (check.node_of, "test_c", "in 0 files"), (check.node_of, "test_a", "in 2 files"),
+    ):  # fmt: skip
+        with pytest.raises(SystemExit, match=words):
+            find(one, files)

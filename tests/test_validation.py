@@ -1,12 +1,17 @@
-"""Every public function validates every argument: the cases follow from the annotations.
+"""Every public function validates every argument, and bad input is refused in one sentence.
 
-Values that annotations refuse are refused; those that fit an annotation and cannot be right, such as a name that is
-unknown or an array of a wrong shape, are answered, or refused by the function itself.
+Cases follow from the annotations: values that these refuse are refused; those that fit an annotation and cannot be
+right, such as a name that is unknown or an array of a wrong shape, are answered, or refused by the function itself.
+Others, of all verbs and functions, are in data/refusals, whose README says what an entry may hold.
 """
 
 from __future__ import annotations
 
 import inspect
+import pickle
+import re
+import shlex
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -19,6 +24,7 @@ import pytest
 from astropy.table import Column, MaskedColumn
 from astropy.time import TimeDelta
 from astropy.utils.masked import Masked
+from commands import ended
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel
 from refusals import refused, says_what_is_accepted
@@ -139,6 +145,11 @@ def wrong_values(path: str, name: str) -> Iterator[Any]:
 def test_every_public_function_is_validated() -> None:
     assert len(PARAMETERS) > 300
     assert not [path for path, f in FUNCTIONS.items() if arguments(f) and not hasattr(f, "__validated__")]
+    # Arguments that are missing, or too many, are refused as everywhere in Python.
+    star = mauvecl.Source.from_library("G2V")
+    for call, given in ((star.flaring, ()), (star.binned, (1.0, 2.0)), (type(mauvecl.Study().run), (5,))):
+        with pytest.raises(TypeError, match="argument"):
+            call(*given)
 
 
 @pytest.mark.parametrize("path", [path for path, f in FUNCTIONS.items() if arguments(f)])
@@ -269,13 +280,6 @@ def test_wrong_fields_of_records_raise(record: type[BaseModel]) -> None:
                 assert says_what_is_accepted(refusal), refusal
 
 
-def test_missing_and_surplus_arguments_are_refused() -> None:
-    star = mauvecl.Source.from_library("G2V")
-    for call, given in ((star.flaring, ()), (star.binned, (1.0, 2.0)), (type(mauvecl.Study().run), (5,))):
-        with pytest.raises(TypeError, match="argument"):
-            call(*given)
-
-
 #: Values of required parameters that are text, by name of the parameter.
 WORDS = {
     "band": "Kepler", "quantity": "magnitude", "statistic": "matched", "target": "290.0 -11.2",
@@ -352,3 +356,55 @@ def test_wrong_name_or_array_raises(path: str, tmp_path: Path, monkeypatch: pyte
                 pass
             except RuntimeError as error:
                 assert error.kind, "a device's failure states its kind"  # type: ignore[attr-defined]  # noqa: PT017
+
+
+TABLES = Path(__file__).parent / "data" / "refusals"
+CONTENT = {path: tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(TABLES.glob("*.toml"))}
+ROWS = [
+    pytest.param(path, row, id=f"{path.stem}: {row.get('run') or row['call']}")
+    for path, table in CONTENT.items()
+    for row in table["refusal"]
+]
+
+
+@cache
+def _names(path: Path) -> dict[str, Any]:
+    """Return the public names, and what the table's setup makes of them."""
+    names = {name: getattr(mauvecl, name) for name in mauvecl.__all__} | {"mauvecl": mauvecl, "np": np, "u": u}
+    exec(CONTENT[path].get("setup", ""), names)
+    return names
+
+
+@pytest.mark.parametrize(("path", "row"), ROWS)
+def test_bad_input_is_refused(path: Path, row: dict[str, Any], tmp_path: Path) -> None:
+    for name, text in (CONTENT[path].get("files", {}) | row.get("files", {})).items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    if "call" in row:
+        with refused(row.get("key"), *row["says"]):
+            eval(row["call"], _names(path) | {"folder": tmp_path})
+        return
+    code, out, reported = ended(*shlex.split(row["run"]), folder=tmp_path)
+    assert code == 2, out + reported
+    sentence = reported.removeprefix("mauvecl: ").strip()
+    for fact in (row["key"], *row["says"]):
+        assert fact in sentence, sentence
+    # Notes on what was assumed may precede the sentence.
+    assert not re.search(r"Traceback|internal error", reported), reported
+    if path.stem in ("cli", "cli-limits"):
+        # One sentence, in which parameters are named by their flags.
+        assert (out, reported.count("\n"), reported[:9]) == ("", 1, "mauvecl: ")
+        assert "`" not in re.sub(r"`mauvecl [^`]*`", "", reported), reported
+
+
+def test_errors_of_values_have_a_key_a_place_and_a_unit() -> None:
+    error = InputError.of("flare amplitude", -1.0, "at least 0", unit="s", where="a.toml")
+    for one in (error.within("star.txt"), pickle.loads(pickle.dumps(error.within("star.txt")))):
+        assert (str(one), one.key) == (
+            "star.txt: a.toml: flare amplitude must be at least 0, not -1.0 s", "flare_amplitude"
+        )  # fmt: skip
+
+    # Values are shown on one short line.
+    shown = {r"'a\nb'": "a\nb", "2.5": np.float64(2.5), "3.0 m": 3 * u.m, "[1, 2]": [1, 2],
+             "'" + "x" * 56 + "..." + "x" * 19 + "'": "x" * 500}  # fmt: skip
+    for text, value in shown.items():
+        assert str(InputError.of("key", value, "another")) == f"key must be another, not {text}"

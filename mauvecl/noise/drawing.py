@@ -33,7 +33,7 @@ SMOOTH_STEPS = 1.5
 MAX_SKEW = 0.04
 #: Estimated number of draws of one pixel after which Pearson's test of whole DN would detect, at five sigma, that they
 #: are not drawn frame by frame and count by count. By exact convolution, the worst allowed case needs 4e13 draws
-#: (tests/kernels/test_words.py, tests/noise/test_stacks.py). The payload's fastest draws satisfy this at every
+#: (tests/kernels/test_words.py, tests/noise/test_correlations.py). The payload's fastest draws satisfy this at every
 #: temperature and exposure, some with only 5e13 to 1e14.
 DRAWS_TO_NOTICE = 4.2e13
 #: Largest number of harmonics of the rounding error's sawtooth; Gaussian noise of 0.02 DN suppresses all others.

@@ -86,6 +86,7 @@ def test_flares_are_measured_along_a_stare(engine: Engine) -> None:
     assert any(name.startswith("line_") for name in two.tables["temperatures"].colnames)
 
 
+@pytest.mark.long
 def test_second_temperature_is_the_hotter_and_of_the_fits_that_have_one(engine: Engine) -> None:
     """Fit two blackbodies to a flare of one, which some exposures show, and to one whose hotter part comes first."""
     settings = ["measure.fits=20", "flare.amplitudes=[0.3]", "nuisances.usual=false"]
@@ -188,6 +189,7 @@ def test_flares_that_saturate_most_pixels_are_measured(usual: str, engine: Engin
     assert np.isnan(own.forecasts(np.array([1000.0]), own.unknown)[0].errors).all()
 
 
+@pytest.mark.long
 def test_gaussian_sweeps_what_neither_keywords_nor_a_study_state(engine: Engine) -> None:
     """Only the verb's own question has a default sweep."""
     for magnitude, exposure in ((9, 5), (9, None), (None, 5), (9, 50)):

@@ -207,6 +207,7 @@ def test_sharp_maxima_at_bounds_are_found() -> None:
     assert np.abs(found.estimates[0] - list(m.values(10_000.0, m.amplitudes(10_000.0, 5.0)).values()))[0] < 1.0
 
 
+@pytest.mark.long
 def test_two_temperatures_are_recovered_without_noise() -> None:
     """Compare to 0.6 %, the step between second temperatures; in a dimmed exposure to 3 % of their errors."""
     x, two, m = scene("M3V", 9.0, 3.0, FLARE, distance_pc=5.0)

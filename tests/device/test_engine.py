@@ -17,14 +17,13 @@ from marks import long_but
 from processes import python
 from reference import known_answers
 from reference import statistics as numpy_kernels
-from scenes import instrument, star
+from scenes import instrument, prepare, star
 
 from mauvecl import Comparison, CosmicRays, Engine, Linear, Normal, PixelMap, Processes, Uniform
 from mauvecl.detection import counts, requests
 from mauvecl.device import build, drivers, selftest
 from mauvecl.device.launches import scene_launches
 from mauvecl.noise import layout, reference
-from mauvecl.noise.scene import prepare
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
 PRIORS = Processes(

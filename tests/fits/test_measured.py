@@ -126,6 +126,7 @@ def test_intervals_of_a_bright_flare_of_another_shape_follow_its_standard_errors
         assert np.abs(np.log(ratios[:, found.column(name)])).max() < 0.25, (name, ratios[:, found.column(name)])
 
 
+@pytest.mark.long
 def test_intervals_of_an_open_cooling_contain_their_estimates() -> None:
     """Fit 6 faint flares, whose final temperatures range from the least one of the model to that of the peak."""
     x, rng = quiet(), np.random.default_rng(0)
@@ -181,9 +182,8 @@ def test_pointing_drifts_and_jitters_are_unknown_levels_of_light() -> None:
     assert known.count[-1] > 1
 
 
-@pytest.mark.parametrize(("unknown", "count"), [
-    (False, 12), pytest.param(True, 100, marks=pytest.mark.long),
-], ids=["known", "unknown"])  # fmt: skip
+@pytest.mark.long
+@pytest.mark.parametrize(("unknown", "count"), [(False, 12), (True, 100)], ids=["known", "unknown"])
 def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine) -> None:
     """Count coverages of nine quantities, squared distances and chi-squared; each side fails in 1e-6 of seeds."""
     nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})

@@ -115,18 +115,16 @@ def test_forecasts_agree_with_brute_force(
 CA_II_NM = np.array([393.478, 396.959])
 
 
-def test_hot_flare_has_a_lower_limit_of_temperature() -> None:
-    """Check a one-sided coverage of 97.5 % in 400 fits; fewer than 370 have p < 1e-6."""
+def test_hot_flares_have_a_lower_limit_of_temperature_and_none_an_amplitude_at_its_boundary() -> None:
+    """Check a one-sided coverage of 97.5 % in 400 fits; fewer than 370 have p < 1e-6.
+
+    Without a flare half of 400 amplitudes are 0 at one temperature, and fewer over temperatures, at least 50 (1e-6).
+    """
     x, m = quiet(), model()
     found = fit(drawn(x, m.counts(60_000.0, [0.01]), 400, 31), x, m, levels=(0.95,))
     assert found.one_sided[0, :, 0].mean() > 0.5
     assert np.isposinf(found.high[0, found.one_sided[0, :, 0], 0]).all()
     assert (found.low[0, :, 0] <= 60_000.0).sum() >= 370
-
-
-def test_amplitude_without_a_flare_is_at_its_boundary() -> None:
-    """Check that half of 400 amplitudes are 0 at one temperature, and fewer over temperatures, at least 50 (1e-6)."""
-    x, m = quiet(), model()
     found = fit(drawn(x, np.zeros(x.wavelength_nm.size), 400, 32), x, m, levels=(0.95,))
     amplitude = found.column("amplitude")
     none = found.estimates[:, amplitude] == 0.0
@@ -136,6 +134,7 @@ def test_amplitude_without_a_flare_is_at_its_boundary() -> None:
     assert found.one_sided[0, none, 0].sum() + np.isinf(found.low[0, none, 0]).sum() > 0
 
 
+@pytest.mark.long
 def test_bounded_intervals_agree_with_brute_force() -> None:
     """Compare jump and lines near their bounds with SciPy's non-negative least squares on grids."""
     x, m = quiet(), model(jump=True, lines=("Mg II",))

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from reference import stares as stare_reference
 from refusals import refused
-from scenes import NEAR, instrument, star
+from scenes import NEAR, Components, instrument, star
 from scipy import special
 
 from mauvecl import CosmicRays, Engine, Processes, Stare, Stares, Study
 from mauvecl.flares import stare_scene
-from mauvecl.flares.frames import Components
 
 METHODS = ["pixels", "cumulants"]
 

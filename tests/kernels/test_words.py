@@ -11,13 +11,12 @@ import pytest
 import randomgen
 from probes import Probes
 from refusals import refused
-from scenes import instrument, star
+from scenes import instrument, prepare, star
 from scipy import optimize, special, stats
 
 from mauvecl import Engine, Expectation, InputError, Normal, Processes, Uniform
 from mauvecl.device import selftest
 from mauvecl.noise import layout, reference
-from mauvecl.noise.scene import prepare
 
 
 def test_philox_gives_the_known_answers(probes: Probes) -> None:

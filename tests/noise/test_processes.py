@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes import python
-from scenes import instrument, star
+from scenes import instrument, prepare, star
 from scipy import integrate, stats
 
 from mauvecl import CosmicRays, Engine, Normal, Processes, Study, Uniform, simulate
 from mauvecl.device import selftest
 from mauvecl.noise import layout, reference, unknowns
-from mauvecl.noise.scene import changes_of, prepare
+from mauvecl.noise import scene as noise_scene
 
 N = 20_000
 NONE = Processes()
@@ -194,6 +194,9 @@ def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
     streams = [s + e for s in layout.STREAMS.values() for e in (0, layout.REFERENCE)]
     assert len(set(streams)) == len(streams)
     assert max(streams) < 256
+    # Every default prior has a source or documentation.
+    assert all(row.source for row in unknowns.PROCESSES.values() if row.prior is not None)
+    assert all(row.marginalised and row.scatter > 0 for row in unknowns.DOCUMENTED_NUISANCES)
 
 
 @pytest.mark.parametrize("level", [Uniform(0.5, 1.5), Uniform(0.2, 9.0)])
@@ -222,18 +225,11 @@ def test_sky_follows_its_level(engine: Engine, level: Uniform) -> None:
         assert abs(of_sky.var() / wanted - 1) < 5 * error + abs(mean - 1) * noise[1] / wanted
 
 
-def test_every_default_prior_has_a_source_or_documentation() -> None:
-    assert all(row.source for row in unknowns.PROCESSES.values() if row.prior is not None)
-    for row in unknowns.DOCUMENTED_NUISANCES:
-        assert row.marginalised
-        assert row.scatter > 0
-
-
 @pytest.mark.parametrize("magnitude", [-2.0, -1.2, -1.0, 2.0])
 def test_changes_are_slopes_of_recorded_moments(magnitude: float) -> None:
     """Compare with a star whose light, or dark, is larger by 1e-5, where no, some and most pixels saturate."""
     quiet, *_ = star("K3V", magnitude, payload=instrument(part=True))
-    means, variances = changes_of(quiet)
+    means, variances = noise_scene.changes_of(quiet)
     step = 1e-5
     light = ("source_electrons", "sky_electrons", "neighbour_electrons")
     for row, names in ((0, light), (1, light[1:2]), (2, ("dark_dn",))):

@@ -60,9 +60,7 @@ def test_error_of_change_is_the_scatter_of_fits(quiet: Expectation) -> None:
     assert row.error == pytest.approx(fitted[:, 0].std(), rel=4 / np.sqrt(2 * n), abs=0)
     assert row.error_known == pytest.approx(1 / np.linalg.norm(delta / sd), rel=1e-6)
     assert row.error > 1.2 * row.error_known
-
-
-def test_changes_and_indices_that_an_unknown_imitates_are_hidden() -> None:
+    # Changes and indices that an unknown imitates are hidden.
     whole, part = asked("change.of=['150-760', '200-320']", "nuisances.light='free'", "sky={none=true}").table
     assert whole["error"] > 1e3 * whole["error_known"]
     assert part["error"] < 10 * part["error_known"]
@@ -218,6 +216,7 @@ def test_mg_ii_of_au_mic_lies_in_the_published_range() -> None:
     assert error.max() < 5e-13
 
 
+@pytest.mark.long
 def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
     rng = np.random.default_rng(299)
     star, blue, shape, loss = np.linspace(100.0, 900.0, 40), np.linspace(300.0, 50.0, 40), np.zeros(300), np.ones(300)

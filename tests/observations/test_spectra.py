@@ -109,6 +109,7 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
         assert low < same.quantity(name)[0] < high, name
 
 
+@pytest.mark.long
 def test_noise_per_pixel_lies_within_its_range_and_sums_have_covariance_one_however_errors_are_stated() -> None:
     """95 % of pixels are within their ranges; the binomial bound fails by chance once in ten thousand times.
 
@@ -132,7 +133,7 @@ def test_noise_per_pixel_lies_within_its_range_and_sums_have_covariance_one_howe
     assert noise.used[20] / noise.stated[20] == pytest.approx(1.5, rel=0.1)
 
 
-def test_jitter_of_the_dark_current_is_measured_and_marginalised_over() -> None:
+def test_jitter_of_the_dark_current_and_drifts_are_measured_and_marginalised_over() -> None:
     """Next to changes of the light, which are ten times as large and not taken for it."""
     rng, unknown = np.random.default_rng(302), model().unknowns(light())
     added = sum(np.outer(sd * rng.standard_normal(N), unknown[of]) for of, sd in (("dark", 0.2), ("light", 0.3)))
@@ -142,6 +143,12 @@ def test_jitter_of_the_dark_current_is_measured_and_marginalised_over() -> None:
     assert series.jitters["dark"] == pytest.approx(0.2, rel=0.25)
     # What is marginalised over moves the sums no more than their unit variance says.
     assert survey.sums.std(axis=0).max() < 1.15
+    # Drifts next to a short event, of which one part of eight lacks its frames, have the same standard errors.
+    _, survey, series = prepared(drawn(np.random.default_rng(320)))
+    short = np.isin(survey.stare.numbers, range(200, 210))
+    without, with_event = (spectra.drifts(survey, series, taken, N // 8) for taken in (short & False, short))
+    for name in ("light", "dark"):
+        assert with_event[name] == pytest.approx(without[name], rel=0.3)
 
 
 @pytest.mark.parametrize("loss", [0.0005, 0.1])
@@ -302,15 +309,6 @@ def test_intervals_of_temperature_and_energy_cover() -> None:
     assert all(((low <= count) & (count <= high)).all() for count in inside.values()), inside
     most = stats.chi2.ppf(0.999, number)
     assert all(np.sum(np.square(values)) < most for values in pulls.values()), pulls
-
-
-def test_drifts_are_measured_next_to_a_short_event() -> None:
-    """One part of eight lacks its frames: the standard errors of the other means are the same."""
-    _, survey, series = prepared(drawn(np.random.default_rng(320)))
-    short = np.isin(survey.stare.numbers, range(200, 210))
-    without, with_event = (spectra.drifts(survey, series, taken, N // 8) for taken in (short & False, short))
-    for name in ("light", "dark"):
-        assert with_event[name] == pytest.approx(without[name], rel=0.3)
 
 
 @pytest.mark.long

@@ -13,13 +13,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from reference import stares, statistics
+from scenes import prepare
 
 from mauvecl import Nuisances
 from mauvecl.detection import counts, requests, snr
 from mauvecl.device import selftest
 from mauvecl.flares import stare_scene
 from mauvecl.noise import reference
-from mauvecl.noise.scene import prepare
 
 FILE = Path(selftest.__file__).parent / "known_answers.npz"
 
