@@ -109,6 +109,21 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
         assert low < same.quantity(name)[0] < high, name
 
 
+@pytest.mark.parametrize(
+    ("unit", "same", "factor"),
+    [("DN/sec", "adu / s", 1.0), ("ADU s^-1", "adu / s", 1.0), ("adu.s-1", "adu/s", 1.0), ("adu/min", "adu / s", 60.0),
+     ("erg/s/cm2/A", "erg / (s cm2 Angstrom)", 1.0), ("FLAM", "erg / (s cm2 Angstrom)", 1.0), ("JY", "Jy", 1.0)],
+)  # fmt: skip
+def test_units_of_spectra_may_have_any_usual_spelling(unit: str, same: str, factor: float) -> None:
+    frames = drawn(np.random.default_rng(4))
+    one, other = (frame_model(STUDY, replace(frames, unit=name)) for name in (same, unit))
+    np.testing.assert_allclose(other.per_dn, factor * one.per_dn, rtol=1e-12)
+
+
+def test_spectra_in_magnitudes_are_no_flux_densities() -> None:
+    assert "unit must be one of" in frame_model(STUDY, replace(drawn(np.random.default_rng(4)), unit="ABmag"))
+
+
 def test_noise_per_pixel_lies_within_its_range_and_sums_have_covariance_one_however_errors_are_stated() -> None:
     """95 % of pixels are within their ranges; the binomial bound fails by chance once in ten thousand times.
 
