@@ -329,6 +329,9 @@ class EventSpectrum:
         if self.cause != "flare":
             gain = self.chi2["flare"] - self.chi2[self.cause]
             return f"its spectrum is that of a change of the {self.cause}: chi-squared is {gain:.3g} below a flare's"
+        if self.ambiguous and self.snr >= FLARE_SNR:
+            fault = "a change of the instrument alone fits its spectrum as well as a flare alone"
+            return f"{fault}; next to such changes a flare has an S/N of {self.snr:.3g}"
         if self.ambiguous:
             return "its spectrum does not distinguish it from a change of the instrument"
         return "no flare of one temperature fits its spectrum" if self.p_together < NO_FIT else ""
