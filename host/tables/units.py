@@ -87,6 +87,22 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     return _linear_unit(name, text, expected)
 
 
+def counts_in(text: str) -> tuple[float, bool] | None:
+    """Return the number that is one DN, or one DN/s, in a unit of counts, and whether it is a rate.
+
+    The unit is of adu or DN, in any usual spelling, such as ``DN/sec`` or ``adu.s-1``; None for another one.
+    """
+    import astropy.units as u
+
+    name, n_found = re.subn(r"\b(?:dn|adu)\b", "adu", text.translate(_TYPOGRAPHY), flags=re.IGNORECASE)
+    try:
+        unit = _linear_unit(in_brackets(name), text, "adu or DN") if n_found else u.one
+    except InputError:
+        return None
+    counts = next((counts for counts in (u.adu, u.adu / u.s) if counts.is_equivalent(unit)), None)
+    return None if counts is None else (float(counts.to(unit)), counts != u.adu)
+
+
 def _scale_and_name(name: str) -> tuple[float, str]:
     """Return the factor before or after the name of a unit, and the name."""
     if match := SCALE.match(name):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import spectrum_of
 from mauvecl.host.arrays import PER_MAD, Bool, Float
+from mauvecl.host.tables.units import counts_in, unit_of
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,12 +49,11 @@ class FrameModel:
         `flux_per_dn` is the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each of its pixels. Raises
         InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
-        # Counts with bias and dark current or without, and rates without, as of `stare`; "adu s-1" is "adu/s".
-        unit = frames.unit.lower().replace(" ", "").replace("s-1", "/s").replace("dn", "adu")
-        counts = ("adu", "adu/s")
+        # Counts with bias and dark current or without, and rates without, as of `stare`.
+        counts = counts_in(frames.unit)
         assert frames.wavelength_nm is not None
-        flux = None if unit in counts else _per_flam(frames.unit, frames.wavelength_nm)
-        if unit not in counts and flux is None:
+        flux = None if counts is not None else _per_flam(frames.unit, frames.wavelength_nm)
+        if counts is None and flux is None:
             raise InputError.of("unit", frames.unit, "one of adu, DN, adu / s, DN / s, or a flux density")
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
@@ -77,8 +77,10 @@ class FrameModel:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
             return cls(quiet, flare, bins, flux / (bins @ per_flux), False)
-        per_dn = np.ones(len(bins))
-        if unit != "adu":
+        assert counts is not None
+        per_count, is_rate = counts
+        per_dn = np.full(len(bins), per_count)
+        if is_rate:
             return cls(quiet, flare, bins, per_dn / exposure, False)
         raw = cls(quiet, flare, bins, per_dn, True)
         # Where a pixel has far less light than bias and dark current, these were subtracted.
@@ -143,13 +145,16 @@ class FrameModel:
         )
 
 
-def _per_flam(unit: str, wavelength_nm: Float) -> Float | None:
+def _per_flam(text: str, wavelength_nm: Float) -> Float | None:
     """Return a flux density of 1 erg s-1 cm-2 nm-1 in a unit, shape (n_value,); None if it is not one."""
     import astropy.units as u
 
     flux = np.ones(wavelength_nm.size) * u.Unit("erg / (s cm2 nm)")
     try:
-        return np.asarray(flux.to_value(u.Unit(unit), u.spectral_density(wavelength_nm * u.nm)))
+        unit = unit_of(text)
+        # Magnitudes are not linear.
+        is_linear = isinstance(unit, u.UnitBase)
+        return np.asarray(flux.to_value(unit, u.spectral_density(wavelength_nm * u.nm))) if is_linear else None
     except (ValueError, TypeError):
         return None
 

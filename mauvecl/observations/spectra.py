@@ -313,6 +313,7 @@ class EventSpectrum:
     chi2: dict[Kind, float]  # of single causes, with the best amplitude, and of flares of the best temperature
     dof: int
     p_value: float  # probability of a chi-squared at least as large as the smallest, if its cause is right
+    p_together: float  # the same of flares whose amplitude is fitted together with those changes
 
     @property
     def ambiguous(self) -> bool:
@@ -328,9 +329,12 @@ class EventSpectrum:
         if self.cause != "flare":
             gain = self.chi2["flare"] - self.chi2[self.cause]
             return f"its spectrum is that of a change of the {self.cause}: chi-squared is {gain:.3g} below a flare's"
+        if self.ambiguous and self.snr >= FLARE_SNR:
+            fault = "a change of the instrument alone fits its spectrum as well as a flare alone"
+            return f"{fault}; next to such changes a flare has an S/N of {self.snr:.3g}"
         if self.ambiguous:
             return "its spectrum does not distinguish it from a change of the instrument"
-        return "no flare of one temperature fits its spectrum" if self.p_value < NO_FIT else ""
+        return "no flare of one temperature fits its spectrum" if self.p_together < NO_FIT else ""
 
 
 def event_spectrum(
@@ -362,6 +366,8 @@ def event_spectrum(
     optimal = flares / variance - (flares @ rows.T) @ rows
     values = (optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))
     snr = float(values.max())
+    left = float((spectrum**2 / variance).sum() - ((rows @ spectrum) ** 2).sum() - max(snr, 0.0) ** 2)
+    p_together = float(scipy.stats.chi2.sf(left, spectrum.size - 1 - len(unknown)))
     cause: Kind = min(chi2, key=lambda name: chi2[name])
     dof = spectrum.size - 1
     least = chi2[cause]
@@ -372,7 +378,7 @@ def event_spectrum(
         cause = "cosmic ray"
     elif cause != "flare" and (chi2["flare"] - least < CLEARLY or snr >= FLARE_SNR):
         cause = "flare"
-    return EventSpectrum(cause, snr, chi2, dof, p_value)
+    return EventSpectrum(cause, snr, chi2, dof, p_value, p_together)
 
 
 def _window(survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> tuple[NDArray[np.intp], Bool]:

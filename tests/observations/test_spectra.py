@@ -109,6 +109,21 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
         assert low < same.quantity(name)[0] < high, name
 
 
+@pytest.mark.parametrize(
+    ("unit", "same", "factor"),
+    [("DN/sec", "adu / s", 1.0), ("ADU s^-1", "adu / s", 1.0), ("adu.s-1", "adu/s", 1.0), ("adu/min", "adu / s", 60.0),
+     ("erg/s/cm2/A", "erg / (s cm2 Angstrom)", 1.0), ("FLAM", "erg / (s cm2 Angstrom)", 1.0), ("JY", "Jy", 1.0)],
+)  # fmt: skip
+def test_units_of_spectra_may_have_any_usual_spelling(unit: str, same: str, factor: float) -> None:
+    frames = drawn(np.random.default_rng(4))
+    one, other = (frame_model(STUDY, replace(frames, unit=name)) for name in (same, unit))
+    np.testing.assert_allclose(other.per_dn, factor * one.per_dn, rtol=1e-12)
+
+
+def test_spectra_in_magnitudes_are_no_flux_densities() -> None:
+    assert "unit must be one of" in frame_model(STUDY, replace(drawn(np.random.default_rng(4)), unit="ABmag"))
+
+
 @pytest.mark.long
 def test_noise_per_pixel_lies_within_its_range_and_sums_have_covariance_one_however_errors_are_stated() -> None:
     """95 % of pixels are within their ranges; the binomial bound fails by chance once in ten thousand times.
@@ -309,6 +324,15 @@ def test_intervals_of_temperature_and_energy_cover() -> None:
     assert all(((low <= count) & (count <= high)).all() for count in inside.values()), inside
     most = stats.chi2.ppf(0.999, number)
     assert all(np.sum(np.square(values)) < most for values in pulls.values()), pulls
+
+
+@pytest.mark.parametrize(("degrees", "reason"), [(0.1, ""), (0.3, "a change of the instrument alone fits")])
+def test_flare_of_one_temperature_fits_while_the_dark_current_drifts(degrees: float, reason: str) -> None:
+    drift = np.outer(degrees * ((TIME - 900.0) / 900.0) ** 2, model().unknowns(light())["dark"])
+    _, survey, series = prepared(drawn(np.random.default_rng(331), flare(1800.0, 60.0, 2.0) + drift))
+    found, taken = events.detect_events(survey, 5.0)
+    one = max(found, key=lambda each: each.value)
+    assert spectra.event_spectrum(survey, series, taken, one).reason[: len(reason) or None] == reason
 
 
 @pytest.mark.long
