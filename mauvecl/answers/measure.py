@@ -612,7 +612,7 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
 def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
     """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
     from mauvecl.fits.time_course import cooling_course, cooling_event, fit_cooling
-    from mauvecl.flares.settings import Cooling
+    from mauvecl.flares import Cooling
 
     staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
     quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +16,12 @@ from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible_targets
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.device.stares import Stares
+from mauvecl.flares import Curve
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
-from mauvecl.flares.settings import Curve
 from mauvecl.host.arrays import Arrays, Float
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE, Particles, Thermal
 from mauvecl.host.stars.library import nearest_spectrum
@@ -38,10 +40,6 @@ from mauvecl.study.plan import RATES, PlanTarget
 from mauvecl.study.star import Star
 from mauvecl.study.stare import InjectionQuestion
 from mauvecl.study.study import Study
-
-if TYPE_CHECKING:
-    from mauvecl.detection.nuisances import Nuisances
-    from mauvecl.host.exposure.expectation import Expectation
 
 
 def two_digits(value: float) -> str:

@@ -25,13 +25,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.fits.flare_model import Ratio, derived_values
+from mauvecl.fits.flare_model import FlareModel, MeanSums, Ratio, ReducedSums, derived_values
 from mauvecl.host.arrays import Float
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
-
-    from mauvecl.fits.flare_model import FlareModel, MeanSums, ReducedSums
 
 
 #: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.

@@ -7,7 +7,7 @@ higher one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
@@ -43,8 +43,6 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Probability, Temperature, Wavelength
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from astropy.table import Table
 
     from mauvecl.host.exposure.expectation import Expectation

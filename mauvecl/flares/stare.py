@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.flares import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.energies import EnergyScale, amplitude_of
-from mauvecl.flares.settings import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.orbit import Limits

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast, 
 
 from pydantic import create_model
 
-from mauvecl.noise.disturbances import ADDITIVE, Normal, ParticleRate, PriorField, Uniform
+from mauvecl.noise.disturbances import ADDITIVE, AdditiveProcess, Normal, ParticleRate, Prior, PriorField, Uniform
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DetectorTemperature, Range, range_of
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from mauvecl.host.arrays import Float
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.noise.disturbances import AdditiveProcess, Prior
 
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]

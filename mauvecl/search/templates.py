@@ -16,7 +16,7 @@ import numpy as np
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import spanning_weights
-from mauvecl.flares.settings import RANK, WINDOW_S
+from mauvecl.flares import RANK, WINDOW_S
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.noise.unknowns import CHANGED_PART
 from mauvecl.schema.errors import InputError
