@@ -106,10 +106,7 @@ IDEAL = Column("ideal", "", "", "detection probability if everything but the noi
 
 
 def ideal_chances(case: Case, flares: Sequence[Expectation], statistics: Sequence[Statistic]) -> Float | None:
-    """Return the closed-form chances of flares if everything but the noise is known, or None if it is.
-
-    Their shape is (n_flare, n_statistic), and they are NaN where the star or the flare saturates every pixel.
-    """
+    """Return closed-form chances, (n_flare, n_statistic), with everything but the noise known; None if it is known."""
     if case.study.nuisances.none:
         return None
     setting, fap = case.with_sections(nuisances=KNOWN).setting(case.quiet, *flares), case.study.run.fap

@@ -362,10 +362,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
 
 
 def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any]:
-    """Return the threshold and the false alarms of a search, in drawn stares and by importance sampling.
-
-    The keys are the fields of `StarCompleteness`.
-    """
+    """Return threshold and false alarms, drawn and by importance sampling, by the fields of `StarCompleteness`."""
     choice, seed, days = case.study.search, case.study.run.seed, survey.stare.observed_s / DAY_S
     maxima = np.zeros(0)
     if choice.nulls:

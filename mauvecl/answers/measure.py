@@ -131,10 +131,7 @@ class ExpectedMeasurement(StarInCell):
         return f"{self.title}, flare {100 * self.amplitude:g} %, {self.model}"
 
     def forecasts(self, factors: Float, unknown: Nuisances | None) -> list[Forecast]:
-        """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known.
-
-        Errors of a flare that leaves too few pixels below saturation are undefined.
-        """
+        """Return the expected errors for the flare times factors; NaN if too few pixels stay below saturation."""
         kelvin, ahead = np.exp(self.perfect.log_k[0]), []
         for linear in factors[:, None] * self.perfect.amplitudes[0]:
             try:
@@ -245,10 +242,7 @@ def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | Non
 def matched_filter(
     quiet: Expectation, flare: Expectation, unknown: Nuisances | None, added_dn: Float | None, skipped_nm: Ranges
 ) -> tuple[Float, float]:
-    """Return the weights of a matched filter of variance one, and its mean with the flare.
-
-    The variance is that of the quiescent star, or of one with some light added.
-    """
+    """Return the weights of a matched filter of variance one, for the star with `added_dn`, and its mean."""
     variance, used = usable_variance(quiet, added_dn, skipped_nm)
     delta = (flare.recorded_dn - quiet.recorded_dn) * used
     weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
@@ -260,10 +254,7 @@ def matched_filter(
 
 
 def _quantiles(estimates: Float, shares: float | list[float]) -> Float:
-    """Return quantiles of estimates, (n, n_derived), along their first axis; NaN where no fit has the quantity.
-
-    A fit in which one blackbody is best has no second temperature, and is left out.
-    """
+    """Return quantiles of estimates, (n, n_derived), of the fits that have a quantity; NaN if none has it."""
     quantiles = np.full((*np.shape(shares), estimates.shape[1]), np.nan)
     has = np.isfinite(estimates).any(axis=0)
     quantiles[..., has] = np.nanquantile(estimates[:, has], shares, axis=0)

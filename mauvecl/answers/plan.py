@@ -80,10 +80,7 @@ class TargetObservation:
 
     @cached_property
     def signal_per_frame(self) -> float:
-        """S/N of a frame with a flare of amplitude 1; 0 if every pixel saturates.
-
-        What is unknown in each frame is marginalised over; slower changes are left to the level of the search.
-        """
+        """S/N of a frame with a flare of amplitude 1, with the unknowns of each frame; 0 if every pixel saturates."""
         return self.signal_with(frame_nuisances(self.quiet, self.case.stare))
 
     def signal_with(self, unknown: Nuisances | None) -> float:
@@ -163,10 +160,7 @@ def closed_form(observation: TargetObservation, *, ideal: bool = False) -> Compl
 
 
 def errors_of_throughput(observation: TargetObservation, rates: Rates | None) -> tuple[float, float] | None:
-    """Return the relative errors of E50 and of the recovered flares by a calibrated throughput, to first order.
-
-    They are those of the closed form; None if the throughput is not calibrated, or nothing is recovered.
-    """
+    """Return the closed form's relative errors of E50 and yield by a calibrated throughput; None without one."""
     calibrated = throughput_cases(observation.case)
     if not calibrated or not observation.signal_per_frame > 0 or not observation.window_s > 0:
         return None
@@ -260,10 +254,7 @@ WIDTHS, WIDTH_RANGE_S, POSITIONS = 10, (5.0, 3000.0), 20
 
 
 def inject_target(observation: TargetObservation, engine: Stares | Pool | None = None) -> Completeness:
-    """Compute the share of injected flares that the study's search finds, by bolometric energy.
-
-    Each orbit of the stare has one window of the target's median length. The checkpoint of a pool keeps the result.
-    """
+    """Compute the recovered share of flares by energy in stares with one window of median length in each orbit."""
     study = observation.case.study
     orbit_s = study.orbit.orbit().elements.period_s
     gap = max(orbit_s - observation.window_s, 0.0)

@@ -487,11 +487,7 @@ def _found_flare(case: Case, alarm: Alarm) -> FoundFlare:
 
 
 def log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
-    """Return the logarithm of the energy per second of equivalent duration as a function of log temperature.
-
-    It is a spline through the energies at temperatures, K; None if the star's size is unknown, or a template's
-    temperature gives no energy.
-    """
+    """Return log energy per second of equivalent duration over log temperature; None if some energy is unknown."""
     unit = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
     events = [replace(unit, temperature=k) for k in kelvin]
     energies = np.array([_found_energy(case, event) for event in events])
@@ -505,10 +501,7 @@ def log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
 
 
 def _found_energy(case: Case, event: Event) -> float:
-    """Return the bolometric energy of a detected flare, erg; NaN if the star's size is unknown.
-
-    Also NaN if flares replace photosphere and the fitted temperature is not above the photosphere's.
-    """
+    """Return the bolometric energy of a flare, erg; NaN if the star's size is unknown, or its photosphere is hotter."""
     flare = case.study.flare
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:

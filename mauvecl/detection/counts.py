@@ -340,10 +340,7 @@ class Distribution:
         return int(counts[at:].sum()), int(counts[at - 1]) if at else 0
 
     def quantile_interval(self, probability: float) -> Interval:
-        """Return a quantile, interpolated linearly within a bin, with the 95 % interval of order statistics.
-
-        The interval is rounded outwards to edges of bins.
-        """
+        """Return a quantile, linear within its bin, with a 95 % interval of order statistics, rounded to edges."""
         check_probability("probability", probability)
         lower, upper, counts = self.bins
         edges = np.column_stack([lower, upper]).ravel()

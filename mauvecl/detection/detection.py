@@ -449,10 +449,7 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
 
 
 def departure_table(detection: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
-    """Return the departures of a detection as a table, without rows if too few realisations lie beyond thresholds.
-
-    `amplitudes` are those of the detection's flares.
-    """
+    """Return the departures for flares of some amplitudes; no rows if too few realisations are in the tail."""
     rows = []
     for row in departures(detection, fap) if countable(fap, detection.realisations) else ():
         shaped = detection.statistic(row.statistic).shaped

@@ -253,10 +253,7 @@ def _rows(
 
 
 def plan_channels(hypotheses: Hypotheses, batch: range) -> ChannelPlan:
-    """Plan the channels of a batch of flares; scenario 0 is always the quiescent one.
-
-    The first batch also counts the null distributions that all batches share.
-    """
+    """Plan a batch of flares after the quiescent star, scenario 0; the first batch has the nulls of all."""
     statistics = [hypotheses.statistic(name) for name in hypotheses.statistics]
     weighted, smoothed, (linear_end, pixels_end, scale_end) = _rows(hypotheses, statistics, batch)
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)

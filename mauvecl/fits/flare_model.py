@@ -260,11 +260,7 @@ class FlareModel:
 
 
 def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float) -> Float:
-    """Return the reported quantities of flares, shape (n, n_derived).
-
-    Temperatures have the shape (n,), amplitudes of the recorded light (n, n_linear), and factors by which it was
-    dimmed (n,).
-    """
+    """Return the quantities, (n, n_derived), of recorded amplitudes (n, n_linear) dimmed by factors (n,)."""
     values = np.empty((log_k.size, len(model.derived)))
     is_sum, spline = model.sums
     values[:, is_sum] = undimmed(np.einsum("nql,nl->nq", spline(log_k), linear), factor)

@@ -40,10 +40,7 @@ def least_squares(
 
     @lru_cache(maxsize=2)
     def triangle(content: bytes) -> Float:
-        """Return the triangular factor of derivatives and residuals as columns.
-
-        Its columns have the same scalar products, on which alone the fit depends. It has few rows.
-        """
+        """Return a triangle of few rows with the scalar products of derivatives and residuals, which suffice."""
         angles = np.frombuffer(content)
         residuals, jacobian = linearised(middle + half * np.sin(angles))
         return np.asarray(np.linalg.qr(np.column_stack([jacobian * half * np.cos(angles), residuals]), mode="r"))
@@ -65,19 +62,7 @@ def interval_end(
     The end is the lower one if `rise` is negative. The second value is 1, or the share of the rise (below 1) that
     chi-squared has reached where the search stops without an end within the limits of the parameters. Each step goes
     to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals, within the limits.
-
-    Parameters
-    ----------
-    linearised
-        Residuals and their derivatives.
-    quantity
-        Function of the parameters that returns the quantity and its derivatives, (n_parameter,).
-    theta, chi2
-        Best fit.
-    limits
-        Smallest and largest parameters.
-    free
-        Numbers of the parameters that change, all by default.
+    `quantity` also returns its derivatives, and only the `free` parameters change, all by default.
     """
     (low, high), there, unit = limits, theta.copy(), np.sqrt(abs(rise))
     fitted = np.arange(theta.size) if free is None else free

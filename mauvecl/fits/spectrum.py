@@ -288,10 +288,7 @@ class _Problem:
         return np.concatenate([reduction.quiescent_chi2(excess) for excess in self._excess(rows)])
 
     def pilot(self) -> tuple[Float, Float, NDArray[np.bool_]]:
-        """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
-
-        Pixels that are near saturation in a frame are not used.
-        """
+        """Fit all frames with the star's variance, without pixels near saturation, and return which have some."""
         raw, quiet, n = self.raw, self.quiet, len(self.raw)
         log_k, linear = np.empty(n), np.empty((n, len(self.model.linear)))
         usual = self.reduction(None)
@@ -477,10 +474,7 @@ def forecast_model(
     nuisances: Nuisances | None = None,
     skipped_nm: Ranges = (),
 ) -> Forecast:
-    """Forecast the errors of a model of one temperature, or of two, which are undefined without light of both.
-
-    Parameters are those of `forecast`.
-    """
+    """Forecast as `forecast`, also for two temperatures, whose errors are undefined without light of both."""
     factor = nuisances.mean_factor if nuisances else 1.0
     # The flare as it is recorded.
     linear = factor * np.asarray(amplitudes, np.float64)[None]
@@ -561,10 +555,7 @@ class TwoTemperatures:
         )  # fmt: skip
 
     def slopes(self, log_k: float, reduction: ReducedSums, lower: Float, linear: Float) -> Slopes:
-        """Return derivatives with respect to a second log temperature of flares with lower ones, (n,), and amplitudes.
-
-        The reduction is that of the model of one blackbody.
-        """
+        """Return derivatives by a second log temperature, for a reduction of one blackbody and lower ones, (n,)."""
         model, amplitude = self.at(log_k), linear[:, 1]
         quantities = np.zeros((amplitude.size, len(model.derived)))
         quantities[:, model.sums[0]] = amplitude[:, None] * self.single.sums[1](log_k, 1)[:, 0]
@@ -628,12 +619,8 @@ def fit_two_temperatures(
             flare = two.at(log_k)
             measurements.append(problem.measurement(flare, reduction, profile, best, quiescent[alike], ends, second))
             order.append(rows[alike])
-    return _without_absent_blackbody(Measurement.joined(measurements, order), single)
-
-
-def _without_absent_blackbody(measured: Measurement, single: Measurement) -> Measurement:
-    """Return a measurement of two blackbodies with the estimates of one where the light of the other is zero."""
-    n = len(single.estimates)
+    measured, n = Measurement.joined(measurements, order), len(recorded)
+    # Without light of the other blackbody, the estimates are those of one.
     of_one = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
     absent = (measured.amplitudes[:, :2] <= 0.0).any(axis=1, keepdims=True)
     return replace(measured, estimates=np.where(absent, of_one, measured.estimates))

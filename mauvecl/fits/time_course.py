@@ -321,10 +321,7 @@ class _Data:
         return rise, np.clip(log_k, coolest, hottest), of_rise, of_log_k
 
     def whitening(self, theta: Float | None, *, none: bool = False) -> Whiten:
-        """Return the whitening of residuals for the covariances of a flare, or of frames without one.
-
-        The best unknown levels are subtracted; with `none`, those of frames without a flare.
-        """
+        """Return the whitening of residuals less the best levels, of no flare if `none`, for a flare or without one."""
         covariance, flare = self.quiet_covariance, None
         if theta is not None:
             flare = self.flare(theta)[:2]

@@ -311,10 +311,7 @@ class Checkpoint:
 
 
 def checkpointed(checkpoint: Checkpoint | None, question: object, compute: Callable[[], Arrays]) -> Arrays:
-    """Return the arrays of a computation, from the checkpoint if an earlier run has finished it.
-
-    The question is everything on which the result depends, as for `fingerprint`.
-    """
+    """Return arrays from the checkpoint or a computation; `question` is all that they depend on, see `fingerprint`."""
     if checkpoint is None:
         return compute()
     name = f"{fingerprint(question)}-0-0-1"

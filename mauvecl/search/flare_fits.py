@@ -258,10 +258,7 @@ class Block:
         return np.asarray(inverse.reshape(theta.shape * 2))
 
     def interval(self, best: BlendFit, j: int, quantity: ProfiledQuantity, rise: float) -> tuple[float, float, bool]:
-        """Return the interval of a flare's quantity from the profile likelihood, and whether the fit ends it.
-
-        Chi-squared rises by `rise` at its ends.
-        """
+        """Return a quantity's interval, for a rise of chi-squared, and whether the fit ends before it does."""
 
         def value_and_slope(x: Float) -> tuple[float, Float]:
             gradient = np.zeros(best.theta.shape)

@@ -273,10 +273,7 @@ class Trend:
         return np.asarray(REACH * np.vstack([rows, -rows]))
 
     def factors(self, amplitudes: Float) -> Float:
-        """Return the factors on the components in `STEADY`, shape (4, n_stare, n_frame).
-
-        Amplitudes of unknowns are in standard deviations, (n_stare, n_unknown).
-        """
+        """Return the factors on `STEADY`, (4, n_stare, n_frame), for amplitudes in standard deviations."""
         of, names = np.array(self.of), ("star", "sky", "light", "temperature")
         star, sky, light, warmer = (amplitudes[:, of == name] @ self.curves[of == name] for name in names)
         light = 1 + light
