@@ -544,11 +544,7 @@ class LimitAnswer(Answer):
 
 
 def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None]) -> Limit:
-    """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
-
-    Averages over draws of unknown instrument values if the study has some. Calls `report` with the number of
-    simulations after each of them.
-    """
+    """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed."""
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     draws = forms.drawn(study) if study.unknowns.draws else None

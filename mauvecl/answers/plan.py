@@ -193,10 +193,7 @@ def rates_of(observation: TargetObservation) -> tuple[Rates | None, str]:
 
 
 def star_of(row: PlanTarget, target: Target) -> Star:
-    """Return the library star that represents a target of a plan, which has been looked up.
-
-    Raises InputError if its type, magnitude or distance is neither given nor known.
-    """
+    """Return the library star for a target; raises InputError if its type, magnitude or distance is not known."""
     properties: dict[str, Any] = {name: getattr(target, name) for name in ("spectral_type", "magnitude", "distance_pc")}
     missing = [name for name, value in properties.items() if value is None]
     if missing:

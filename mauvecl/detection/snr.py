@@ -50,10 +50,7 @@ CLIPPED_COLUMNS = tuple(
 
 
 def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
-    """Return the `layout.OBSERVER` structures: subtracted bias and dark, and noise model, shape (n_padded,).
-
-    The sky is subtracted per resolution element.
-    """
+    """Return the `layout.OBSERVER` structures, (n_padded,), without the sky, which is subtracted per element."""
     table = np.zeros(len(scene.pixels), layout.OBSERVER)
     table["variance"] = 1.0  # padding: 0 / 1
     real = table[: scene.n_pixel]
@@ -67,10 +64,7 @@ def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
 
 
 def elements(x: Expectation) -> NDArray[np.void]:
-    """Return the `layout.ELEMENT` structures of the resolution elements, shape (n_element,).
-
-    Bins are centred on the closed-form S/N and scaled to its linearised spread.
-    """
+    """Return the `layout.ELEMENT` structures, (n_element,), with bins by the closed form's centre and spread."""
     first = np.searchsorted(x.element, np.arange(x.element_wavelength_nm.size))
     table = np.zeros(first.size, layout.ELEMENT)
     table["first"], table["end"] = first, np.append(first[1:], x.element.size)

@@ -582,10 +582,7 @@ def spanning_weights(
 def variance_of(
     quiet: Expectation, added_dn: Float | None = None, highest_dn: Float | None = None
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the variance of an exposure with a flare, DN^2, zero in saturated pixels, and which pixels are used.
-
-    Pixels saturate with the light `highest_dn` of a flare, by default the mean `added_dn`.
-    """
+    """Return the variance with a flare, DN^2, zero in pixels saturated by `highest_dn`, and which pixels are used."""
     added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
     highest = added if highest_dn is None else highest_dn
     light, most = (np.maximum(quiet.light_dn + flare, 0.0) for flare in (added, highest))

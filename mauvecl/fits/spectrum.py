@@ -394,11 +394,9 @@ class _Problem:
 
 
 def clipped_pixels(raw: NDArray[Any], quiet: Expectation) -> NDArray[np.bool_]:
-    """Return which pixels are near saturation in any of some exposures, and their neighbours, shape (n_pixel,).
-
-    Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
-    """
+    """Return which pixels are near saturation in any of some exposures, and their neighbours, shape (n_pixel,)."""
     clipped = (raw > _highest_usable(quiet)).any(axis=0)
+    # With neighbours, the noise of single pixels does not select the pixels of a fit.
     return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
 
 

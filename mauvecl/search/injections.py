@@ -54,11 +54,7 @@ ACCURACY_COLUMNS = (
 
 
 def fit_accuracy(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, Float]:
-    """Summarise the fits of all positions, arrays by `FIT_QUANTITIES` of shape (n_stare, n_half_width, n_size).
-
-    Values of each cell, by the names of `ACCURACY_COLUMNS`, have the shape (n_half_width, n_size); NaN without
-    detections.
-    """
+    """Summarise fits by `FIT_QUANTITIES`, (n_stare, n_half_width, n_size) at each position, as `ACCURACY_COLUMNS`."""
     ratios = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
     # NumPy warns of cells without detections.
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
