@@ -39,11 +39,7 @@ if TYPE_CHECKING:
 
 
 def blended_stars(cases: Sequence[Case]) -> list[tuple[str, float, float]]:
-    """Return the stars in the fibre of the observed star, itself first: name, separation in arcsec, and rise.
-
-    The rise is that of all stars' light by a flare of unit amplitude on this star, relative to their light. Raises
-    InputError for several cases.
-    """
+    """Return name, separation, arcsec, and relative rise of all light by a unit flare, of each star in the fibre."""
     if len(cases) != 1:
         raise InputError(
             "neighbours of observed frames need the one star that was observed, such as `star=G2V` with its magnitude, "
@@ -81,7 +77,7 @@ COLUMNS = (
 
 #: Name of the bolometric energy among measured quantities.
 ENERGY = "energy bolometric"
-#: Star that replaces one that is not named: far from saturation.
+#: Star that replaces one that is not named, far from saturation; fluxes of flares do not depend on it.
 ANY_STAR = Star(library="G2V", magnitude=12.0)
 
 
@@ -545,11 +541,7 @@ def analyse(
 
 
 def frame_model(study: Study, frames: Frames) -> FrameModel | str:
-    """Return the model of frames' pixels, or the reason why it is not known, which is empty for a light curve.
-
-    The star is known if the study names exactly one. Otherwise a faint one replaces it: the fluxes of flares do not
-    depend on it, and the light of the star is measured.
-    """
+    """Return the model of frames' pixels, or the reason why it is not known, which is empty for a light curve."""
     if frames.flux.ndim == 1:
         return ""
     (case, *_), named = cases(study, swept=False), len(study.star) == 1

@@ -208,10 +208,7 @@ class Launches:
         self._device.kernel(kernel_files, self.variant, name)(self._queue, items, local, *arguments)
 
     def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
-        """Draw the raw spectra of a tile into `out`, of uint16 or int32 and shape (tile.count, n_pixel).
-
-        Return the number of samples (pixels times frames) clipped at zero or saturation, shape (tile.count,).
-        """
+        """Draw raw spectra of a tile into `out`, (count, n_pixel); return each one's number of clipped samples."""
         clipped = np.empty(tile.count, np.uint32)
         counts, items = self._scratch("clipped", clipped.nbytes), (tile.size // self.variant.width,)
         with self._output("rows", out) as rows:
@@ -264,10 +261,7 @@ class Launches:
         return host
 
     def weigh(self, plan: ChannelPlan, bands: NDArray[np.float32], finished: NDArray[np.uint32]) -> None:
-        """Upload the weights and scales of all statistics, and which squares are subtracted from which rows.
-
-        `bands`, shape (n_chunk, n_slot, chunk), and `finished`, shape (n_chunk,), are those of `Smoothing.bands`.
-        """
+        """Upload weights, scales and subtracted rows of statistics; for bands and finished see `Smoothing.bands`."""
         scene, self._rows = self._scene, plan.n_rows
         # A final row of zeros serves scenarios without linear statistics.
         weights = np.concatenate([plan.weights, np.zeros((1, len(scene.pixels)), np.float32)])

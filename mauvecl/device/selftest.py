@@ -271,10 +271,7 @@ START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 
 
 def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
-    """Return a device's results of a case: raw counts, statistics, histograms and tallies.
-
-    Those of stares are the sums of every frame with flares by each method, and the noise factors of the flares.
-    """
+    """Return a device's results of a case: raw counts, statistics, histograms and tallies, or sums of stares."""
     if name in STARE_CASES:
         stares, (components, stare, flares) = Stares(engine.open_device), stare_case(name, count)
         keywords: dict[str, Any] = {"first": START, "count": count, "seed": SEED}

@@ -350,10 +350,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMet
 
 
 def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray[np.bool_]:
-    """Return the pixels whose frames come within `RAIL_SIGMA` of zero or saturation, shape (n_pixel,).
-
-    The limits include all values allowed by the priors and the largest charge of additive processes per frame.
-    """
+    """Return pixels whose frames may come within `RAIL_SIGMA` of zero or saturation by priors and added charge."""
     frame = Cumulants.of(x, 1)
     faint, bright = (frame.scaled(x, *at_end) for at_end in zip(*factors.ends.values(), strict=True))
     # Even the faint end scatters as the expectation does.

@@ -213,10 +213,7 @@ def alias_table(mean: float) -> AliasTable:
 
 
 def alias_table_of(probability: Float, low: int = 0) -> AliasTable:
-    """Compute the alias table of a distribution over the integers from `low` on.
-
-    `probability` has up to 2**24 values, which need not sum to one.
-    """
+    """Compute the alias table of up to 2**24 integers from `low` on, of probabilities of any sum."""
     bits = max(int(probability.size - 1).bit_length(), 1)
     padded = np.zeros(1 << bits)
     padded[: probability.size] = probability

@@ -258,10 +258,7 @@ class SampledRate:
         return float(scipy.special.log_ndtr(-threshold) + self._fit()(threshold)), error
 
     def threshold(self, rate: float) -> Interval:
-        """Return the threshold for a number of false alarms per star-day, with a 95 % interval.
-
-        Raises InputError if it is outside the sampled range, or if trends cause more alarms at all sampled thresholds.
-        """
+        """Return the threshold of a rate, with a 95 % interval; raises InputError for rates that are not sampled."""
         from scipy.optimize import brentq
 
         most = float(self.probability[-1])
@@ -290,10 +287,7 @@ class SampledRate:
 
 
 def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate:
-    """Estimate the false-alarm rate of a search in normal noise of the assumed variance.
-
-    The stare should not exceed a few days, since every draw evaluates all templates.
-    """
+    """Estimate the false-alarm rate in normal noise; each draw evaluates all templates, so stares should be short."""
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, NULL_KEY]))
     rows, n_sum = search.grid, search.bank.directions.shape[1]
     tried = [np.flatnonzero(row.per_amplitude > 0) for row in rows]

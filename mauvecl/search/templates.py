@@ -226,10 +226,7 @@ class Templates:
 
 
 def frame_nuisances(quiet: Expectation, stare: Stare, more: Mapping[str, float] | None = None) -> Nuisances | None:
-    """Return the nuisance parameters of each frame: the stare's jitters, and `more`.
-
-    Standard deviations by name in `more` replace jitters of the same kind; an infinite one is projected out.
-    """
+    """Return the nuisance parameters of each frame: jitters of the stare, replaced or added to by `more`."""
     jitters: dict[str, float] = {CHANGED_PART[of]: sd for of, sd in stare.jitters.items() if sd > 0}
     # Drifts and re-acquisitions change all light alike, by any amount and at any time.
     drifting = {} if stare.pointing is None else {"light": np.inf}
