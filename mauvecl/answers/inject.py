@@ -53,10 +53,13 @@ def survey_star(case: Case) -> Survey:
     # Templates are blackbodies if the study's flare has no temperature to vary.
     blackbody = flare.model_copy(update={"spectrum": FlareLight()})
     hot = frame if flare.spectrum.file is None else frame.with_sections(flare=blackbody)
-    quiet, electrons = frame.quiet, hot.flare_electrons(TEMPERATURES_K)
+    quiet, electrons, used = frame.quiet, hot.flare_electrons(TEMPERATURES_K), ~frame.quiet.saturated
     nuisances = frame_nuisances(quiet, stare, choice.spreads())
-    signal = electrons * quiet.gain_dn_per_electron
-    templates = Templates.of(quiet, signal, TEMPERATURES_K, nuisances=nuisances, rank=choice.sums)
+    if not used.any():
+        raise InputError.of("quiet", quiet.name, "a star that does not saturate every pixel")
+    variance, gain = np.where(used, quiet.variance_dn2, 0.0), quiet.gain_dn_per_electron
+    signal = electrons * gain * used
+    templates = Templates.of(variance, signal, gain, TEMPERATURES_K, nuisances=nuisances, rank=choice.sums)
     level = choice.level(stare, case.study.stare.orbit_s)
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
