@@ -74,7 +74,6 @@ COLUMNS = (
            number(".4g")),
 )  # fmt: skip
 
-
 #: Name of the bolometric energy among measured quantities.
 ENERGY = "energy bolometric"
 #: Star that replaces one that is not named, far from saturation; fluxes of flares do not depend on it.

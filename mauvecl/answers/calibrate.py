@@ -61,7 +61,6 @@ class FittedValue:
         return bool(np.isfinite(self.error))
 
 
-#: Columns of the table of values.
 COLUMNS = (
     Column("quantity", "name", "", "value of the instrument", "quantity", kind=str),
     Column("value", "value", "", "fitted, or nominal where it is not determined", "value",

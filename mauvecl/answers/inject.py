@@ -118,7 +118,6 @@ DIFFERS = 4.0
 #: Probability of the observed number of alarms below which it is reported as too large.
 LEAST_CHANCE = 1e-5
 
-
 SHARE = share_column("survey.components.quiet.target_share")
 SEARCH_COLUMNS = (
     SHARE,

@@ -399,8 +399,6 @@ FIT_COLUMNS = (
 )  # fmt: skip
 MODEL_COLUMN = Column("model", description="model that is fitted", heading="model", detail=True)
 
-
-#: Columns of joint fits of shape and spectrum.
 JOINT_COLUMNS = (
     Column("quantity", "joint.found.names", "", "what is measured", "quantity"),
     Column("unit", "joint.found.units", "", "of truth, estimate and intervals", "unit"),

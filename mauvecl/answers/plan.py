@@ -297,7 +297,6 @@ def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
     )  # fmt: skip
 
 
-#: Columns of the table of targets.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
     Column("seen", "seen_h", "h", "time in which the target is seen, times the duty cycle", "seen (h)", ".0f",
@@ -325,7 +324,6 @@ COLUMNS = (
     Column("best_months", lambda row: " ".join(row.best_months), "", "months with the most hours", "best months",
            months, detail=True),
 )  # fmt: skip
-#: Columns of the table of inputs.
 STAR_COLUMNS = (
     Column("target", "name", "", "name of the target"),
     Column("ra", "observation.target.ra_deg", "deg", "right ascension"),

@@ -47,7 +47,6 @@ UNDEFINED = Interval(np.nan, np.nan, np.nan)
 
 #: Rows of a curve's table.
 ROC_ROWS = 200
-#: Columns of a curve's table.
 ROC_COLUMNS = (
     Column("threshold", description="value at and above which a detection is claimed"),
     Column("fap", description="false-alarm probability per test, with a 95 % Clopper-Pearson interval"),
@@ -334,7 +333,6 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         }  # fmt: skip
 
 
-#: Columns of the table of detections.
 COLUMNS = (
     Column("name"),
     Column("statistic", description="detection statistic", heading="statistic"),
@@ -360,12 +358,10 @@ COLUMNS = (
            format=".4f", detail=True),
     Column("fap_error", description="relative standard error of the false-alarm probability at the threshold"),
 )  # fmt: skip
-#: Columns of the table of extremes.
 TAIL_COLUMNS = (
     Column("realisation", "realisations", description="number of the realisation, by which it can be drawn again"),
     Column("value", "values", description="of the statistic, as the device computed it"),
 )
-
 
 #: Differences above this many standard errors are significant.
 SIGNIFICANT = 4.0
@@ -457,7 +453,6 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
     return table_of(DEPARTURE_COLUMNS, rows, fap=fap)
 
 
-#: Columns of the table of departures.
 DEPARTURE_COLUMNS = (
     Column("statistic", description="detection statistic", heading="statistic", kind=str),
     Column("amplitude", description="flare amplitude: relative rise of the photons in the flare's band",

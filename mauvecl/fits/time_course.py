@@ -47,7 +47,6 @@ BINS_EVERY = 8
 #: Bins whose known conditions agree to this many digits are fitted together.
 DIGITS = 6
 
-
 #: Heading, format and heading of the error of quantities in printed tables.
 SHOWN = {
     "temperature": ("temperature (K)", ".0f", "error"),

@@ -49,7 +49,6 @@ def check_shape(name: str) -> str:
 #: Name of a flare shape in a study.
 ShapeName = Annotated[str, AfterValidator(check_shape)]
 
-
 #: Temperatures that differ by less are treated as equal, K.
 SAME_K = 0.5
 

@@ -447,7 +447,6 @@ def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, c
     return dark
 
 
-#: Columns of the table of components.
 COLUMNS = (
     Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element"),
     *(

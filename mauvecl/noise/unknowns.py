@@ -194,7 +194,6 @@ NUISANCES = _by_name(
 #: Nuisance parameters of the documented set.
 DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.sd is not None)
 
-
 if TYPE_CHECKING:
     NuisanceName = str
 else:
@@ -228,7 +227,6 @@ INSTRUMENT_VALUES = _by_name(
                     prior=Uniform(20.0, 25.0)),
     InstrumentValue(name="read_noise_dn", label="read noise (DN)", prior=Normal(12.0, 1.0, 9.0, 15.0)),
 )  # fmt: skip
-
 
 #: Largest number of modes of a calibration that are unknown: of the light in eight bands and seven other values.
 MAX_MODES = 15
@@ -322,7 +320,6 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
 
 
 NONE = Processes()
-
 
 #: Largest number of quiescent exposures in a stack.
 MAX_EXPOSURES = 1000

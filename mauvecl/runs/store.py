@@ -164,7 +164,6 @@ class StoredScene:
         return Chunk(self, name, start, min(start + self.chunk_rows, self.rows))
 
 
-#: Columns of the table of arrays.
 ARRAY_COLUMNS = (
     Column("array", heading="array"),
     Column("star", heading="star"),
@@ -172,7 +171,6 @@ ARRAY_COLUMNS = (
     Column("shape", heading="shape", format=lambda shape: " x ".join(map(str, shape))),
     Column("type", heading="type"),
 )
-
 
 DIGESTS = "digests.txt"
 CRC_BYTES = 4

@@ -37,7 +37,6 @@ from mauvecl.search.templates import Bank
 #: equivalent duration is within its standard error.
 FIT_QUANTITIES = ("energy", "amplitude", "half_width", "temperature", "peak", "covered")
 
-
 #: Columns of the accuracy of fits, for values by name.
 ACCURACY_COLUMNS = (
     Column("fitted", description="flares that were found and fitted"),
