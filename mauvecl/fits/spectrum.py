@@ -28,14 +28,7 @@ from mauvecl.fits.flare_model import (
     derived_values,
     undimmed,
 )
-from mauvecl.fits.profile import (
-    BestFit,
-    Profile,
-    Slopes,
-    covariance,
-    intervals,
-    with_bounds,
-)
+from mauvecl.fits.profile import BestFit, Profile, Slopes, covariance, intervals, with_bounds
 from mauvecl.host.arrays import Float
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, formatted, table_of
