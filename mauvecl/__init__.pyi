@@ -20,8 +20,8 @@ from mauvecl.answers.signal import simulate as simulate
 from mauvecl.answers.signal import snr as snr
 from mauvecl.answers.stare import stare as stare
 from mauvecl.answers.visible import visible as visible
-from mauvecl.detection.departures import departures as departures
 from mauvecl.detection.detection import Detection as Detection
+from mauvecl.detection.detection import departures as departures
 from mauvecl.detection.nuisances import Nuisances as Nuisances
 from mauvecl.detection.statistics import Linear as Linear
 from mauvecl.device.engine import Engine as Engine
@@ -32,9 +32,9 @@ from mauvecl.fits.spectrum import fit_two_temperatures as fit_two_temperatures
 from mauvecl.fits.spectrum import forecast as forecast
 from mauvecl.fits.time_course import fit_cooling as fit_cooling
 from mauvecl.fits.time_course import measure_along as measure_along
+from mauvecl.flares import Cooling as Cooling
+from mauvecl.flares import Sinusoid as Sinusoid
 from mauvecl.flares.energies import EnergyScale as EnergyScale
-from mauvecl.flares.settings import Cooling as Cooling
-from mauvecl.flares.settings import Sinusoid as Sinusoid
 from mauvecl.flares.shapes import SHAPES as SHAPES
 from mauvecl.flares.shapes import TableShape as TableShape
 from mauvecl.flares.stare import Event as Event

@@ -22,7 +22,7 @@ import numpy as np
 from astropy.table import Table
 from typer.testing import CliRunner
 
-from mauvecl.answers.files import write_table
+from mauvecl.answers.answer import write_table
 from mauvecl.cli.app import app
 from mauvecl.detection.requests import STATISTICS
 from mauvecl.runs.pool import LocalWorkers, Pool

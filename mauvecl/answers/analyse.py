@@ -78,10 +78,9 @@ COLUMNS = (
            number(".4g")),
 )  # fmt: skip
 
-
 #: Name of the bolometric energy among measured quantities.
 ENERGY = "energy bolometric"
-#: Star that replaces one that is not named: far from saturation.
+#: Star that replaces one that is not named, far from saturation; fluxes of flares do not depend on it.
 ANY_STAR = Star(library="G2V", magnitude=12.0)
 
 

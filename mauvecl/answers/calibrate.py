@@ -16,8 +16,7 @@ import numpy as np
 from astropy.table import QTable, Table
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, TableOf
-from mauvecl.answers.files import ecsv_text
+from mauvecl.answers.answer import Answer, TableOf, ecsv_text
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.host.exposure.expectation import Expectation, expect
 from mauvecl.host.instrument import shipped_names
@@ -62,7 +61,6 @@ class FittedValue:
         return bool(np.isfinite(self.error))
 
 
-#: Columns of the table of values.
 COLUMNS = (
     Column("quantity", "name", "", "value of the instrument", "quantity", kind=str),
     Column("value", "value", "", "fitted, or nominal where it is not determined", "value",

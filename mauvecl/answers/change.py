@@ -102,7 +102,6 @@ def _amount(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}" if unit else f"{formatted(100 * value, '.3g')} %"
 
 
-#: Columns of the table of changes.
 COLUMNS = (
     Column("change", "change.name", "", "what changes", "change", kind=str),
     Column("unit", "change.unit", "", "unit of the change and its errors; empty if relative", kind=str),

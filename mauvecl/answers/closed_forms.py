@@ -18,7 +18,7 @@ import numpy as np
 from mauvecl.detection import MIN_IN_TAIL
 from mauvecl.detection.distributions import CONFIDENCE_SD
 from mauvecl.detection.nuisances import join_names
-from mauvecl.detection.statistics import Matched, Setting
+from mauvecl.detection.statistics import Matched, Setting, Statistic
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, unknown_values_of
 from mauvecl.schema.columns import Column, FirstItems, chance_text, number
@@ -27,7 +27,6 @@ from mauvecl.study.cases import Case
 from mauvecl.study.observation import KNOWN, NuisanceChoice
 
 if TYPE_CHECKING:
-    from mauvecl.detection.statistics import Statistic
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.study import Study
 

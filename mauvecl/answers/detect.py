@@ -16,9 +16,8 @@ from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, name_o
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap, countable
 from mauvecl.detection.chi2 import Paper
-from mauvecl.detection.departures import DEPARTURE_COLUMNS, departure_table
-from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, ROC_COLUMNS, ROC_ROWS
-from mauvecl.detection.distributions import QuadraticForm
+from mauvecl.detection.detection import AREA_COLUMNS, COLUMNS, DEPARTURE_COLUMNS, ROC_COLUMNS, ROC_ROWS, departure_table
+from mauvecl.detection.distributions import Interval, QuadraticForm
 from mauvecl.detection.nuisances import read_at_pixels
 from mauvecl.detection.requests import matched_snr, shift_between
 from mauvecl.detection.statistics import Linear, Matched, Setting
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.detection.detection import Detection
-    from mauvecl.detection.distributions import Interval
     from mauvecl.host.exposure.expectation import Expectation
 
 #: Largest number of rows of the tables of ROC curves and extremes, divided among flares.

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 SURE, ERRORS_IN_INTERVAL = 4, 3.92
 #: Smallest ratio of false-alarm probabilities that is distinguished.
 SMALLEST_RATIO = 1e-3
-#: Columns of the table of resolution elements.
 ELEMENT_COLUMNS = (
     Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element"),
     Column("expected", description="S/N by the formula"),

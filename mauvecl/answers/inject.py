@@ -53,10 +53,13 @@ def survey_star(case: Case) -> Survey:
     # Templates are blackbodies if the study's flare has no temperature to vary.
     blackbody = flare.model_copy(update={"spectrum": FlareLight()})
     hot = frame if flare.spectrum.file is None else frame.with_sections(flare=blackbody)
-    quiet, electrons = frame.quiet, hot.flare_electrons(TEMPERATURES_K)
+    quiet, electrons, used = frame.quiet, hot.flare_electrons(TEMPERATURES_K), ~frame.quiet.saturated
     nuisances = frame_nuisances(quiet, stare, choice.spreads())
-    signal = electrons * quiet.gain_dn_per_electron
-    templates = Templates.of(quiet, signal, TEMPERATURES_K, nuisances=nuisances, rank=choice.sums)
+    if not used.any():
+        raise InputError.of("quiet", quiet.name, "a star that does not saturate every pixel")
+    variance, gain = np.where(used, quiet.variance_dn2, 0.0), quiet.gain_dn_per_electron
+    signal = electrons * gain * used
+    templates = Templates.of(variance, signal, gain, TEMPERATURES_K, nuisances=nuisances, rank=choice.sums)
     level = choice.level(stare, case.study.stare.orbit_s)
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
@@ -114,7 +117,6 @@ SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": 
 DIFFERS = 4.0
 #: Probability of the observed number of alarms below which it is reported as too large.
 LEAST_CHANCE = 1e-5
-
 
 SHARE = share_column("survey.components.quiet.target_share")
 SEARCH_COLUMNS = (
@@ -362,10 +364,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
 
 
 def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any]:
-    """Return the threshold and the false alarms of a search, in drawn stares and by importance sampling.
-
-    The keys are the fields of `StarCompleteness`.
-    """
+    """Return threshold and false alarms, drawn and by importance sampling, by the fields of `StarCompleteness`."""
     choice, seed, days = case.study.search, case.study.run.seed, survey.stare.observed_s / DAY_S
     maxima = np.zeros(0)
     if choice.nulls:

@@ -6,7 +6,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +16,13 @@ from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection import RECOMMENDED, check_fap
 from mauvecl.device.engine import Engine
 from mauvecl.host.arrays import Float
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.columns import Column, View, interval_columns, table_of
 from mauvecl.schema.errors import InputError, Message, of_kind
 from mauvecl.study.cases import (
     SATURATED,
+    Case,
     assumptions_of,
     cases,
     collect_messages,
@@ -31,10 +32,6 @@ from mauvecl.study.cases import (
 )
 from mauvecl.study.questions import QUANTITIES, Axis, LimitQuestion
 from mauvecl.study.study import Study
-
-if TYPE_CHECKING:
-    from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.cases import Case
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = tuple(name for name, quantity in QUANTITIES.items() if quantity.path[0] == "flare")

@@ -260,10 +260,7 @@ def matched_filter(
 
 
 def _quantiles(estimates: Float, shares: float | list[float]) -> Float:
-    """Return quantiles of estimates, (n, n_derived), along their first axis; NaN where no fit has the quantity.
-
-    A fit in which one blackbody is best has no second temperature, and is left out.
-    """
+    """Return quantiles of estimates, (n, n_derived), of the fits that have a quantity; NaN if none has it."""
     quantiles = np.full((*np.shape(shares), estimates.shape[1]), np.nan)
     has = np.isfinite(estimates).any(axis=0)
     quantiles[..., has] = np.nanquantile(estimates[:, has], shares, axis=0)
@@ -408,8 +405,6 @@ FIT_COLUMNS = (
 )  # fmt: skip
 MODEL_COLUMN = Column("model", description="model that is fitted", heading="model", detail=True)
 
-
-#: Columns of joint fits of shape and spectrum.
 JOINT_COLUMNS = (
     Column("quantity", "joint.found.names", "", "what is measured", "quantity"),
     Column("unit", "joint.found.units", "", "of truth, estimate and intervals", "unit"),
@@ -612,7 +607,7 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
 def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
     """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
     from mauvecl.fits.time_course import cooling_course, cooling_event, fit_cooling
-    from mauvecl.flares.settings import Cooling
+    from mauvecl.flares import Cooling
 
     staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
     quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +16,12 @@ from mauvecl.answers.closed_forms import throughput_cases
 from mauvecl.answers.inject import inject
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.answers.visible import VisibleAnswer, assumption_columns, visible_targets
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.device.stares import Stares
+from mauvecl.flares import Curve
 from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
-from mauvecl.flares.settings import Curve
 from mauvecl.host.arrays import Arrays, Float
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.host.orbit.orbit import Target
 from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE, Particles, Thermal
 from mauvecl.host.stars.library import nearest_spectrum
@@ -38,10 +40,6 @@ from mauvecl.study.plan import RATES, PlanTarget
 from mauvecl.study.star import Star
 from mauvecl.study.stare import InjectionQuestion
 from mauvecl.study.study import Study
-
-if TYPE_CHECKING:
-    from mauvecl.detection.nuisances import Nuisances
-    from mauvecl.host.exposure.expectation import Expectation
 
 
 def two_digits(value: float) -> str:
@@ -201,10 +199,7 @@ def rates_of(observation: TargetObservation) -> tuple[Rates | None, str]:
 
 
 def star_of(row: PlanTarget, target: Target) -> Star:
-    """Return the library star that represents a target of a plan, which has been looked up.
-
-    Raises InputError if its type, magnitude or distance is neither given nor known.
-    """
+    """Return the library star for a target; raises InputError if its type, magnitude or distance is not known."""
     properties: dict[str, Any] = {name: getattr(target, name) for name in ("spectral_type", "magnitude", "distance_pc")}
     missing = [name for name, value in properties.items() if value is None]
     if missing:
@@ -311,7 +306,6 @@ def _throughput_column(name: str, k: int, of: str, heading: str) -> Column:
     )  # fmt: skip
 
 
-#: Columns of the table of targets.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
     Column("seen", "seen_h", "h", "time in which the target is seen, times the duty cycle", "seen (h)", ".0f",
@@ -339,7 +333,6 @@ COLUMNS = (
     Column("best_months", lambda row: " ".join(row.best_months), "", "months with the most hours", "best months",
            months, detail=True),
 )  # fmt: skip
-#: Columns of the table of inputs.
 STAR_COLUMNS = (
     Column("target", "name", "", "name of the target"),
     Column("ra", "observation.target.ra_deg", "deg", "right ascension"),

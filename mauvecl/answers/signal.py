@@ -12,24 +12,21 @@ import numpy as np
 from mauvecl.answers.answer import Answer, StarInCell, TableOf, first_of_several, reported
 from mauvecl.answers.verbs import Progress, by_keywords
 from mauvecl.detection.distributions import smallest_integer
-from mauvecl.detection.snr import COLUMNS
+from mauvecl.detection.snr import COLUMNS, SnrResult
 from mauvecl.device.engine import Engine
-from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
+from mauvecl.host.exposure.expectation import BUDGET_COLUMNS, Expectation
 from mauvecl.noise.reference import components
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column
 from mauvecl.schema.errors import InputError, Message, counted
 from mauvecl.schema.fields import DAY_S, FirstRealisation, Wavelength
-from mauvecl.study.cases import Case, cases, collect_messages, star_column, star_label
+from mauvecl.study.cases import Case, Use, cases, collect_messages, star_column, star_label
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.detection.snr import SnrResult
-    from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.cases import Use
 
 Per = Literal["pixel", "element"]
 #: Longest time that is considered, s: many exposures, added up.

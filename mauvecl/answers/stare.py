@@ -176,8 +176,6 @@ MOST_ROWS = 100_000
 #: Largest number of frames: 115 days, with spectra of 1.2 GB.
 MOST_SHOWN = 2_000_000
 
-
-#: Columns of the table of stares.
 COLUMNS = (
     Column("frames", "staring.stare.n_frames", "", "frames of the stare", "frames"),
     Column("observed", "staring.stare.observed_s", "s", "time in them", "recorded (s)", "g", detail=True),
@@ -197,7 +195,6 @@ COLUMNS = (
     Column("drifting_frames", "", "", "frames that lost light in pointing drifts, which are assumptions",
            "drifting", when=lambda answer: answer.study.stare.pointing is not None),
 )  # fmt: skip
-#: Columns of the table of flares, for `StareFlare`.
 EVENT_COLUMNS = (
     Column("peak_time", "event.peak_s", "s", "from the start of the stare; tau = 0 of the shape", "peak at (s)", ".6g"),
     Column("half_width", "event.half_width_s", "s", "t_1/2 of the shape's publication", "half-width (s)", "g",
@@ -228,7 +225,6 @@ def _fitted(
     ]  # fmt: skip
 
 
-#: Columns of the table of flares that a search found, for `FoundFlare`.
 FOUND_COLUMNS = (
     *_fitted("peak_time", "peak_s", "s", "from the start of the stare", "peak at (s)", number(".6g", "not measured")),
     *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude",
@@ -505,10 +501,7 @@ def log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
 
 
 def _found_energy(case: Case, event: Event) -> float:
-    """Return the bolometric energy of a detected flare, erg; NaN if the star's size is unknown.
-
-    Also NaN if flares replace photosphere and the fitted temperature is not above the photosphere's.
-    """
+    """Return the bolometric energy of a flare, erg; NaN if the star's size is unknown, or its photosphere is hotter."""
     flare = case.study.flare
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:

@@ -362,7 +362,6 @@ VERBS: dict[str, Verb] = {
     )
 }
 
-
 Answered = TypeVar("Answered", covariant=True)
 
 

@@ -61,7 +61,6 @@ MOST_WINDOWS = 100_000
 #: Smallest exposure per day, hours, for which a target counts as visible on a day if windows are not known.
 SEEN_H = 0.5
 
-
 #: Largest number of targets with printed hours per month.
 MOST_MONTHLY = 12
 TARGET_COLUMN = Column("target", description="name of the target", heading="target", kind=str)

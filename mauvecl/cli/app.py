@@ -73,7 +73,7 @@ def selftest(
     """
     from dataclasses import asdict
 
-    from mauvecl.answers.files import make_folder, write_document
+    from mauvecl.answers.answer import make_folder, write_document
     from mauvecl.device import selftest
     from mauvecl.device.build import write_outcome
     from mauvecl.device.engine import Engine

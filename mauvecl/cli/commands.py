@@ -118,7 +118,7 @@ class Session(flags.Options):
     @cached_property
     def folder(self) -> Path:
         """Output folder, which is locked from the first use."""
-        from mauvecl.answers.files import make_folder
+        from mauvecl.answers.answer import make_folder
         from mauvecl.runs.checkpoint import locked
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
@@ -234,7 +234,7 @@ class Session(flags.Options):
 
     def _leave_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""
-        from mauvecl.answers.files import write_record
+        from mauvecl.answers.answer import write_record
         from mauvecl.charts.matplotlib import available
 
         writers = answer.writers
@@ -458,7 +458,7 @@ def verify(
 
     Example: mauvecl verify frames.zarr --repair
     """
-    from mauvecl.answers.files import FAULT_COLUMNS, is_answer, verify_answer
+    from mauvecl.answers.answer import FAULT_COLUMNS, is_answer, verify_answer
 
     if is_answer(store):
         if repair or redraw or rows is not None:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 BINS_PER_SIGMA = 128.0
 #: Percentages of the reported quantiles: the median and one, two and three sigma.
 PERCENTAGES = (0.135, 2.5, 16.0, 50.0, 84.0, 97.5, 99.865)
-#: Columns of the tables of pixels and elements.
 COLUMNS = (
     Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element", heading="nm",
            format=".1f"),

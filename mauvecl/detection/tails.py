@@ -29,13 +29,12 @@ from mauvecl.detection.statistics import Differences
 from mauvecl.host.arrays import Float
 from mauvecl.noise import layout, reference
 from mauvecl.noise.disturbances import ADDITIVE
-from mauvecl.noise.scene import factor_nodes, quantile_at_score
+from mauvecl.noise.scene import Scene, factor_nodes, quantile_at_score
 from mauvecl.noise.unknowns import PROCESSES, SIGNAL_PARTS
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.detection.requests import Hypotheses
-    from mauvecl.noise.scene import Scene
 
 #: Number of simulated campaigns with overlapping stacks.
 SIMULATIONS = 20_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,13 @@ from mauvecl.device.build import Device, DeviceRecord, devices
 from mauvecl.device.drivers import DeviceError
 from mauvecl.device.launches import ELEMENT_CHUNK, Progress, Tile, Tiles, detection_launches, scene_launches
 from mauvecl.host.arrays import Arrays
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.noise.unknowns import NOISE_FREE, Comparison
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DEFAULT_SEED, FirstRealisation, OneOrMore, Realisations, Seed
-
-if TYPE_CHECKING:
-    from mauvecl.host.exposure.expectation import Expectation
 
 __all__ = ["DeviceError", "DeviceRecord", "Engine", "devices"]
 

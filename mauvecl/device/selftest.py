@@ -46,7 +46,6 @@ class Check:
     result: str
 
 
-#: Columns of the table of checks.
 CHECK_COLUMNS = (
     Column("passed", heading="result", format=lambda passed: "PASS" if passed else "FAIL"),
     Column("name", heading="check"),
@@ -114,7 +113,6 @@ def chi2_rate(engine: Engine) -> float:
     return count * PIXELS / min(spent, work(count))
 
 
-#: Columns of the table of devices.
 DEVICE_COLUMNS = (
     Column("number", heading="number"),
     Column("platform", heading="device", format=lambda platform, name: f"{platform}: {name}", others=("name",)),
@@ -226,7 +224,6 @@ PHILOX_VECTORS = (
         (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
     ),
 )
-
 
 #: Small scenes that run every branch of every kernel: options of `toy`, and of the draw and comparison.
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {

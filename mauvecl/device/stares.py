@@ -204,7 +204,7 @@ class StareLaunches(Launches):
             ends = np.uint32(first * variant.chunk), np.uint32(last * variant.chunk)
             self._of_method = [*map(self.upload, by_pixels), *ends]
         else:
-            self._of_method = [self.upload(table.packed)]
+            self._of_method = [self.upload(np.concatenate([table.rows.ravel(), table.lower]))]
 
     def upload_flares(self, flares: stare_scene.Flares, first: int, count: int) -> None:
         """Upload the flares and the pointing losses of the next `count` stares."""

@@ -25,13 +25,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.fits.flare_model import Ratio, derived_values
+from mauvecl.fits.flare_model import FlareModel, MeanSums, Ratio, ReducedSums, derived_values
 from mauvecl.host.arrays import Float
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
-
-    from mauvecl.fits.flare_model import FlareModel, MeanSums, ReducedSums
 
 
 #: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
@@ -405,10 +403,7 @@ def _ratio_ends(faces: list[Face], per: Float, n_linear: int, least: Float) -> t
 
 
 def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:
-    """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
-
-    It is divided by the factor on all light, or by another linear function of the amplitudes, if there is one.
-    """
+    """Return the ends of a sum of amplitudes, with factors (n_linear, n, n_sample), over the factor on all light."""
     lows, highs = np.full(factors.shape[1:], np.inf), np.full(factors.shape[1:], -np.inf)
     for face in faces:
         room = face.gain - least

@@ -7,7 +7,7 @@ higher one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
@@ -28,14 +28,7 @@ from mauvecl.fits.flare_model import (
     derived_values,
     undimmed,
 )
-from mauvecl.fits.profile import (
-    BestFit,
-    Profile,
-    Slopes,
-    covariance,
-    intervals,
-    with_bounds,
-)
+from mauvecl.fits.profile import BestFit, Profile, Slopes, covariance, intervals, with_bounds
 from mauvecl.host.arrays import Float
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, formatted, table_of
@@ -43,8 +36,6 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Probability, Temperature, Wavelength
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from astropy.table import Table
 
     from mauvecl.host.exposure.expectation import Expectation
@@ -404,6 +395,7 @@ def clipped_pixels(raw: NDArray[Any], quiet: Expectation) -> NDArray[np.bool_]:
     Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
     """
     clipped = (raw > _highest_usable(quiet)).any(axis=0)
+    # With neighbours, the noise of single pixels does not select the pixels of a fit.
     return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
 
 
@@ -630,12 +622,8 @@ def fit_two_temperatures(
             flare = two.at(log_k)
             measurements.append(problem.measurement(flare, reduction, profile, best, quiescent[alike], ends, second))
             order.append(rows[alike])
-    return _without_absent_blackbody(Measurement.joined(measurements, order), single)
-
-
-def _without_absent_blackbody(measured: Measurement, single: Measurement) -> Measurement:
-    """Return a measurement of two blackbodies with the estimates of one where the light of the other is zero."""
-    n = len(single.estimates)
+    measured, n = Measurement.joined(measurements, order), len(recorded)
+    # Without light of the other blackbody, the estimates are those of one.
     of_one = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
     absent = (measured.amplitudes[:, :2] <= 0.0).any(axis=1, keepdims=True)
     return replace(measured, estimates=np.where(absent, of_one, measured.estimates))

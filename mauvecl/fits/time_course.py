@@ -20,11 +20,11 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
-from mauvecl.fits.flare_model import EVERY, Ranges, RawCounts, ReducedSums
+from mauvecl.fits.flare_model import EVERY, FlareModel, Ranges, RawCounts, ReducedSums
 from mauvecl.fits.least_squares import interval_end
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
+from mauvecl.flares import Cooling
 from mauvecl.flares.frames import Components, known_strengths
-from mauvecl.flares.settings import Cooling
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.flares.stare import Event, Stare
 from mauvecl.host.arrays import Float, array_cache
@@ -37,7 +37,6 @@ from mauvecl.schema.fields import Amplitude, Duration, Moment, Probability, Rang
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.fits.flare_model import FlareModel
     from mauvecl.host.exposure.expectation import Expectation
 
 
@@ -47,7 +46,6 @@ MOST_FRAMES_PER_BIN = 4096
 BINS_EVERY = 8
 #: Bins whose known conditions agree to this many digits are fitted together.
 DIGITS = 6
-
 
 #: Heading, format and heading of the error of quantities in printed tables.
 SHOWN = {

@@ -499,7 +499,6 @@ def fiducial2018(quiescent_si_iv_erg_s: Positive) -> PowerLaw:
 #: Typical mass (solar masses) and age (Myr) of a spectral type (assumption).
 TYPICAL = {"G": (0.95, 1000.0), "K": (0.75, 1000.0), "M": (0.4, 1000.0)}
 
-
 #: Exponents for types without published rates of single stars: Althukair & Tsiklauri 2023, "Main Sequence Star
 #: Super-flare Frequency based on Entire Kepler Data", abstract.
 EXPONENTS = {"A": "1.3", "F": "2.0 to 2.1"}

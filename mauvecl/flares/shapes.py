@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from mauvecl.flares.settings import check_shape, integral_between_points
+from mauvecl.flares import check_shape, integral_between_points
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened

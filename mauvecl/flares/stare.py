@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.flares import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.energies import EnergyScale, amplitude_of
-from mauvecl.flares.settings import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.orbit import Limits
@@ -158,10 +158,7 @@ class Event:
 
 
 def check_contributions(events: Sequence[Event], start_s: Float, frame_s: float) -> list[str]:
-    """Return a message for each flare that peaks outside the frames but contributes light to them.
-
-    Raises InputError if a flare contributes no light.
-    """
+    """Return messages on flares that peak outside the frames; raises InputError if one adds no light to them."""
     frames = np.column_stack([start_s, start_s + frame_s])
     sentences = []
     for number, event in enumerate(events, 1):

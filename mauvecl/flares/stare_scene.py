@@ -117,10 +117,7 @@ class StareScene:
 
     @classmethod
     def of(cls, components: Components, stare: Stare, processes: Processes = NONE) -> Self:
-        """Build the arrays.
-
-        Raises InputError if the quiescent frame cannot be drawn jointly, or there are too many sums or unknowns.
-        """
+        """Build the arrays; raises InputError for frames that are not drawn jointly, or too many sums or unknowns."""
         x, n_pixel = components.quiet, components.quiet.wavelength_nm.size
         if abs(stare.frame_s - x.frame_s) > 1e-9 * x.frame_s:
             raise InputError.of("frame_s", stare.frame_s, f"the instrument's {x.frame_s:g} s")
@@ -396,10 +393,7 @@ class SumTable:
 
     @classmethod
     def of(cls, components: Components) -> Self:
-        """Compute the table.
-
-        Raises InputError if weights are linearly dependent, or counts are too few for the expansion.
-        """
+        """Compute the table; raises InputError if weights depend on each other, or counts are too few to expand."""
         n = components.n_statistics
         constant, each = components.sum_cumulants(2)
         covariance = constant + each[: len(STEADY)].sum(axis=0)
@@ -419,11 +413,6 @@ class SumTable:
                     often = math.factorial(4) // math.prod(math.factorial(m) for m in Counter(key).values())
                 columns.append(often * np.array([reference[key], *(component[key] for component in each)]))
         return cls(np.array(columns, np.float32).T.copy(), lower[np.tril_indices(n)].astype(np.float32), fourths)
-
-    @property
-    def packed(self) -> Floats:
-        """Array for the kernel."""
-        return np.concatenate([self.rows.ravel(), self.lower])
 
 
 def check_cumulants(scene: StareScene, flares: Flares) -> None:
@@ -460,10 +449,7 @@ def method_for(components: Components, stare: Stare, processes: Processes = NONE
 
 
 def _fourths_are_needed(components: Components) -> bool:
-    """Return whether neglecting cumulants beyond the third could be noticed.
-
-    Raises InputError if neglecting those beyond the fourth could be noticed.
-    """
+    """Return whether fourth cumulants could be noticed; raises InputError if higher ones could."""
     x, w = components.quiet, components.weights
     photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
     sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))

@@ -294,7 +294,6 @@ RAIL_SIGMA = 8.0
 #: Limit of the counter's 24 bits for groups of four pixels.
 MAX_PIXELS = 65_536
 
-
 #: Fields of an expectation that scenarios on common draws share.
 OF_DETECTOR = ("wavelength_nm", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron", "element", "n_frames",
                "frame_s", "dark_unit", "photon_noise", "adc_max_dn", "saturation_dn")  # fmt: skip

@@ -283,21 +283,6 @@ def digitise(v: Floats, edge: np.void | NDArray[np.void], *, clip: bool) -> Floa
     return np.asarray(r - MAGIC)
 
 
-def observed(
-    scene: Scene, realisation: NDArray[np.uint64], seed: int, *, exposure: int = 0, number: int = 0,
-    scenarios: Sequence[int] | None = None,
-) -> NDArray[np.int64]:  # fmt: skip
-    """Sum the DN above the base over the draws of exposure `number`, (n_scenario, n_padded, n_realisation)."""
-    drawn_frames = range(number * scene.n_draws, (number + 1) * scene.n_draws)
-    index, frames, changes = _all_frames(scene, realisation, drawn_frames, seed, exposure)
-    drawn = draws(scene, index, frames, seed, exposure=exposure)
-    sums = []
-    for k in range(len(scene.levels)) if scenarios is None else scenarios:
-        dn = digitise(analogue(scene, drawn, k, *changes), scene.edges[k, :, None], clip=scene.clip)
-        sums.append(dn.astype(np.int64).reshape(len(dn), scene.n_draws, -1).sum(axis=1))
-    return np.array(sums)
-
-
 def _all_frames(
     scene: Scene, realisation: NDArray[np.uint64], frames: range, seed: int, exposure: int = 0
 ) -> tuple[NDArray[np.uint64], NDArray[np.int64], NDArray[np.float32]]:
@@ -312,21 +297,13 @@ def _all_frames(
     return np.tile(realisation, len(frames)), np.repeat(frames, len(realisation)), np.concatenate(changes, axis=1)
 
 
-def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
-    """Count the frames below zero and above saturation of scenario 0, shape (n_realisation, n_pixel, 2)."""
-    if not scene.clip:
-        return np.zeros((len(realisation), scene.n_pixel, 2), np.int64)
-    index, frames, changes = _all_frames(scene, realisation, range(scene.n_draws), seed)
-    r, edge = analogue(scene, draws(scene, index, frames, seed), 0, *changes) + MAGIC, scene.edges[0, :, None]
-    outside = np.stack([r < edge["low"], r > edge["high"]], axis=-1)[: scene.n_pixel]
-    count: NDArray[np.int64] = outside.reshape(scene.n_pixel, scene.n_draws, -1, 2).sum(axis=1)
-    return count.swapaxes(0, 1)
-
-
 def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
     """Draw raw DN of scenario 0, summed over the frames, shape (n_realisation, n_pixel)."""
-    above = observed(scene, realisation, seed, scenarios=[0])[0, : scene.n_pixel]
-    raw: NDArray[np.int64] = (above + scene.n_draws * scene.base_dn[0][:, None]).T
+    index, frames, changes = _all_frames(scene, realisation, range(scene.n_draws), seed)
+    v = analogue(scene, draws(scene, index, frames, seed), 0, *changes)[: scene.n_pixel]
+    dn = digitise(v, scene.edges[0, : scene.n_pixel, None], clip=scene.clip).astype(np.int64)
+    dn += scene.base_dn[0][:, None]
+    raw: NDArray[np.int64] = dn.reshape(scene.n_pixel, scene.n_draws, -1).sum(axis=1).T
     return raw
 
 
@@ -453,10 +430,7 @@ def _split(
 
 
 def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:
-    """Draw dark counts, DN, given their sum with a Gaussian of this variance, by inversion at `chance`.
-
-    All arrays have the shape (n_pixel, n_draw) but `step`, which has the shape (n_pixel,).
-    """
+    """Draw dark counts, DN, (n_pixel, n_draw), given their sum with Gaussian noise, by inversion at `chance`."""
     dark = np.where((mean > 0) & (variance == 0), total, 0.0)
     for p in np.flatnonzero(mean.any(axis=1)):
         drawn = (mean[p] > 0) & (variance[p] > 0)
@@ -473,7 +447,6 @@ def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, c
     return dark
 
 
-#: Columns of the table of components.
 COLUMNS = (
     Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element"),
     *(

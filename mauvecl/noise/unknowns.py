@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast, 
 
 from pydantic import create_model
 
-from mauvecl.noise.disturbances import ADDITIVE, Normal, ParticleRate, PriorField, Uniform
+from mauvecl.noise.disturbances import ADDITIVE, AdditiveProcess, Normal, ParticleRate, Prior, PriorField, Uniform
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DetectorTemperature, Range, range_of
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from mauvecl.host.arrays import Float
     from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.noise.disturbances import AdditiveProcess, Prior
 
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]
@@ -195,7 +194,6 @@ NUISANCES = _by_name(
 #: Nuisance parameters of the documented set.
 DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.sd is not None)
 
-
 if TYPE_CHECKING:
     NuisanceName = str
 else:
@@ -229,7 +227,6 @@ INSTRUMENT_VALUES = _by_name(
                     prior=Uniform(20.0, 25.0)),
     InstrumentValue(name="read_noise_dn", label="read noise (DN)", prior=Normal(12.0, 1.0, 9.0, 15.0)),
 )  # fmt: skip
-
 
 #: Largest number of modes of a calibration that are unknown: of the light in eight bands and seven other values.
 MAX_MODES = 15
@@ -323,7 +320,6 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
 
 
 NONE = Processes()
-
 
 #: Largest number of quiescent exposures in a stack.
 MAX_EXPOSURES = 1000

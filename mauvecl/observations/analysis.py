@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.fits.spectrum import Measurement
-from mauvecl.flares.settings import RANK
+from mauvecl.flares import RANK
 from mauvecl.flares.shapes import shape_of
 from mauvecl.host.arrays import Float
 from mauvecl.observations.events import LONG_S, Kind, ObservedEvent, detect_events, measure_events, most_events

@@ -273,7 +273,7 @@ def _correlate(values: Float, kernel: Float, first: int) -> Float:
     return Correlations(values, max(abs(first), kernel.size)).of(kernel, first)
 
 
-#: Step between half-widths of a bank: the same as that of `flares.settings.HALF_WIDTHS_S`.
+#: Step between half-widths of a bank: the same as that of `flares.HALF_WIDTHS_S`.
 WIDTH_STEP = 1.86
 #: Narrowest template in frames, and widest as a share of the time in frames without gaps of a day, and in seconds.
 NARROWEST, WIDEST, WIDEST_S = 1.5, 0.15, 7200.0

@@ -202,7 +202,7 @@ def _weighted_sums(
     # Flares that double the light of the star, in the sum over wavelength.
     flares *= abs(float(light.sum())) / flares.sum(axis=1, keepdims=True)
     templates, steady = (
-        Templates.of_spectra(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=included, rank=rank)
+        Templates.of(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=included, rank=rank)
         for included in (nuisances, nuisances.without(["light"]))
     )
     snr_kept = float(np.median(templates.best / steady.best))

@@ -205,7 +205,6 @@ class Fault:
     mended: bool  # whether the file was repaired
 
 
-#: Columns of the table of faults.
 FAULT_COLUMNS = (
     Column("key", heading="file"),
     Column("state", heading="what"),

@@ -40,7 +40,6 @@ RECOUNT_S = 5.0
 #: Items of `map_in_order` in progress beyond the number of workers, which are prepared while devices count others.
 PREPARED = 1
 
-
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 

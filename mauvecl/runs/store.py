@@ -19,12 +19,13 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host import VERSION
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.host.tables.files import NO_ROOM, UNFINISHED, read_bytes, toml, write_whole, writing
 from mauvecl.runs.checkpoint import differing_keys
 from mauvecl.schema.columns import Column, percent
@@ -32,9 +33,6 @@ from mauvecl.schema.errors import InputError, missing_package
 from mauvecl.study.cases import cases, full_label
 from mauvecl.study.cases import collect_messages as messages_of
 from mauvecl.study.study import Study, read_version
-
-if TYPE_CHECKING:
-    from mauvecl.host.exposure.expectation import Expectation
 
 #: Units of the calibration per pixel and frame, which each star's group contains.
 CALIBRATION = {
@@ -166,7 +164,6 @@ class StoredScene:
         return Chunk(self, name, start, min(start + self.chunk_rows, self.rows))
 
 
-#: Columns of the table of arrays.
 ARRAY_COLUMNS = (
     Column("array", heading="array"),
     Column("star", heading="star"),
@@ -174,7 +171,6 @@ ARRAY_COLUMNS = (
     Column("shape", heading="shape", format=lambda shape: " x ".join(map(str, shape))),
     Column("type", heading="type"),
 )
-
 
 DIGESTS = "digests.txt"
 CRC_BYTES = 4

@@ -17,21 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import Float, true_runs
-from mauvecl.search.flare_fits import (
-    AMPLITUDE,
-    KELVIN,
-    PEAK,
-    WIDTH,
-    BlendFit,
-    Block,
-    Factor,
-    FittedFlares,
-    ProfiledQuantity,
-    SummedStare,
-)
+from mauvecl.search.flare_fits import AMPLITUDE, KELVIN, PEAK, WIDTH, FittedFlares, ProfiledQuantity, SummedStare
 from mauvecl.search.templates import LEAD, TAIL
 
 if TYPE_CHECKING:
+    from mauvecl.search.flare_fits import BlendFit, Block, Factor
     from mauvecl.search.search import Row, Survey
 
 

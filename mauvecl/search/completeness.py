@@ -12,8 +12,8 @@ from scipy import interpolate, optimize, stats
 
 from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
 from mauvecl.detection.nuisances import Nuisances
+from mauvecl.flares import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
-from mauvecl.flares.settings import HALF_WIDTHS_S as BANK_S
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.exposure.expectation import Expectation

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +30,12 @@ from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
 from mauvecl.search.flare_fits import WIDTH, FittedFlares, SummedStare
-from mauvecl.search.search import Survey
-
-if TYPE_CHECKING:
-    from mauvecl.search.search import Search, SearchedFrames
-    from mauvecl.search.templates import Bank
-
+from mauvecl.search.search import Search, SearchedFrames, Survey
+from mauvecl.search.templates import Bank
 
 #: Quantities of each fit: ratios of fitted to injected values, the peak offset in half-widths, and whether the
 #: equivalent duration is within its standard error.
 FIT_QUANTITIES = ("energy", "amplitude", "half_width", "temperature", "peak", "covered")
-
 
 #: Columns of the accuracy of fits, for values by name.
 ACCURACY_COLUMNS = (

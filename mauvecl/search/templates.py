@@ -16,7 +16,7 @@ import numpy as np
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import spanning_weights
-from mauvecl.flares.settings import RANK, WINDOW_S
+from mauvecl.flares import RANK, WINDOW_S
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.noise.unknowns import CHANGED_PART
 from mauvecl.schema.errors import InputError
@@ -144,29 +144,6 @@ class Templates:
     @classmethod
     def of(
         cls,
-        quiet: Expectation,
-        flares_dn: Float,
-        temperatures_k: Sequence[float],
-        *,
-        nuisances: Nuisances | None = None,
-        rank: int = RANK,
-    ) -> Self:
-        """Compute weights from one frame of the quiescent star and the mean DN of flares, (n_temperature, n_pixel).
-
-        Flares have unit amplitude and ascending temperatures, in steps small enough for `chosen`. `nuisances` are
-        independent in each frame, such as jitter, and `rank` is the largest number of sums.
-        """
-        used = ~quiet.saturated
-        if not used.any():
-            raise InputError.of("quiet", quiet.name, "a star that does not saturate every pixel")
-        variance = np.where(used, quiet.variance_dn2, 0.0)
-        return cls.of_spectra(
-            variance, flares_dn * used, quiet.gain_dn_per_electron, temperatures_k, nuisances=nuisances, rank=rank
-        )
-
-    @classmethod
-    def of_spectra(
-        cls,
         variance: Float,
         flares: Float,
         photon_variance: Float,
@@ -177,8 +154,9 @@ class Templates:
     ) -> Self:
         """Compute weights from the noise of a quiescent frame and flare spectra, all in one unit.
 
-        `variance` and `flares` are zero in pixels that are not used, and `photon_variance` is the rise of the variance
-        with the flux; other arguments are those of `of`.
+        `variance` and `flares`, (n_temperature, n_pixel), are zero in unused pixels; `photon_variance` is the
+        rise of the variance with the flux. Flares have unit amplitude and ascending temperatures, in steps small enough
+        for `chosen`. `nuisances` are independent in each frame, such as jitter; `rank` is the largest number of sums.
         """
         rows = nuisances.rows(variance, nuisances.spectra * (variance > 0)) if nuisances else None
         plain = np.divide(flares, variance, out=np.zeros_like(flares), where=variance > 0)

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from mauvecl.flares import settings
-from mauvecl.flares.settings import HALF_WIDTHS_S, SHAPE_NAMES, WINDOW_S, Cooling, CoolingLaw, Curve, Per, ShapeName
+from mauvecl import flares
+from mauvecl.flares import HALF_WIDTHS_S, SHAPE_NAMES, WINDOW_S, Cooling, CoolingLaw, Curve, Per, ShapeName
 from mauvecl.noise.disturbances import Normal, PointingDrifts, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, DEFAULT_SPREADS, PROCESSES, Changing, Course, NuisanceName
 from mauvecl.schema import fields
@@ -45,7 +45,7 @@ class StareQuestion(Section):
             "--gap", kind=list[str], read=partial(read_ranges, expected="two times in s, such as 1000:2000", unit="s")
         ),
     )
-    orbit_s: fields.Duration = setting(settings.ORBIT_S, "Orbital period")
+    orbit_s: fields.Duration = setting(flares.ORBIT_S, "Orbital period")
     orbit_gap_s: Annotated[float, Unit("s"), Range(0)] = setting(
         0.0, "Gap at the end of every orbit", flag="--orbit-gap"
     )
@@ -164,7 +164,7 @@ class SearchChoice(Section):
     half_widths_s: tuple[fields.Duration, ...] = setting(
         HALF_WIDTHS_S, "Half-widths of the template bank", min_length=1
     )
-    sums: Annotated[int, Range(1, 8)] = setting(settings.RANK, "Largest number of weighted sums per frame")
+    sums: Annotated[int, Range(1, 8)] = setting(flares.RANK, "Largest number of weighted sums per frame")
     offset: bool = setting(True, "Whether to marginalise over the offset of the baseline")
     slope: bool = setting(True, "Whether to marginalise over the slope of the baseline")
     cycle: bool | None = setting(
@@ -206,7 +206,7 @@ class SearchChoice(Section):
     @property
     def rate(self) -> float:
         """False alarms per star-day."""
-        return self.false_alarms / settings.DAYS[self.per]
+        return self.false_alarms / flares.DAYS[self.per]
 
     @property
     def rate_text(self) -> str:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from mauvecl.answers.files import write_table
+from mauvecl.answers.answer import write_table
 from mauvecl.answers.verbs import VERBS, Progress
 from mauvecl.schema.columns import View
 from mauvecl.schema.errors import InputError

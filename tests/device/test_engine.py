@@ -93,7 +93,7 @@ def _reference_raw(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Compute raw counts and each realisation's number of clipped samples with the reference, once for both widths."""
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
-    return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
+    return reference.realise(scene, INDEX, SEED), numpy_kernels.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
 
 
 @pytest.mark.parametrize("name", long_but(CASES, "stack", "apart, electrons, frames"))

@@ -49,7 +49,7 @@ def results(name: str, count: int) -> dict[str, np.ndarray]:
     seen = statistics.histograms(scene, snr.observers(quiet, scene), snr.elements(quiet), index, seed)
     return {
         "raw": reference.realise(scene, index, seed).astype(np.int32),
-        "clipped": reference.clipped(scene, index, seed).sum(axis=(1, 2)).astype(np.uint32),
+        "clipped": statistics.clipped(scene, index, seed).sum(axis=(1, 2)).astype(np.uint32),
         "statistics": values,
         "fast statistics": fast,
         "histograms": selftest.histograms_of(seen),

@@ -1,5 +1,6 @@
 """NumPy reference of the kernels for statistics, S/N histograms and tallies, in the device's order of summation."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,34 @@ from mauvecl.detection import requests, snr
 from mauvecl.noise import layout, reference
 
 fma = reference.fma
+
+
+def observed(
+    scene: Any, realisation: np.ndarray, seed: int, *, exposure: int = 0, number: int = 0,
+    scenarios: Sequence[int] | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Sum the DN above the base over the draws of exposure `number`, (n_scenario, n_padded, n_realisation)."""
+    drawn_frames = range(number * scene.n_draws, (number + 1) * scene.n_draws)
+    index, frames, changes = reference._all_frames(scene, realisation, drawn_frames, seed, exposure)
+    drawn = reference.draws(scene, index, frames, seed, exposure=exposure)
+    sums = []
+    for k in range(len(scene.levels)) if scenarios is None else scenarios:
+        analogue = reference.analogue(scene, drawn, k, *changes)
+        dn = reference.digitise(analogue, scene.edges[k, :, None], clip=scene.clip)
+        sums.append(dn.astype(np.int64).reshape(len(dn), scene.n_draws, -1).sum(axis=1))
+    return np.array(sums)
+
+
+def clipped(scene: Any, realisation: np.ndarray, seed: int) -> np.ndarray:
+    """Count the frames below zero and above saturation of scenario 0, shape (n_realisation, n_pixel, 2)."""
+    if not scene.clip:
+        return np.zeros((len(realisation), scene.n_pixel, 2), np.int64)
+    index, frames, changes = reference._all_frames(scene, realisation, range(scene.n_draws), seed)
+    analogue = reference.analogue(scene, reference.draws(scene, index, frames, seed), 0, *changes)
+    r, edge = analogue + reference.MAGIC, scene.edges[0, :, None]
+    outside = np.stack([r < edge["low"], r > edge["high"]], axis=-1)[: scene.n_pixel]
+    count: np.ndarray = outside.reshape(scene.n_pixel, scene.n_draws, -1, 2).sum(axis=1)
+    return count.swapaxes(0, 1)
 
 
 def statistics(hypotheses: requests.Hypotheses, plan: Any, realisation: np.ndarray, seed: int) -> np.ndarray:
@@ -22,10 +51,10 @@ def statistics(hypotheses: requests.Hypotheses, plan: Any, realisation: np.ndarr
     estimated, exposures = scene.comparison.estimated, scene.comparison.exposures
     added, scale = scene.job["reference_weight"], scene.job["pair_scale"]
     out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
-    x = _above_reference(scene, reference.observed(scene, realisation, seed))
+    x = _above_reference(scene, observed(scene, realisation, seed))
     drawn = max(exposures, 1) if exposures or pair or smoothed else 0
     others = [
-        _above_reference(scene, reference.observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
+        _above_reference(scene, observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
         for number in range(drawn)
     ]
     finished, begin = [], 0
@@ -138,7 +167,7 @@ def _summed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def histograms(scene: Any, observers: Any, elements: np.ndarray, realisation: np.ndarray, seed: int) -> snr.Counts:
     """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
     counts = snr.Counts(scene.n_pixel, len(elements))
-    n = reference.observed(scene, realisation, seed, scenarios=[0])[0]
+    n = observed(scene, realisation, seed, scenarios=[0])[0]
     for e, element in enumerate(elements):
         first, end = int(element["first"]), int(element["end"])
         for p in range(first, end):
@@ -146,7 +175,7 @@ def histograms(scene: Any, observers: Any, elements: np.ndarray, realisation: np
         ratio = snr.signal_to_noise(n[first:end], observers[first:end], element["sky"])
         steps = (ratio - element["centre"]) * element["bins_per_unit"]
         counts.bins["element"].count(e, np.rint(steps).astype(np.int64))
-    counts.clipped += reference.clipped(scene, realisation, seed).sum(axis=0)
+    counts.clipped += clipped(scene, realisation, seed).sum(axis=0)
     counts.n = len(realisation)
     return counts
 
