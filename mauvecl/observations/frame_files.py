@@ -19,27 +19,11 @@ from mauvecl.host.tables.files import check_content, parsing, without_columns
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import is_magnitude, is_missing, key_of
 from mauvecl.host.tables.opening import open_table
-from mauvecl.host.tables.table import (
-    MemoryTable,
-    TableFile,
-    Values,
-    convert,
-    unit_in,
-    without_indefinite,
-)
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values, convert, unit_in, without_indefinite
 from mauvecl.host.tables.units import is_dated, unit_and_medium, vacuum_wavelengths
+from mauvecl.observations import stored_frames as stored
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits
 from mauvecl.observations.mapping import COLUMN_NAMES, FrameMapping, recognised, times_of
-from mauvecl.observations.stored_frames import (
-    FolderFile,
-    Light,
-    PixelStatistics,
-    StoredFile,
-    open_stored,
-    read_light,
-    stored_in_fits,
-    weighted_sums,
-)
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 
@@ -131,7 +115,7 @@ class ReducedFrames:
     """Spectra reduced to weighted sums."""
 
     light_curves: tuple[Frames, ...]  #: one for each row of the weights
-    pixels: PixelStatistics  #: light and noise of each pixel of the file
+    pixels: stored.PixelStatistics  #: light and noise of each pixel of the file
 
 
 @validated
@@ -154,7 +138,7 @@ def reduce_frames(
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.label)
         bits = QualityBits.of(file.header, places.quality_bits, file.label)
-        lights, pixels = weighted_sums(flux, error, _excluding_bits(quantities.get("quality"), bits), weights)
+        lights, pixels = stored.weighted_sums(flux, error, _excluding_bits(quantities.get("quality"), bits), weights)
         return ReducedFrames(tuple(_frames_in(file, quantities, places, stem, light) for light in lights), pixels)
 
 
@@ -186,15 +170,17 @@ def _open_frames(
         if not place.is_dir():
             opened = _open_file(place, name, places, check, large=True)
         elif (place / "zarr.json").is_file():
-            opened = open_stored(place, label, name)
+            opened = stored.open_stored(place, label, name)
         elif places is None:
             fault = f"{label} is not a store of spectra; give a mapping that says where its quantities are"
             raise InputError(fault, key="mapping")
         else:
             open_file = partial(_open_file, name=name, check=check)
-            opened = nullcontext(FolderFile(place, places, label, open_file))
+            opened = nullcontext(stored.FolderFile(place, places, label, open_file))
         with opened as file:
-            yield file, places or (file.mapping(raw) if isinstance(file, StoredFile) else recognised(file)), place.stem
+            if places is None:
+                places = file.mapping(raw) if isinstance(file, stored.StoredFile) else recognised(file)
+            yield file, places, place.stem
 
 
 def _open_file(
@@ -206,9 +192,9 @@ def _open_file(
     groups = usual if places is None else [(title,) for title in places.times]
 
     def of_fits(hdus: Any, label: str) -> TableFile:
-        return stored_in_fits(FitsTables(hdus, label), name) or FitsTables(hdus, label, name, groups)
+        return stored.stored_in_fits(FitsTables(hdus, label), name) or FitsTables(hdus, label, name, groups)
 
-    of_hdf5 = partial(open_stored, name=name)
+    of_hdf5 = partial(stored.open_stored, name=name)
     return open_table(path, f"file {path.name!r}", check=check, large=large, of_fits=of_fits, of_hdf5=of_hdf5)
 
 
@@ -224,7 +210,7 @@ def _quantities(file: TableFile, mapping: FrameMapping) -> Quantities:
     quantities |= {key: file.find(name) for key, name in names.items() if name is not None}
     if (nm := _wavelength(file, mapping)) is not None:
         quantities["wavelength"], rows = nm, quantities["flux"].n_rows
-        if nm.shape == quantities["flux"].shape == quantities["time"].shape and not isinstance(file, FolderFile):
+        if nm.shape == quantities["flux"].shape == quantities["time"].shape and not isinstance(file, stored.FolderFile):
             check_content(32 * rows, f"{file.label} has {rows} rows of pixels, which need 32 bytes each and at most")
             quantities = _with_row_per_frame(_with_numeric_flags(quantities), file.label)
     _check_rows(file, quantities)
@@ -377,7 +363,7 @@ def _relative_to_level(light: Float, sd: Float | None, unit: str) -> tuple[Float
 
 
 def _frames_in(
-    file: TableFile, quantities: Quantities, mapping: FrameMapping, stem: str, reduced: Light | None = None
+    file: TableFile, quantities: Quantities, mapping: FrameMapping, stem: str, reduced: stored.Light | None = None
 ) -> Frames:
     """Build frames from a file and its quantities; with `reduced` light, which is not read again."""
     label, header = file.label, file.header
@@ -410,7 +396,7 @@ def _frames_in(
         scale=system.scale,
         position=system.position,
         direction_deg=system.direction_deg,
-        net=isinstance(file, StoredFile) and mapping.flux != "raw",
+        net=isinstance(file, stored.StoredFile) and mapping.flux != "raw",
     )
     if system.at != 0.5:
         frames = frames.shifted((0.5 - system.at) * frames.exposure_s)
@@ -418,11 +404,11 @@ def _frames_in(
 
 
 def _read_light(
-    file: TableFile, quantities: Quantities, mapping: FrameMapping, bits: QualityBits, reduced: Light | None
+    file: TableFile, quantities: Quantities, mapping: FrameMapping, bits: QualityBits, reduced: stored.Light | None
 ) -> tuple[Float, Float | None, Float | None, str, tuple[str, ...]]:
     """Return light, errors, flags, the unit of the light, and remarks."""
     unit, flux, error, remarks = _linear_light(quantities, mapping)
-    light, sd, flags, more = reduced or read_light(flux, error, _excluding_bits(quantities.get("quality"), bits))
+    light, sd, flags, more = reduced or stored.read_light(flux, error, _excluding_bits(quantities.get("quality"), bits))
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     sd = None if sd is None else without_indefinite(sd)

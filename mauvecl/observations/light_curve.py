@@ -16,22 +16,10 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
 from mauvecl.host.arrays import PER_MAD, Bool, Float, true_runs
+from mauvecl.observations import level as levels
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.events import END_FRAMES, LONG_S, MIN_QUIET, detect_events, light_of_flare
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.level import (
-    FAR,
-    MOST_BELOW,
-    QuiescentLevel,
-    check_usable,
-    counts_per_unit,
-    guess_flares,
-    level_error,
-    noise_of_frames,
-    noise_of_steps,
-    relative_level,
-    single_frames,
-)
 from mauvecl.observations.process import UNREPORTED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
@@ -215,7 +203,7 @@ def _fit_processes(survey: SeriesSurvey, quiet: Bool, before: SeriesSurvey | Non
     starts = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
     for column, start in zip(columns, starts, strict=False):
         time, values, variance = survey.stare.start_s[quiet], column[quiet], survey.variance[quiet]
-        fits.append(fit_process(BinnedLightCurve.of(time, values, variance, survey.stare.frame_s), start, steps))
+        fits.append(fit_process(BinnedLightCurve(time, values, variance, survey.stare.frame_s).binned(), start, steps))
     return replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
 
 
@@ -319,7 +307,7 @@ def _find_eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     if not 0 < guessed.mean() < MOST_LOST:
         return lost
     bright, dim = survey.frames(~guessed), survey.frames(guessed)
-    fitted, in_events = fit_quiet_light(bright, guess_flares(bright.stare.numbers, bright.flux))
+    fitted, in_events = fit_quiet_light(bright, levels.guess_flares(bright.stare.numbers, bright.flux))
     # The light in eclipses may have any smooth shape.
     data = BinnedLightCurve(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
     size = float(np.log(guessed.size))
@@ -348,7 +336,7 @@ def guess_eclipses(survey: SeriesSurvey) -> Bool:
 
     time = survey.stare.start_s
     inside = np.zeros(time.size, np.bool_)
-    data = BinnedLightCurve.of(time, survey.flux, survey.variance, survey.stare.frame_s, MOST_BINNED)
+    data = BinnedLightCurve(time, survey.flux, survey.variance, survey.stare.frame_s).binned(MOST_BINNED)
     period = max(SHORTEST_PERIOD_S, 2 * data.step_s / ECLIPSES[0])
     grids = []
     while period < data.span_s / 3:
@@ -406,7 +394,7 @@ ROUNDS = 3
 
 def survey_light_curve(
     frames: Frames, shape: Shape, seed: int, steps: Steps = UNREPORTED
-) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
+) -> tuple[SeriesSurvey, levels.QuiescentLevel, Frames]:
     """Fit the quiescent light of a light curve, and prepare its search; `seed` is that of the error of the level.
 
     Frames of few counts are returned with a remark and without errors. `steps` reports fits, searches and draws.
@@ -423,10 +411,10 @@ def survey_light_curve(
     for number in range(ROUNDS):
         used = reasons == 0
         if survey is None:
-            guessed[used] = guess_flares(frames.numbers[used], flux[used], least)
+            guessed[used] = levels.guess_flares(frames.numbers[used], flux[used], least)
             level = np.full(flux.size, _mean(frames.name, flux[used & ~guessed], least))
         quiet = used & ~guessed
-        variance, photon = noise_of_frames(frames, flux, error, level, quiet, counts)
+        variance, photon = levels.noise_of_frames(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
         survey, in_events = fit_quiet_light(new, guessed[used], survey, fits)
@@ -443,7 +431,7 @@ def survey_light_curve(
             break
         reasons = np.where(used, reasons | flagged, reasons)
     assert survey is not None
-    below = np.isfinite(flux) & (reasons != 0) & (flux - level < -FAR * sd)
+    below = np.isfinite(flux) & (reasons != 0) & (flux - level < -levels.FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     survey = survey.frames((reasons == 0)[np.searchsorted(frames.time_s, survey.time_s)])
     light = quiescent_light(frames, survey, reasons, ~guessed, seed, steps.part(0.9, 1.0))
@@ -455,23 +443,23 @@ def _prepare(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], F
 
     Frames of few counts have no errors; for others, counts are None. Raises InputError if too few frames are usable.
     """
-    if (counts := counts_per_unit(frames)) is not None:
+    if (counts := levels.counts_per_unit(frames)) is not None:
         remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
         frames = replace(frames, error=None).with_remarks((remark,))
     flux, error = frames.white_light
     reasons, level = frames.faults.copy(), np.ones(flux.size)
-    check_usable(frames, reasons)
+    levels.check_usable(frames, reasons)
     if counts is None:
         # Single frames far above the frames around them, as the level is not known yet.
         usable, sigmas = reasons == 0, np.zeros(flux.size)
-        scatter = noise_of_steps(frames.numbers[usable], flux[usable])
+        scatter = levels.noise_of_steps(frames.numbers[usable], flux[usable])
         sd = np.full(int(usable.sum()), scatter) if error is None else np.maximum(error[usable], scatter)
         above = flux[usable] - median_filter(flux[usable], size=SPIKE_FRAMES, mode="nearest")
         sigmas[usable] = np.divide(above, sd, out=np.zeros(sd.size), where=sd > 0)
-        reasons[single_frames(frames.numbers, sigmas, usable)] |= Reason.SPIKE
+        reasons[levels.single_frames(frames.numbers, sigmas, usable)] |= Reason.SPIKE
         if np.ptp(frames.time_s) > LONG_S:
             rows = np.flatnonzero(reasons == 0)
-            relative = relative_level(frames.time_s[rows], frames.numbers[rows], flux[rows], frames.cadence_s)
+            relative = levels.relative_level(frames.time_s[rows], frames.numbers[rows], flux[rows], frames.cadence_s)
             # Frames that are not searched have the level of the next one that is.
             level = relative[np.clip(np.searchsorted(rows, np.arange(flux.size)), 0, rows.size - 1)]
     return frames, counts, reasons, level
@@ -481,7 +469,7 @@ def _mean(name: str, flux: Float, least: float) -> float:
     """Return the mean without outliers, which must not be zero; a median of whole numbers would be one of them."""
     middle = float(np.median(flux))
     spread = max(PER_MAD * float(np.median(np.abs(flux - middle))), least)
-    near = np.abs(flux - middle) <= max(FAR * spread, 1e-12 * abs(middle))
+    near = np.abs(flux - middle) <= max(levels.FAR * spread, 1e-12 * abs(middle))
     if (mean := float(flux[near].mean())) == 0.0:
         raise InputError(f"{name}: the level of the star's light must not be zero", key="flux")
     return mean
@@ -493,24 +481,24 @@ def _flag_single_frames(
     """Return the reasons not to search single frames: far below the level, or alone far above it."""
     sigmas = np.where(used, (flux - level) / sd, 0.0)
     flagged = np.zeros(flux.size, np.int64)
-    below = (sigmas < -FAR) & ~events
-    if below.mean() <= MOST_BELOW:
+    below = (sigmas < -levels.FAR) & ~events
+    if below.mean() <= levels.MOST_BELOW:
         flagged[below] = Reason.BELOW
     if counts is None:
-        flagged[single_frames(frames.numbers, sigmas, used)] |= Reason.SPIKE
+        flagged[levels.single_frames(frames.numbers, sigmas, used)] |= Reason.SPIKE
     return flagged
 
 
 def quiescent_light(
     frames: Frames, survey: SeriesSurvey, reasons: NDArray[np.int64], outside: Bool, seed: int, steps: Steps
-) -> QuiescentLevel:
+) -> levels.QuiescentLevel:
     """Return level, its error, and noise of all frames, from those that are searched and `outside` of events."""
     used, process = reasons == 0, survey.flux_process
     quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
-    error = level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
+    error = levels.level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
     level, sd, noise = (
         np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
         for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
     )
     spread = float(level[used].std()) / survey.level
-    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process, spread)
+    return levels.QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process, spread)

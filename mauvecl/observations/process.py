@@ -144,10 +144,7 @@ class ProcessTerm:
         quality, ratio = shape
         sizes = ratio ** np.arange(float(HARMONICS))
         sizes *= size / np.linalg.norm(sizes)
-        oscillators = (
-            terms.SHOTerm(sigma=sd, rho=scale / harmonic, Q=harmonic * quality) for harmonic, sd in enumerate(sizes, 1)
-        )
-        return terms.TermSum(*oscillators)
+        return terms.TermSum(*(terms.SHOTerm(sigma=sd, rho=scale / n, Q=n * quality) for n, sd in enumerate(sizes, 1)))
 
 
 @dataclass(frozen=True)
@@ -223,19 +220,14 @@ def _time(seconds: float) -> str:
 
 
 class Covariance:
-    """Covariance of values of a process at ascending times with independent noise, factorised as L D L^T.
-
-    The kernel is a term of celerite2, and the variance that of the noise of each value.
-    """
+    """Covariance of values of a process, a term of celerite2, with noise at ascending times, factorised as L D L^T."""
 
     def __init__(self, kernel: Any, time_s: Float, variance: Float) -> None:
         from celerite2 import driver
 
         self._driver = driver
-        self._time = np.ascontiguousarray(time_s, np.float64)
-        self._rates, diagonal, self._u, v = kernel.get_celerite_matrices(
-            self._time, np.ascontiguousarray(variance, np.float64)
-        )
+        self._time, noise = (np.ascontiguousarray(values, np.float64) for values in (time_s, variance))
+        self._rates, diagonal, self._u, v = kernel.get_celerite_matrices(self._time, noise)
         # In place, as celerite2 does it.
         self._d, self._w = driver.factor(self._time, self._rates, diagonal, self._u, v, diagonal, v)
         if not (self._d > 0).all():
@@ -259,9 +251,8 @@ class Covariance:
     def squared_norms(self, columns: Float, first: int, after: int) -> Float:
         """Return v^T C^-1 v of each column, shape (n_column,).
 
-        Columns, which are overwritten, have values from time number `first` on. Innovations after the last value follow
-        from the state of the recursion there: their sum of squares is a quadratic form of as many variables as the
-        process has. Those more than `after` times later are neglected.
+        Columns, which are overwritten, have values from time number `first` on. The squares of later innovations, up to
+        `after` times after the last value, are a quadratic form of the state of the recursion there.
         """
         last = first + len(columns)
         rows, later = slice(first, last), slice(last, last + after)
@@ -315,8 +306,9 @@ class BinnedLightCurve:
     @cached_property
     def noise(self) -> float:
         """Robust standard deviation of a value, from differences of neighbours."""
-        steps = np.diff(self.values)[np.diff(self.time_s) < 1.5 * self.step_s]
-        steps = steps if steps.size else np.diff(self.values)
+        steps = np.diff(self.values)
+        near = np.diff(self.time_s) < 1.5 * self.step_s
+        steps = steps[near] if near.any() else steps
         spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
         return spread if spread > 0 else float(np.std(self.values))
 
@@ -325,23 +317,18 @@ class BinnedLightCurve:
         """Logarithm of this noise over the typical stated one."""
         return float(np.log(max(self.noise / float(np.sqrt(np.median(self.variance))), 1e-6)))
 
-    @classmethod
-    def of(
-        cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED
-    ) -> BinnedLightCurve:
+    def binned(self, largest: int = MAX_FITTED) -> BinnedLightCurve:
         """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
-        factor = -(-time_s.size // largest)
+        factor = -(-self.time_s.size // largest)
         if factor == 1:
-            return cls(time_s, values, variance, step_s)
-        number = np.floor((time_s - time_s[0]) / (factor * step_s) + 0.5 / factor).astype(np.int64)
+            return self
+        step_s = factor * self.step_s
+        number = np.floor((self.time_s - self.time_s[0]) / step_s + 0.5 / factor).astype(np.int64)
         _, first, count = np.unique(number, return_index=True, return_counts=True)
         full = count >= factor / 2
-
-        def total(column: Float) -> Float:
-            return np.asarray(np.add.reduceat(column, first)[full])
-
-        count = count[full]
-        return cls(total(time_s) / count, total(values) / count, total(variance) / count**2, factor * step_s)
+        totals = np.add.reduceat([self.time_s, self.values, self.variance], first, axis=1)[:, full]
+        time_s, values, variance = totals / np.array([count[full], count[full], count[full] ** 2])
+        return BinnedLightCurve(time_s, values, variance, step_s)
 
 
 def criterion_of_process(process: Process, data: BinnedLightCurve, size: float) -> float:
@@ -383,9 +370,9 @@ def _sharpen(data: BinnedLightCurve, process: Process) -> tuple[Process, float] 
     size, period, quality, *_ = process.terms[-1].parameters
     sharp = ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
     terms, log_excess = (*process.terms[:-1], sharp), float(np.log(process.excess))
-    coarse = BinnedLightCurve.of(data.time_s, data.values, data.variance, data.step_s, MAX_TRIED)
+    coarse = data.binned(MAX_TRIED)
     fitted, bic = _fit_terms(coarse, terms, log_excess)
-    if coarse.step_s != data.step_s:
+    if coarse is not data:
         if bic + STRONG >= _fit_terms(coarse, process.terms, log_excess)[1]:
             return None
         fitted, bic = _fit_terms(data, fitted.terms, log_excess)
@@ -480,10 +467,8 @@ def _fit_terms(data: BinnedLightCurve, terms: tuple[ProcessTerm, ...], log_exces
     options: Any = {"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(x)), 1.0)}
     # The estimate of the curvature may mislead a fit, which another one from its end on shows.
     for _ in range(STARTS):
-        result = scipy.optimize.minimize(
-            cost_and_slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options
-        )
-        x, before, value = result.x, value, float(result.fun)
+        best = scipy.optimize.minimize(cost_and_slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        x, before, value = best.x, value, float(best.fun)
         if before - value < SAME:
             break
     return process_of(x), 2 * value + start.size * float(np.log(data.values.size))

@@ -18,17 +18,9 @@ from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.spectrum import Measurement, fit
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.noise.unknowns import NUISANCES
+from mauvecl.observations import frame_model as models
 from mauvecl.observations.detector import variance_of_steps
 from mauvecl.observations.events import Kind
-from mauvecl.observations.frame_model import (
-    CLEARLY,
-    CleanedSpectra,
-    FrameModel,
-    LightChange,
-    chi2_of_one,
-    clean_spectra,
-    light_changes,
-)
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import QuiescentLevel, check_usable, guess_flares, single_frames
 from mauvecl.observations.light_curve import fit_quiet_light, quiescent_light
@@ -85,9 +77,9 @@ class SpectralSeries:
     excess: Float  # shape (n_frame, n_pixel); spectra less that of the quiescent star
     light: Float  # shape (n_pixel,); spectrum of the quiescent star
     noise: PixelNoise
-    cleaned: CleanedSpectra
+    cleaned: models.CleanedSpectra
     jitters: Mapping[str, float]  # standard deviations of unknowns of frames; infinite if they are projected out
-    changes: list[LightChange]  # sudden changes of the light that all pixels share
+    changes: list[models.LightChange]  # sudden changes of the light that all pixels share
     snr_kept: float  # S/N of flares over that with a steady level of the frames
     dark_drift: float  # range of the slow changes of the dark current over the light in the sum; 0 if they are small
 
@@ -125,7 +117,7 @@ def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared:
 
 def survey_spectra(
     frames: Frames,
-    model: FrameModel,
+    model: models.FrameModel,
     shape: Shape,
     rank: int,
     seed: int,
@@ -137,7 +129,7 @@ def survey_spectra(
     Slow changes of what the weights let through are processes of the weighted sums. The level that is returned is that
     of the sum over wavelength, with flags of single frames that only the weighted sums show.
     """
-    fits, cleaned = steps.part(0.0, 0.9), clean_spectra(frames, model)
+    fits, cleaned = steps.part(0.0, 0.9), models.clean_spectra(frames, model)
     frames = cleaned.frames
     flux, error = frames.white_light
     assert error is not None
@@ -147,7 +139,7 @@ def survey_spectra(
     events = np.zeros(flux.size, np.bool_)
     events[used] = guess_flares(frames.numbers[used], flux[used])
     for _ in range(ROUNDS):
-        series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
+        series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters or {})
         lit, level = np.maximum(series.light, 0.0), float(np.median(flux[used & ~events]))
         # Frames without light, such as dark frames, have no photon noise that could weight the gains.
         photon = float(np.average(cleaned.model.gain, weights=lit if lit.any() else None))
@@ -171,7 +163,7 @@ def survey_spectra(
 
 
 def _weighted_sums(
-    cleaned: CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float] | None
+    cleaned: models.CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float]
 ) -> tuple[SpectralSeries, Templates, Float]:
     """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
 
@@ -193,9 +185,9 @@ def _weighted_sums(
     flares = model.flares(TEMPERATURES_K)
     compared = np.flatnonzero(reasons == 0)
     alternatives = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
-    changes = light_changes(excess, compared, frames.numbers, light, alternatives, noise.used)
+    changes = models.light_changes(excess, compared, frames.numbers, light, alternatives, noise.used)
     dark, drift = _dark_changes(excess, pairs, quiet, noise.used, shared)
-    deviations = {"light": np.inf} | dark | dict(jitters or {})
+    deviations = {"light": np.inf} | dark | dict(jitters)
     names = tuple(name for name in deviations if name in unknown)
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
                           np.array([deviations[name] for name in names]))  # fmt: skip
@@ -318,7 +310,7 @@ class EventSpectrum:
     def ambiguous(self) -> bool:
         """True if a flare explains the spectrum best, but hardly better than a change of the instrument does."""
         rival = min(value for cause, value in self.chi2.items() if cause != "flare")
-        return self.cause == "flare" and rival < self.chi2["flare"] + CLEARLY
+        return self.cause == "flare" and rival < self.chi2["flare"] + models.CLEARLY
 
     @property
     def reason(self) -> str:
@@ -352,7 +344,7 @@ def event_spectrum(
     flares, unknown = model.flares(TEMPERATURES_K), model.unknowns(series.light)
     causes: dict[Kind, Float] = {"flare": flares}
     causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
-    fits = {cause: chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
+    fits = {cause: models.chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
     chi2 = {cause: float(values.min()) for cause, values in fits.items()}
     # Light is added, never taken away.
     rises = flares @ (spectrum / variance) > 0
@@ -370,7 +362,7 @@ def event_spectrum(
     p_value = float(scipy.stats.chi2.sf(least, dof))
     if p_value < NO_FIT and (residual**2 / variance).max() > RAY_SHARE * least:
         cause = "cosmic ray"
-    elif cause != "flare" and (chi2["flare"] - least < CLEARLY or snr >= FLARE_SNR):
+    elif cause != "flare" and (chi2["flare"] - least < models.CLEARLY or snr >= FLARE_SNR):
         cause = "flare"
     return EventSpectrum(cause, snr, chi2, dof, p_value)
 

@@ -164,7 +164,7 @@ def test_level_norms_and_covariances_are_those_of_the_matrices(kind: Any, parame
 
 def test_bins_of_a_long_light_curve_are_means_with_their_variance() -> None:
     frames = np.delete(np.arange(24.0), [5, 6, 7, 14])
-    data = processes.BinnedLightCurve.of(10 * frames, frames**2, 1 + frames, 10.0, largest=7)
+    data = processes.BinnedLightCurve(10 * frames, frames**2, 1 + frames, 10.0).binned(7)
     # Of three frames each, of which one is too few.
     ends = ((0, 3), (3, 5), (9, 12), (12, 14), (15, 18), (18, 21), (21, 24))
     bins = [np.arange(*map(float, pair)) for pair in ends]
