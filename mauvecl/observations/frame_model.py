@@ -67,12 +67,10 @@ class FrameModel:
         elif elements is not None:
             bins = (~quiet.saturated * (quiet.element == elements[:, None])).astype(np.float64)
         else:
-            raise InputError(
-                f"the spectra must have the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} "
-                f"resolution elements of {quiet.instrument}, but have {frames.wavelength_nm.size} wavelengths from "
-                f"{frames.wavelength_nm[0]:.1f} nm",
-                key="wavelength_nm",
-            )
+            expected = f"{quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements"
+            given = f"{frames.wavelength_nm.size} wavelengths from {frames.wavelength_nm[0]:.1f} nm"
+            fault = f"the spectra must have the {expected} of {quiet.instrument}, but have {given}"
+            raise InputError(fault, key="wavelength_nm")
         if flux is not None:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
@@ -117,10 +115,7 @@ class FrameModel:
         return self.bins @ fixed * self.per_dn**2 + self.gain * np.maximum(light, 0.0)
 
     def exposure(self, light: Float, variance: Float, n_frames: int) -> Expectation:
-        """Return the expectation of some frames, with one pixel for each value, as measured.
-
-        Light of a quiescent frame and its variance are in the frames' unit.
-        """
+        """Return the expectation of some frames, with one pixel for each value, from light and variance as measured."""
         gain = self.gain / self.per_dn
         electrons = np.maximum(light / self.per_dn, 0.0) / gain / self.quiet.n_frames
         total = variance / self.per_dn**2 / self.quiet.n_frames
@@ -293,8 +288,7 @@ def _replace_rays(
     spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
     basis = np.linalg.svd(spectra / np.linalg.norm(spectra, axis=1, keepdims=True) / sd, full_matrices=False)[2]
     limit = float(scipy.stats.norm.isf(CHANCE_RAYS / 2 / excess.size))
-    bad = np.zeros(excess.shape, np.bool_)
-    rows = np.arange(at.size)
+    bad, rows = np.zeros(excess.shape, np.bool_), np.arange(at.size)
     for _ in range(RAY_ROUNDS):
         fit = (excess[rows] / sd) @ basis.T @ basis * sd
         residual = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
@@ -309,10 +303,9 @@ def _replace_rays(
         if not rows.size:
             break
     # An excess in the same pixel of a neighbouring frame as well is not a ray, but light that the fit does not include.
-    adjacent = np.diff(numbers[at]) == 1
-    persistent = bad[1:] & bad[:-1] & adjacent[:, None]
+    persistent = bad[1:] & bad[:-1] & (np.diff(numbers[at]) == 1)[:, None]
     bad[1:] &= ~persistent
     bad[:-1] &= ~persistent
-    where = np.nonzero(bad)
-    flux[at[where[0]], where[1]] = (excess + light)[where]
+    frame, pixel = np.nonzero(bad)
+    flux[at[frame], pixel] = (excess + light)[bad]
     return np.asarray(bad.sum(axis=1), np.int64)

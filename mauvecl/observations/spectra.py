@@ -171,14 +171,11 @@ def _weighted_sums(
     """
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[quiet].mean(axis=0)
-    unknown = model.unknowns(light)
-    excess = frames.flux - light
-    neighbours = np.diff(frames.numbers) == 1
-    pairs = np.flatnonzero(quiet[:-1] & quiet[1:] & neighbours)
+    unknown, excess = model.unknowns(light), frames.flux - light
+    pairs = np.flatnonzero(quiet[:-1] & quiet[1:] & (np.diff(frames.numbers) == 1))
     if not pairs.size:
-        raise InputError(
-            f"{frames.name} needs neighbouring frames without a flare, from which the noise follows", key="frames"
-        )
+        fault = "needs neighbouring frames without a flare, from which the noise follows"
+        raise InputError(f"{frames.name} {fault}", key="frames")
     assert frames.wavelength_nm is not None
     shared = np.array([unknown["light"], unknown["dark"]])
     noise = measure_noise(excess, pairs, cleaned.stated, shared, frames.wavelength_nm)
@@ -207,9 +204,8 @@ def _weighted_sums(
 
 def _independent(sums: Float, pairs: NDArray[np.intp], quiet: Bool) -> Float:
     """Return the matrix of sums of unit covariance, as measured, along the axes on which they change slowly."""
-    n = sums.shape[1]
+    n, steps = sums.shape[1], sums[pairs + 1] - sums[pairs]
     mixing = np.eye(n)
-    steps = sums[pairs + 1] - sums[pairs]
     covariance = steps.T @ steps / (2 * pairs.size)
     if (np.abs(covariance - mixing) > DEPARTS * 2 * relative_error(pairs.size)).any():
         mixing = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -266,11 +262,9 @@ def event_colour(spectra: Float, error: Float, event: Bool, quiet: Bool) -> tupl
     excess = spectra[event].mean(axis=0) - star
     count, base = np.count_nonzero(event), np.count_nonzero(quiet)
     variance = (error[event] ** 2).sum(axis=0) / count**2 + (error[quiet] ** 2).sum(axis=0) / base**2
-    scale = _multiple(excess, star, variance)
-    chi2 = ((excess - scale[0] * star) ** 2 / variance).sum()
-    half = fine.sum() // 2
-    halves = (slice(None, half), slice(half, None))
-    blue, red = (_multiple(excess[pixels], star[pixels], variance[pixels]) for pixels in halves)
+    scale, half = _multiple(excess, star, variance)[0], fine.sum() // 2
+    chi2 = ((excess - scale * star) ** 2 / variance).sum()
+    blue, red = (_multiple(excess[k], star[k], variance[k]) for k in (slice(None, half), slice(half, None)))
     ratio = blue[0] / red[0]
     relative = np.hypot(blue[1] / blue[0], red[1] / red[0])
     return float(ratio), float(abs(ratio) * relative), float(scipy.stats.chi2.sf(chi2, fine.sum() - 1))
@@ -352,12 +346,9 @@ def event_spectrum(
     together = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.full(len(unknown), np.inf))
     rows = together.rows(variance, together.spectra)
     optimal = flares / variance - (flares @ rows.T) @ rows
-    values = (optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))
-    snr = float(values.max())
+    snr = float(((optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))).max())
     cause: Kind = min(chi2, key=lambda name: chi2[name])
-    dof = spectrum.size - 1
-    least = chi2[cause]
-    row = causes[cause][fits[cause].argmin()]
+    dof, least, row = spectrum.size - 1, chi2[cause], causes[cause][fits[cause].argmin()]
     residual = spectrum - (row @ (spectrum / variance)) / (row @ (row / variance)) * row
     p_value = float(scipy.stats.chi2.sf(least, dof))
     if p_value < NO_FIT and (residual**2 / variance).max() > RAY_SHARE * least:
@@ -385,8 +376,7 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, n_fram
     of noise, and what noise may hide. With fewer than `MIN_PARTS` means, shorter ones are taken, and changes are
     assumed to grow in proportion to time. The sky has its documented prior.
     """
-    unknown = series.cleaned.model.unknowns(series.light)
-    names = ("light", "dark")
+    unknown, names = series.cleaned.model.unknowns(series.light), ("light", "dark")
     spectra = np.array([unknown[name] for name in names])
     amplitudes, covariance = fit_changes(series.excess, spectra, series.noise.used)
     drift = dict.fromkeys(names, np.inf)
@@ -399,9 +389,8 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, n_fram
         means, counts = [amplitudes[(segment == k) & ~in_events].mean(axis=0) for k in enough], counts[enough]
         size = size if len(means) >= MIN_PARTS else size // 2
     if len(means) >= MIN_PARTS:
-        bends = np.diff(np.array(means), 2, axis=0) / 2
+        bends, share = np.diff(np.array(means), 2, axis=0) / 2, 1.0 / counts
         for k, name in enumerate(names):
-            share = 1.0 / counts
             # A mean less that of its neighbours has 3/2 of the variance of a mean, where all are of as many frames.
             expected = float(covariance[k, k]) * float((share[:-2] / 4 + share[1:-1] + share[2:] / 4).mean())
             beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
@@ -422,9 +411,8 @@ def measure_flare(
     n, base = int(inside.sum()), int((~inside).sum())
     if base < MIN_BASELINE:
         return f"{base} frames around it show the quiescent star, {MIN_BASELINE} are needed"
-    excess = series.excess[at]
+    excess, model = series.excess[at], series.cleaned.model
     summed = excess[inside].sum(axis=0) - n * excess[~inside].mean(axis=0)
-    model = series.cleaned.model
     # The level is that of a finite number of frames.
     variance = series.noise.used**2 * (1 + n / base)
     exposure = model.exposure(series.light, variance, n)
