@@ -53,11 +53,9 @@ class CalibrationFrames:
             fault = "dark current and bias are subtracted; use read_frames(..., raw=True)"
             raise InputError(f"{name}: {fault}", key="frames")
         temperatures = frames.temperature_c
-        if temperatures is None:
-            if temperature_c is None:
-                fault = f"{name} needs a column of detector temperatures, or temperature_c"
-                raise InputError(fault, key="temperature_c")
-            temperatures = np.full(frames.n_frames, temperature_c)
+        if temperatures is None and temperature_c is None:
+            raise InputError(f"{name} needs a column of detector temperatures, or temperature_c", key="temperature_c")
+        temperatures = np.full(frames.n_frames, temperature_c) if temperatures is None else temperatures
         good = (frames.faults == 0) & np.isfinite(temperatures)
         lengths = np.unique(frames.exposure_s[good].round(6))
         if good.sum() < 3 or lengths.size != 1:
@@ -206,10 +204,9 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     variance, light, dark, dof, gains, shares = measured
     fits = {"DN": _fit(shares, gains * light, dark, variance, dof),
             "electrons": _fit(shares, gains * (light + dark), np.zeros_like(dark), variance, dof)}  # fmt: skip
-    better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
-    assumed: tuple[str, ...] = ("unit of the dark counts",)
+    better, unit, assumed = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit, ["unit of the dark counts"]
     if abs(better) > MIN_CHI2_DIFFERENCE:
-        unit, assumed = "electrons" if better > 0 else "DN", ()
+        unit, assumed = "electrons" if better > 0 else "DN", []
     (read, gain), covariance, chi2, model = fits[unit]
     errors = np.sqrt(np.diag(covariance))
     if not gain > MIN_SNR * errors[1]:
@@ -221,7 +218,7 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
     read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))
     return PhotonTransfer(noise, covariance, float(read_error), unit, float(chi2),
-                          variance.size - 2, light, variance, model, assumed)  # fmt: skip
+                          variance.size - 2, light, variance, model, tuple(assumed))  # fmt: skip
 
 
 def _fit(share: Float, column: Float, fixed: Float, variance: Float, dof: Float) -> tuple[Float, Float, float, Float]:
@@ -304,9 +301,9 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     Without frames all are the instrument's.
     """
     bias, level = (nominal.per_pixel(*of) for of in (("bias_dn", nominal.bias_dn), ("dark", nominal.dark_dn_per_s)))
-    covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)
     if not dark:
         return _assumed_dark(nominal, level, bias)
+    covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)
     raw = np.concatenate([frames.raw_dn for frames in dark])
     temperature = np.concatenate([frames.temperature_c for frames in dark])
     exposure = np.concatenate([np.full(frames.n_frames, frames.exposure_s) for frames in dark])
@@ -333,30 +330,20 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         change, error = fitted[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
     mean = seconds[:, None] * level
     return DarkFit(
-        reference_c=reference,
-        level_dn_per_s=level,
-        bias_dn=bias,
-        covariance=covariance,
-        shared=shared,
-        slope_per_c=slope,
-        pixel_slope_per_c=slope + change,
-        pixel_slope_error=error,
+        reference, level, bias, covariance, shared, slope, pixel_slope_per_c=slope + change, pixel_slope_error=error,
         chi2=float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean))),
         dof=raw.size - len(used) * n_pixel - int(fits_slope) - int(shares_bias),
         slopes_p_value=float(scipy.stats.chi2.sf(np.sum((change / error) ** 2), n_pixel - 1)),
-        assumed=(*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))),
-    )
+        assumed=tuple(name for name, fits in (("dark slope", fits_slope), ("bias", fits_bias)) if not fits),
+    )  # fmt: skip
 
 
 def _assumed_dark(nominal: Instrument, level: Float, bias: Float) -> DarkFit:
     """Return the instrument's dark current, with an assumed error of its level."""
     shared = np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0])
-    unknown = np.full(level.size, np.nan)
-    return DarkFit(
-        nominal.temperature_c, level, bias, covariance=np.zeros((level.size, 2, 2)), shared=shared,
-        slope_per_c=nominal.dark_slope_per_c, pixel_slope_per_c=unknown, pixel_slope_error=unknown,
-        assumed=("dark current", "dark slope", "bias"),
-    )  # fmt: skip
+    unknown, assumed = np.full(level.size, np.nan), ("dark current", "dark slope", "bias")
+    return DarkFit(nominal.temperature_c, level, bias, np.zeros((level.size, 2, 2)), shared,
+                   nominal.dark_slope_per_c, unknown, unknown, assumed)  # fmt: skip
 
 
 def _mean_dark(

@@ -225,11 +225,8 @@ def _with_row_per_frame(quantities: Quantities, label: str) -> Quantities:
     counts = np.bincount(number, minlength=frames.size * pixels.size).reshape(frames.size, pixels.size)
     if (counts != 1).any():
         row, column = np.argwhere(counts != 1)[0]
-        raise InputError(
-            f"{label}: the frame at {frames[row]} must have one row of wavelength {pixels[column]:g}, "
-            f"not {counts[row, column]}",
-            key="wavelength",
-        )
+        fault = f"{label}: the frame at {frames[row]} must have one row of wavelength {pixels[column]:g}"
+        raise InputError(f"{fault}, not {counts[row, column]}", key="wavelength")
     place, by_frame = np.argsort(number).reshape(counts.shape), {}
     for key, values in quantities.items():
         if key in ("flux", "error", "quality"):
@@ -316,11 +313,8 @@ def _check_rows(file: TableFile, quantities: Quantities) -> None:
             raise InputError(f"{fault}; give one, or name wavelengths in a mapping", key=values.name)
     if len(flux.shape) > 2:
         pixels = " x ".join(map(str, flux.shape[1:]))
-        raise InputError(
-            f"{label}: {flux.name!r} holds images of {pixels} pixels, as target pixel files do; "
-            "give a light curve, such as lightkurve's `to_lightcurve` makes",
-            key="flux",
-        )
+        fault = f"{label}: {flux.name!r} holds images of {pixels} pixels, as target pixel files do"
+        raise InputError(f"{fault}; give a light curve, such as lightkurve's `to_lightcurve` makes", key="flux")
 
 
 def _conditions(
@@ -347,18 +341,18 @@ def _conditions(
 def _relative_to_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float | None, str, list[str]]:
     """Return light and errors, as multiples of the level if they are deviations from it in parts, and remarks."""
     finite = np.sort(light[np.isfinite(light)])
+    finite, remarks = finite[finite.size // 100 : finite.size - finite.size // 100], list[str]()
     if not finite.size:
-        return light, sd, unit, []
-    finite = finite[finite.size // 100 : finite.size - finite.size // 100]
+        return light, sd, unit, remarks
     level, share = float(finite.mean()), PARTS_OF_LEVEL.get(unit.lower())
     # A tenth of the light of a star is not below zero.
     if share is not None and finite[finite.size // 10] < 0.0:
         remarks = [f"its light is a deviation from its level in {unit}, and is read as a multiple of the level"]
         return 1.0 + share * light, None if sd is None else share * sd, "", remarks
-    if level > MIN_LEVEL_SNR * float(finite.std()) / np.sqrt(finite.size):
-        return light, sd, unit, []
-    remarks = [f"the mean of its light is {level:.3g}, not significantly above zero, as after a level or an image is "
-            "subtracted: amplitudes and equivalent durations relative to it mean nothing"]  # fmt: skip
+    if not level > MIN_LEVEL_SNR * float(finite.std()) / np.sqrt(finite.size):
+        cause = "not significantly above zero, as after a level or an image is subtracted"
+        effect = "amplitudes and equivalent durations relative to it mean nothing"
+        remarks = [f"the mean of its light is {level:.3g}, {cause}: {effect}"]
     return light, sd, unit, remarks
 
 
@@ -383,21 +377,14 @@ def _frames_in(
     quality = None if flags is None else np.where(np.isfinite(flags), flags, bits.mask & -bits.mask)
     by_frame |= {"error": sd, "quality": quality}
     frames = Frames.of(
-        time[has_time],
-        light[has_time],
+        time[has_time], light[has_time],
         **{name: None if column is None else column[has_time] for name, column in by_frame.items()},
-        quality_mask=bits.mask,
-        mission=bits.mission,
+        quality_mask=bits.mask, mission=bits.mission, wavelength_nm=nm if light.ndim == 2 else None, unit=unit,
         name=mapping.name or str(header.get("OBJECT", "") or header.get("star", "") or stem),
-        wavelength_nm=nm if light.ndim == 2 else None,
-        unit=unit,
         instrument=str(header.get("INSTRUME", "") or header.get("TELESCOP", "")).strip(),
-        reference_mjd=system.epoch_mjd,
-        scale=system.scale,
-        position=system.position,
-        direction_deg=system.direction_deg,
-        net=isinstance(file, stored.StoredFile) and mapping.flux != "raw",
-    )
+        reference_mjd=system.epoch_mjd, scale=system.scale, position=system.position,
+        direction_deg=system.direction_deg, net=isinstance(file, stored.StoredFile) and mapping.flux != "raw",
+    )  # fmt: skip
     if system.at != 0.5:
         frames = frames.shifted((0.5 - system.at) * frames.exposure_s)
     return frames.with_remarks((*remarks, *bits.remarks(frames.quality, frames.name)))
@@ -412,14 +399,13 @@ def _read_light(
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     sd = None if sd is None else without_indefinite(sd)
-    notes: list[str] = []
-    unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
+    notes, unused = [*file.remarks], [name for name in file.columns if FLAGS & {*words_of(name)}]
     if "quality" not in quantities and unused:
-        notes = [*notes, f"no flags are used; a mapping with quality names one of {', '.join(unused)}"]
+        notes.append(f"no flags are used; a mapping with quality names one of {', '.join(unused)}")
     if len(light.shape) == 1:
         light, sd, unit, on_level = _relative_to_level(light, sd, unit)
-        notes = [*notes, *on_level]
-    remarks += (*more, *(f"{file.label}: {text}" for text in (*file.remarks, *notes)))
+        notes += on_level
+    remarks += (*more, *(f"{file.label}: {text}" for text in notes))
     if sd is not None and not np.isfinite(sd).any():
         # lightkurve writes a column of NaN for errors that it does not know.
         sd = None
@@ -438,11 +424,10 @@ def _excluding_bits(quality: Values | None, bits: QualityBits) -> Values | None:
 
 def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
     """Return the unit of the light, light and errors in it, and remarks."""
-    flux, error = quantities["flux"], quantities.get("error")
-    remarks: tuple[str, ...] = ()
+    flux, error, remarks = quantities["flux"], quantities.get("error"), tuple[str, ...]()
     file_unit = flux.stated_unit
     unit = mapping.flux_unit or file_unit
-    if mapping.flux_unit and file_unit and mapping.flux_unit != file_unit:
+    if file_unit and unit != file_unit:
         remarks = (f"the unit of {flux.name!r} is {mapping.flux_unit} as the mapping says, not {file_unit}",)
     if not unit and (is_magnitude(flux.name) or {*words_of(flux.name)} & {"log", "ln", "dex"}):
         remedy = "convert magnitudes and logarithms first, or name a linear unit as flux_unit in a mapping"
@@ -452,11 +437,10 @@ def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, V
         raise InputError.of("flux_unit", unit, expected, where=flux.label)
     if error is None:
         return unit, flux, None, remarks
-    named = f"{error.label}: {error.name!r}"
+    named, error_unit = f"{error.label}: {error.name!r}", error.stated_unit
     if error.shape != flux.shape:
         fault = f"{named} must have the shape of the flux, {flux.shape}, not {error.shape}"
         raise InputError(fault, key="error")
-    error_unit = error.stated_unit
     if error_unit and not unit and error_unit.lower() in PARTS_OF_LEVEL:
         remedy = "give errors in the unit of the light, or flux_unit = '1' in a mapping if its level is 1"
         raise InputError(f"{named} is in {error_unit}, and {flux.name!r} is not; {remedy}", key="error")
@@ -475,9 +459,9 @@ def _vacuum_nm(wavelength: Values, mapping: FrameMapping, file: TableFile) -> Fl
     unit, medium = unit_and_medium(mapping.wavelength_unit or "")
     stated_unit, stated_medium = unit_and_medium(wavelength.unit)
     nm = convert(replace(wavelength, unit=stated_unit or ""), unit, "nm", "wavelength_unit")
-    pixels = nm.rows(slice(0, 1))[0] if len(nm.shape) == 2 else nm.numbers().ravel()
-    for piece in nm.pieces if len(nm.shape) == 2 else []:
-        if not np.allclose(nm.rows(piece), pixels, rtol=1e-9, atol=0.0):
-            fault = f"{wavelength.label}: the wavelengths must be the same in every frame, but change"
-            raise InputError(fault, key="wavelength")
+    by_frame = len(nm.shape) == 2
+    pixels = nm.rows(slice(0, 1))[0] if by_frame else nm.numbers().ravel()
+    if by_frame and not all(np.allclose(nm.rows(piece), pixels, rtol=1e-9, atol=0.0) for piece in nm.pieces):
+        fault = f"{wavelength.label}: the wavelengths must be the same in every frame, but change"
+        raise InputError(fault, key="wavelength")
     return vacuum_wavelengths(pixels, wavelength.name, "", medium or stated_medium, (file.header,))[0]

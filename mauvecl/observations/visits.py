@@ -109,24 +109,22 @@ def recover_periods(
     frequency = _frequencies(base, 1 / (longest_d or max(periods_d)), 1 / (shortest_d or min(periods_d)))
     generator = np.random.default_rng(seed)
 
-    def peak(values: Float) -> tuple[float, float]:
+    def peak(light: Float | float) -> tuple[float, float]:
+        """Return the highest power in a light curve with noise, and its frequency."""
+        values = light + generator.standard_normal(time.size)
         power = LombScargle(time, values).power(frequency, method="fast", assume_regular_frequency=True)
         best = int(np.argmax(power))
         return float(power[best]), float(frequency[best])
 
-    noise = np.sort([peak(generator.standard_normal(time.size))[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])
+    def recovery(amplitude: float, period: float) -> Interval:
+        phases = generator.uniform(0, 2 * np.pi, trials)
+        peaks = [peak(amplitude * np.sin(2 * np.pi * time / period + phase)) for phase in phases]
+        found = sum(power > threshold and abs(at - 1 / period) < 0.5 / base for power, at in peaks)
+        return clopper_pearson(found, trials)
+
+    noise = np.sort([peak(0.0)[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])
     threshold = float(noise[-IN_TAIL])
-    recovered = []
-    for amplitude in amplitudes:
-        row = []
-        for period in periods_d:
-            recoveries = 0
-            for phase in generator.uniform(0, 2 * np.pi, trials):
-                values = amplitude * np.sin(2 * np.pi * time / period + phase) + generator.standard_normal(time.size)
-                power, at = peak(values)
-                recoveries += power > threshold and abs(at - 1 / period) < 0.5 / base
-            row.append(clopper_pearson(recoveries, trials))
-        recovered.append(row)
+    recovered = [[recovery(amplitude, period) for period in periods_d] for amplitude in amplitudes]
     return PeriodRecovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
 
 
@@ -177,10 +175,10 @@ def smallest_change(
     >>> round(smallest_change(1.0, 2, 0.05, 0.9).one, 3)
     4.584
     """
-    dof = visits - 1
-    cut = float(scipy.stats.chi2.isf(fap, dof))
     if power <= fap:
         return SmallestChanges(0.0, 0.0)
+    dof = visits - 1
+    cut = float(scipy.stats.chi2.isf(fap, dof))
     # Non-centrality with which the test exceeds its threshold with this probability.
     centre = scipy.special.chndtrinc(cut, dof, 1.0 - power)
     ratio = cut / float(scipy.stats.chi2.isf(power, dof))
@@ -220,9 +218,8 @@ def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None
         return float("nan")
     variance = float(np.sum(weights**2 * quiet.variance_dn2))
     if unknown:
-        moved = unknown.spectra @ weights
-        free = np.isinf(unknown.sd)
-        if np.any(np.abs(moved[free]) > 0):
+        moved, free = unknown.spectra @ weights, np.isinf(unknown.sd)
+        if moved[free].any():
             return float("inf")
         variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))
     return float(np.sqrt(variance))
@@ -421,9 +418,8 @@ class Change:
             try:
                 line = EmissionLine.named(name)
             except InputError:
-                expected = (
-                    f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum"
-                )
+                lines = ", ".join(INDICES)
+                expected = f"a line such as {lines}, a band such as 200-320, balmer jump, colour or spectrum"
                 raise InputError.of("change.of", shortened(name), expected) from None
             nm = np.unique(np.concatenate([nm, line.nodes_nm]))
             flux, unit, meaning = line.profile(nm), "erg / (s cm2)", f"flux of {line.name}"
