@@ -57,10 +57,7 @@ def inject(
     survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int, temperature_k: float = NO_COLOUR_K,
     steps: Steps = UNREPORTED,
 ) -> InjectionCompleteness:  # fmt: skip
-    """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
-
-    They are injected into `free` frames, which belong to no event; the others are left out. `steps` reports each width.
-    """
+    """Inject flares of several half-widths and sizes into `free` frames at random times, and count those detected."""
     free_frames = np.flatnonzero(free)
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
     bank, frame_s = survey.bank, survey.stare.frame_s
@@ -290,17 +287,10 @@ class Analysis:
 
 
 def analyse_frames(
-    frames: Frames,
-    *,
-    rate: float = 1.0,
-    shape: str = "davenport2014",
-    seed: int = 1,
-    model: FrameModel | None = None,
-    rank: int = RANK,
-    jitters: Mapping[str, float] | None = None,
-    temperature_k: float = NO_COLOUR_K,
-    report: Callable[[float], None] | None = None,
-) -> Analysis:
+    frames: Frames, *, rate: float = 1.0, shape: str = "davenport2014", seed: int = 1,
+    model: FrameModel | None = None, rank: int = RANK, jitters: Mapping[str, float] | None = None,
+    temperature_k: float = NO_COLOUR_K, report: Callable[[float], None] | None = None,
+) -> Analysis:  # fmt: skip
     """Find the flares in observed frames.
 
     The `rate` is that of false alarms per star-day. The `model` is that of the pixels of spectra, which are

@@ -35,10 +35,7 @@ class CalibrationFrames:
 
     @classmethod
     def of(cls, frames: Frames, nominal: Instrument, star: Source | None, temperature_c: float | None = None) -> Self:
-        """Select the good frames of spectra that a detector recorded: raw DN of each pixel that the instrument reads.
-
-        `temperature_c` is that of the detector where the frames do not state it.
-        """
+        """Select the good frames of raw DN in the instrument's pixels; `temperature_c` is used where none is stated."""
         name, nm, own_nm = frames.name, frames.wavelength_nm, nominal.wavelength_nm
         if nm is None or nm.shape != own_nm.shape:
             expected = f"spectra of the {own_nm.size} pixels that {nominal.name} reads"

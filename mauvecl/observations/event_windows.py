@@ -52,10 +52,7 @@ GENERAL_WEIGHT = 0.5
 
 @dataclass(frozen=True)
 class HalfProfile(TimeProfile):
-    """Rise of a flare that ends at the peak, or decay that begins there.
-
-    Integrals are those up to a time before the peak and from a time after it, which is all that callers need.
-    """
+    """Rise that ends at the peak, by its integral up to a time, or decay that begins there, by that from a time."""
 
     integral: Callable[[Float], Float]
     decays: bool = False
@@ -112,10 +109,8 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        rises = [
-            HalfProfile(SHAPES["davenport2014"].before),
-            *(HalfProfile(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES),
-        ]
+        integrals = [SHAPES["davenport2014"].before, *(partial(_gaussian, width=-width) for width in GAUSSIAN_RISES)]
+        rises = [HalfProfile(integral) for integral in integrals]
         gaussian = HalfProfile(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
         # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
@@ -370,11 +365,7 @@ class Likelihood:
         return slope, np.maximum(information, least)
 
     def level_without(self, light: Float) -> Float:
-        """Return the level of the star at the peak less the light of flares, of which tails raise it.
-
-        It is that of frames without events where the values are not the star's light, or the fitted level is not
-        above zero.
-        """
+        """Return the level at the peak less the light of flares; that of frames without events if it is not above 0."""
         fitted = (self.window.values - light) @ self.level
         return np.where(fitted > 0, fitted, self.window.quiet_level)
 

@@ -348,10 +348,7 @@ class ObservedEvent:
 def measure_events(
     survey: SeriesSurvey, in_events: Bool, detected: Sequence[DetectedEvent], causes: Sequence[Kind], steps: Steps
 ) -> list[ObservedEvent]:
-    """Measure detected events in order of time; their frames are `in_events`, and `causes` follow from their spectra.
-
-    Weaker events next to a step or a dip belong to it. `steps` reports each event.
-    """
+    """Measure events in order of time; `causes` follow from their spectra. Weaker ones next to a step belong to it."""
     level = survey.flux_level(~in_events)
     pairs = list(zip(detected, causes, strict=True))
     measured = map_in_threads(lambda pair: measure_event(survey, in_events, level, *pair), pairs)

@@ -123,19 +123,11 @@ class FrameModel:
         nm, none = self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1), np.zeros(electrons.size)
         dark: dict[str, Any] = dict.fromkeys(("sky_electrons", "neighbour_electrons", "dark_dn", "bias_dn"), none)
         return replace(
-            self.quiet,
-            **dark,
-            source_electrons=electrons,
-            read_noise_dn=np.sqrt(read_variance),
-            gain_dn_per_electron=gain,
-            wavelength_nm=nm,
-            element=np.arange(nm.size, dtype=np.int32),
-            element_wavelength_nm=nm,
-            n_frames=self.quiet.n_frames * n_frames,
-            adc_max_dn=NO_CEILING_DN,
-            saturation_dn=float(NO_CEILING_DN),
-            messages=(),
-        )
+            self.quiet, **dark, source_electrons=electrons, gain_dn_per_electron=gain, wavelength_nm=nm,
+            read_noise_dn=np.sqrt(read_variance), element=np.arange(nm.size, dtype=np.int32),
+            element_wavelength_nm=nm, n_frames=self.quiet.n_frames * n_frames,
+            adc_max_dn=NO_CEILING_DN, saturation_dn=float(NO_CEILING_DN), messages=(),
+        )  # fmt: skip
 
 
 def _per_flam(unit: str, wavelength_nm: Float) -> Float | None:

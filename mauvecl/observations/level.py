@@ -75,10 +75,7 @@ class QuiescentLevel:
 
 
 def counts_per_unit(frames: Frames) -> float | None:
-    """Return the number of counts in a unit of the flux if frames hold few counts, or None.
-
-    Fluxes that are whole numbers, or become so by multiplication with the exposure time, are counts.
-    """
+    """Return the counts in a unit of the flux if frames hold few, as whole numbers or these per exposure; else None."""
     flux = frames.flux
     finite = np.isfinite(flux)
     if flux.ndim > 1 or not finite.any() or (flux[finite] < 0).any():

@@ -70,10 +70,7 @@ EACH = 0.07
 
 
 class Steps:
-    """Part of an analysis, which reports the share of the whole that is done.
-
-    `report` is called with shares of the whole, which rise from `first` to `last`; it may raise to stop the work.
-    """
+    """Part of an analysis; `report` is called with the share of the whole that is done, and may raise to stop it."""
 
     def __init__(self, report: Callable[[float], None] | None = None, first: float = 0.0, last: float = 1.0) -> None:
         self._report, self._first, self._last, self._done = report, first, last, 0.0
@@ -161,13 +158,11 @@ class Process:
         return " + ".join((*(term.kind for term in self.terms), "white"))
 
     def kernel(self) -> Any:
-        """Return the sum of the terms as a term of celerite2; one of zero variance if there are none.
-
-        Raises InputError if celerite2 is not installed, which has no wheels for some machines.
-        """
+        """Return the sum of the terms as a term of celerite2; one of zero variance if there are none."""
         try:
             from celerite2 import terms
         except ImportError as error:
+            # It has no wheels for some machines.
             fault = "celerite2, which models the light of stars, is not installed; use pip install celerite2"
             raise InputError(fault, key="celerite2") from error
         return terms.TermSum(*(term.kernel() for term in self.terms)) if self.terms else terms.RealTerm(a=0.0, c=1.0)
@@ -277,10 +272,7 @@ class Covariance:
 
 
 def level_fit(covariance: Covariance, values: Float) -> tuple[float, float, Float]:
-    """Return the mean of values by generalised least squares, their log likelihood, and the innovations without it.
-
-    The likelihood is integrated over a flat prior of the mean.
-    """
+    """Return the mean of values by least squares, their log likelihood for a flat prior of it, and the innovations."""
     values, constant = covariance.whitened(np.column_stack([values, np.ones(values.size)])).T
     information = float(constant @ constant)
     mean = float(values @ constant) / information
@@ -338,10 +330,7 @@ def criterion_of_process(process: Process, data: BinnedLightCurve, size: float) 
 
 
 def fit_process(data: BinnedLightCurve, start: Process | None = None, steps: Steps = UNREPORTED) -> Process:
-    """Fit a process to a light curve without flares; the terms of `start`, of nearly the same data, are kept.
-
-    `steps` reports each combination of terms.
-    """
+    """Fit a process to a light curve without flares; the terms of `start`, of nearly the same data, are kept."""
     if start is not None:
         return replace(_fit_terms(data, start.terms, float(np.log(start.excess)))[0], bic=start.bic)
     best, value = _fit_terms(data, (), data.log_excess)
@@ -409,10 +398,7 @@ def _rotation(size: float, period: float) -> ProcessTerm:
 
 
 def _find_period(data: BinnedLightCurve, values: Float, share: float) -> float | None:
-    """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
-
-    The values may be residuals of the data; `share` is the longest period over the length of the data.
-    """
+    """Return the most significant period of values, s, up to a `share` of the length of the data; None for noise."""
     from astropy.timeseries import LombScargle
 
     # Visits over years have few frames and many frequencies.

@@ -67,10 +67,7 @@ class Filter:
 
     @property
     def per_amplitude(self) -> Float:
-        """Mean of rho for a flare with unit peak along each direction, shape (n_direction, n_onset).
-
-        It is zero where the template is not searched, and where its norm is not solved.
-        """
+        """Mean of rho for a flare with unit peak, shape (n_direction, n_onset); zero where it is not searched."""
         squared = self.weights @ np.maximum(self.norms - self.lost, 0.0)
         searched = (squared >= LEAST_SHARE * self.without_gaps) & ~self.unsolved.any(axis=0)
         return np.sqrt(np.where(searched, squared, 0.0))
@@ -315,10 +312,7 @@ class SeriesSurvey:
         cls, frames: Frames, flux: Float, variance: Float, used: Bool, level: float, photon: float, shape: Shape,
         counts: float = 0.0, weighted: tuple[Templates, Float] | None = None,
     ) -> SeriesSurvey:  # fmt: skip
-        """Prepare the frames that can be searched, `used`, without a process; see the attributes.
-
-        The flux is searched, or sums of spectra, which are given by `weighted` with their templates.
-        """
+        """Prepare `used` frames without a process: their flux, or `weighted` sums of spectra with their templates."""
         stare, scale, typical = stare_of(frames, used), float(np.sqrt(np.median(variance[used]))), abs(level)
         net, relative_variance = flux[used] / scale, variance[used] / scale**2
         if weighted is None:
@@ -354,10 +348,7 @@ class SeriesSurvey:
         return np.asarray((self.sums - self.levels(quiet)) @ unit / np.sqrt(self.variance * (unit**2 @ excess**2)))
 
     def flux_level(self, quiet: Bool) -> Float:
-        """Return the quiescent level of the flux given quiescent frames, in units of `scale`, shape (n_frame,).
-
-        With fewer than `MIN_BASELINE` of these, it is the typical level.
-        """
+        """Return the level of the flux given quiescent frames, in units of `scale`, shape (n_frame,)."""
         if quiet.sum() < MIN_BASELINE:
             return np.full(quiet.size, self.level / self.scale)
         return self._level_of(self.flux_process, self.flux, quiet)
@@ -421,10 +412,7 @@ class SimulatedRate:
         return MIN_ALARMS / (self.largest.size * self.days)
 
     def rate(self, threshold: float) -> float:
-        """Return the events per star-day above a threshold, at the upper end of its 68 % interval.
-
-        Beyond the simulated values, it falls as the tail of normal noise does, or exponentially if that is not known.
-        """
+        """Return the events per star-day above a threshold, at the upper end of its 68 % interval."""
         return float(np.exp(self._log_rate(threshold)))
 
     def _log_rate(self, threshold: float) -> float:
@@ -437,6 +425,7 @@ class SimulatedRate:
         rate = float(np.log(-np.log1p(-float(scipy.stats.beta.ppf(UPPER, above + 1, n - above))) / self.days))
         if threshold <= anchor:
             return rate
+        # Beyond the simulated values, it falls as the tail of normal noise.
         fall = float(np.subtract(*scipy.special.log_ndtr([-anchor, -threshold])))
         if self.heavy and above:
             # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), or a normal
@@ -496,10 +485,7 @@ def simulated_rates(
 
 
 def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
-    """Return the residuals of quiescent frames given those before them, in standard deviations, (n_quiet, n_sum).
-
-    They are independent and of unit variance if the process describes the light.
-    """
+    """Return residuals of quiescent frames given those before, independent for the right process, (n_quiet, n_sum)."""
     columns = []
     for process, column in zip(survey.processes, survey.sums.T, strict=True):
         covariance = process.covariance(survey.stare.start_s[quiet], survey.variance[quiet] * process.excess**2)

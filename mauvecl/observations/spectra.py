@@ -116,14 +116,9 @@ def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared:
 
 
 def survey_spectra(
-    frames: Frames,
-    model: models.FrameModel,
-    shape: Shape,
-    rank: int,
-    seed: int,
-    jitters: Mapping[str, float] | None = None,
-    steps: Steps = UNREPORTED,
-) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
+    frames: Frames, model: models.FrameModel, shape: Shape, rank: int, seed: int,
+    jitters: Mapping[str, float] | None = None, steps: Steps = UNREPORTED,
+) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:  # fmt: skip
     """Prepare the search of spectra that is weighted for flares; `rank` and `jitters` are those of `analyse_frames`.
 
     Slow changes of what the weights let through are processes of the weighted sums. The level that is returned is that
@@ -403,10 +398,7 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, n_fram
 def measure_flare(
     survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, event: DetectedEvent
 ) -> Measurement | str:
-    """Fit a flare to the sum of the spectra of an event, or return the reason why none is fitted.
-
-    Star, dark current and sky may differ from the surroundings as much as other parts of the frames do; see `drifts`.
-    """
+    """Fit a flare and changes as of `drifts` to the summed spectra of an event, or return the reason why none is."""
     at, inside = _window(survey, in_events, event)
     n, base = int(inside.sum()), int((~inside).sum())
     if base < MIN_BASELINE:

@@ -210,10 +210,7 @@ class ThroughputModel:
             self.slopes_dn += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
 
     def light_dn(self, log_factor: Float, shape: Float) -> Float:
-        """Return the mean light of a frame of each star, DN, shape (n_star, n_pixel).
-
-        The light is quadratic in the local width of the line function.
-        """
+        """Return the mean light of a frame of each star, DN, shape (n_star, n_pixel)."""
         shift, stretch, width, change = np.pad(shape, (0, 4 - shape.size))
         nm, local, step = self.nominal.wavelength_nm, width + change * self.x, WIDTHS[-1] - 1.0
         light = []

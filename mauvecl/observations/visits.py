@@ -244,11 +244,7 @@ class LineIndex:
 
 
 def _integral_of_line(x: Float, weight: Float, share: Float) -> Float:
-    """Return the factors of pixels in the integral of the straight line fitted to them, shape (..., n_pixel).
-
-    It is a linear function of the pixels, by the weights of the least squares; `share` is the width of each pixel that
-    is integrated.
-    """
+    """Return the factors of pixels in the integral over `share` of each of the line fitted to them, (..., n_pixel)."""
     design = np.stack([np.ones_like(x), x])
     normal = np.einsum("ap,...p,bp->...ab", design, weight, design)
     coefficients = np.linalg.solve(normal, (design @ share)[:, None])[..., 0]
