@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 import scipy
@@ -12,12 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import Float
 from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.stars.source import Source
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    from mauvecl.host.stars.source import Source
-
 
 #: Share of saturation above which a mean raw level is not used, since clipping then changes mean and variance.
 MOST_OF_SATURATION = 0.98

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -21,10 +20,7 @@ from numpy.typing import NDArray
 from mauvecl.flares.shapes import SHAPES, Shape
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.event_windows import GENERAL_WEIGHT, Family, FittedFlare, Likelihood, Profile, Window
-
-if TYPE_CHECKING:
-    from mauvecl.observations.search import DetectedEvent, SeriesSurvey
-
+from mauvecl.observations.search import DetectedEvent, SeriesSurvey
 
 #: Published shapes that are averaged, besides that of the search.
 AVERAGED = ("davenport2014", "tovarmendoza2022")

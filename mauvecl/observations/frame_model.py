@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import spectrum_of
+from mauvecl.fits.flare_model import FlareModel
 from mauvecl.host.arrays import PER_MAD, Bool, Float
+from mauvecl.host.exposure.expectation import Expectation
+from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    from mauvecl.fits.flare_model import FlareModel
-    from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.observations.frames import Frames
-
 
 #: Share of bias and dark current below which the median of a pixel cannot include them.
 LEAST_OF_OFFSET = 0.5

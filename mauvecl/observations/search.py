@@ -17,26 +17,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
+from mauvecl.flares.shapes import Shape
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.host.arrays import Bool, Float, array_cache, map_in_threads
+from mauvecl.observations.frames import Frames
 from mauvecl.observations.level import ConditionalLevel
-from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
+from mauvecl.observations.process import UNREPORTED, Covariance, Process, Steps, level_fit
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search.search import largest_values
 from mauvecl.search.templates import LEAST_SHARE, Bank, Baseline, Template, Templates
-
-if TYPE_CHECKING:
-    from mauvecl.flares.shapes import Shape
-    from mauvecl.observations.frames import Frames
-    from mauvecl.observations.process import Covariance
-
 
 #: Flux of a template, relative to its peak, below which it is neglected.
 NEGLECTED = 1e-4

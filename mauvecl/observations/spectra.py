@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.spectrum import Measurement, fit
+from mauvecl.flares.shapes import Shape
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.observations import frame_model as models
@@ -28,10 +28,6 @@ from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
-
-if TYPE_CHECKING:
-    from mauvecl.flares.shapes import Shape
-
 
 #: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0

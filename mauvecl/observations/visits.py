@@ -8,29 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import Annotated, Self
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
 from mauvecl.detection.distributions import Interval, clopper_pearson
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import variance_of
 from mauvecl.host.arrays import Float
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.host.exposure.response import W_PER_NM_IN_FLAM, Order, electrons_per_second
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.orbit.visibility import Windows
 from mauvecl.host.stars.flare import BALMER_EDGE_NM, EmissionLine
+from mauvecl.host.stars.source import Source
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import DEFAULT_SEED, Positive, Probability, Range, Seed, Unit, Wavelength
-
-if TYPE_CHECKING:
-    from mauvecl.detection.nuisances import Nuisances
-    from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.host.orbit.visibility import Windows
-    from mauvecl.host.stars.source import Source
-
 
 #: Frequencies per resolution of the time base.
 OVERSAMPLING = 5
