@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -64,7 +64,6 @@ def inject(
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
     kelvin = survey.templates.nearest(temperature_k)
     direction = survey.templates.directions[kelvin]
-    # Photon noise of a flare of unit amplitude.
     photon_noise = np.linalg.cholesky(survey.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
     size_of = float(np.linalg.norm(direction))
     durations, detected = np.zeros((WIDTHS, SIZES)), np.zeros((WIDTHS, SIZES), np.int64)
@@ -81,7 +80,7 @@ def inject(
             count = min(BATCH, TIMES - first)
             peaks = starts[rng.integers(starts.size, size=count)] + frame_s * rng.random(count)
             shapes = np.array([bank.shape.mean_over(edges, peak, width) for peak in peaks])
-            # The photon noise of the flare itself is added to that of the frames.
+            # The photon noise of the flare itself, here for unit amplitude, is added to that of the frames.
             noise = rng.standard_normal((*shapes.shape, direction.size)) @ photon_noise.T
             noise *= np.sqrt(np.maximum(shapes, 0.0))[:, :, None]
             best = _largest_near(segment, peaks, width, amplitudes, shapes[:, :, None] * direction, noise)
@@ -107,8 +106,7 @@ def _largest_near(
             near = searched & (np.abs(times - peak) <= reach)
             if near.any():
                 quiet, flare, flare_noise = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
-                total = quiet + size * flare + np.sqrt(size) * flare_noise
-                best[:, k] = np.maximum(best[:, k], total.max((1, 2)))
+                best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * flare_noise).max((1, 2)))
     return best
 
 
@@ -241,8 +239,9 @@ class Analysis:
             )
         if changes := self.level.changes:
             largest = max(changes, key=lambda change: abs(change[1]))[1]
+            often = "once" if len(changes) == 1 else f"{len(changes)} times"
             yield (
-                f"The level changes {_often(changes)} suddenly for a day or more, by {100 * largest:+.2g} % at the "
+                f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the "
                 "most: light is relative to the level after each change, and the table of frames has that level."
             )
         if self.level.process.terms and not self.dark_misleads:
@@ -336,9 +335,8 @@ def _thresholds(
     of light have larger dips than noise; those below `candidates` may be missed.
     """
     simulated = simulated_rates(survey, quiet, rate, seed, steps)
-    threshold, candidates = (
-        max(alarms.threshold(allowed) for alarms in simulated) for allowed in (rate, max(rate, CANDIDATES))
-    )
+    allowed = (rate, max(rate, CANDIDATES))
+    threshold, candidates = (max(alarms.threshold(most) for alarms in simulated) for most in allowed)
     down = survey.frames(quiet).inverted()
     start = down.stare.start_s
     stare = replace(down.stare, start_s=start[-1] + start[0] - start[::-1])
@@ -347,10 +345,6 @@ def _thresholds(
     dip = max(float(rho.max(initial=-np.inf)) for rows in values for _, rho in rows)
     chance = -np.expm1(-max(alarms.rate(dip) for alarms in simulated) * survey.stare.observed_s / DAY_S)
     return simulated, max(threshold, dip) if chance < CHANCE_DIP else threshold, candidates, dip
-
-
-def _often(changes: Sequence[object]) -> str:
-    return "once" if len(changes) == 1 else f"{len(changes)} times"
 
 
 def _spectral_messages(spectra: spectral.SpectralSeries) -> Iterator[str]:
@@ -371,10 +365,10 @@ def _spectral_messages(spectra: spectral.SpectralSeries) -> Iterator[str]:
         )
     if changes := spectra.changes:
         largest = max(changes, key=lambda change: abs(change.change))
+        often = "once" if len(changes) == 1 else f"{len(changes)} times"
         yield (
-            f"The light that all pixels share changes suddenly {_often(changes)}, by up to "
-            f"{100 * abs(largest.change):.2g} %, as by pointing losses and re-acquisitions; the table of "
-            "throughput states when."
+            f"The light that all pixels share changes suddenly {often}, by up to {100 * abs(largest.change):.2g} %, as "
+            "by pointing losses and re-acquisitions; the table of throughput states when."
         )
     for name, sd in spectra.jitters.items():
         if np.isfinite(sd):

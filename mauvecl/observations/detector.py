@@ -182,8 +182,7 @@ def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit,
             light = np.zeros(mean.size) if frames.star is None else same.raw_dn[:, usable].mean(axis=0) - mean
             counts, n = mean - dark.bias_dn[usable], len(steps)
             variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, counts]))
-            # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann
-            # 1941).
+            # Degrees of freedom of the mean square of consecutive differences of normal values (von Neumann 1941).
             dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
             measured.append([variance, light, counts, dof, gains[usable], shares[usable]])
     return np.concatenate(measured, axis=1)
@@ -221,8 +220,7 @@ def _fit(share: Float, column: Float, fixed: Float, variance: Float, dof: Float)
     model = np.maximum(variance, 1.0)
     fitted, covariance = np.zeros(2), np.eye(2)
     for _ in range(ITERATIONS):
-        weight = dof / (2 * model**2)
-        weighted = design * weight[:, None]
+        weighted = design * (dof / (2 * model**2))[:, None]
         covariance = np.linalg.pinv(weighted.T @ design)
         fitted = covariance @ (weighted.T @ (variance - fixed))
         model = np.maximum(fixed + design @ fitted, ROUNDING)
@@ -306,12 +304,10 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     fits_slope, by_pixel = spread >= SLOPE_RANGE_C, float(exposure.max() / exposure.min()) >= EXPOSURE_RATIO
     shares_bias = not by_pixel and spread >= BIAS_RANGE_C
     fits_bias = by_pixel or shares_bias
-
     # The mean pixel gives what all pixels share: bias, slope, and their errors.
     free = np.array([fits_bias, True, fits_slope])
     common, shared, typical = _mean_dark(raw, exposure, offset, free, nominal, noise)
     slope, bias = float(common[2]), np.full(n_pixel, common[0]) if shares_bias else bias
-
     # With the slope known, each pixel is linear in its level and bias.
     seconds = exposure * np.exp(slope * offset)
     columns = np.column_stack([np.ones_like(seconds), seconds, seconds * offset])

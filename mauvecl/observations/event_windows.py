@@ -105,8 +105,8 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        integrals = [SHAPES["davenport2014"].before, *(partial(_gaussian, width=-width) for width in GAUSSIAN_RISES)]
-        rises = [HalfProfile(integral) for integral in integrals]
+        rises = [HalfProfile(SHAPES["davenport2014"].before)]
+        rises += [HalfProfile(partial(_gaussian, width=-width)) for width in GAUSSIAN_RISES]
         gaussian = HalfProfile(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
         # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
@@ -202,7 +202,6 @@ class Window:
         start, stop = numbers[first] * frame_s, (numbers[first + count - 1] + 1) * frame_s
         mean = np.add.reduceat(survey.sums[frames] @ unit, first) / count
         noise = np.add.reduceat(survey.variance[frames] * excess, first) / count**2
-        # The nearest bins on each side.
         rows = np.flatnonzero(is_inside)
         nearest = slice(max(rows[0] - MAX_OUTSIDE, 0), rows[-1] + 1 + MAX_OUTSIDE)
         return cls(
@@ -247,15 +246,13 @@ class Window:
 
     @cached_property
     def ranges(self) -> Float:
-        """Largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2).
-
-        A gap before the event may hold the peak, at most as long before as the event lasts.
-        """
+        """Largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2)."""
         event, survey = self.event, self.survey
         frame_s = survey.stare.frame_s
         first_s, last_s = survey.stare.start_s[event.first], survey.stare.start_s[event.last] + frame_s
         low, high = event.peak_s - PEAK_RANGE * event.half_width_s, event.peak_s + PEAK_RANGE * event.half_width_s
         before_s = float(survey.stare.start_s[event.first - 1]) + frame_s if event.first else -np.inf
+        # A gap before the event may hold the peak, at most as long before as the event lasts.
         low = min(low, max(first_s - max(4 * event.half_width_s, last_s - first_s), before_s))
         high = min(max(high, low + frame_s), last_s)
         widest = max(survey.bank.half_widths_s[-1], event.half_width_s) * 3

@@ -157,11 +157,9 @@ def _find_extent(survey: SeriesSurvey, in_events: Bool, faint: float, event: Det
     frame_s = survey.stare.frame_s
     start = event.peak_s - BEGINNING * event.half_width_s - frame_s / 2
     stop = event.peak_s + tail * event.half_width_s + frame_s / 2
-    # Frames are looked up by their middles.
     first, last, peak = np.searchsorted(survey.stare.start_s, np.array([start, stop, event.peak_s]) - frame_s / 2)
     peak = min(int(peak), survey.stare.n_frames - 1)
     first, last = min(int(first), peak), max(int(last) - 1, peak)
-    # Other events end it.
     before, after = np.flatnonzero(in_events[first:peak]), np.flatnonzero(in_events[peak : last + 1])
     if before.size:
         first = first + int(before[-1]) + 1
@@ -258,8 +256,7 @@ def _sum_light(survey: SeriesSurvey, in_events: Bool, level: Float, event: Detec
     near = slice(begin, event.last + 1 + NEARBY)
     time, noise = survey.stare.start_s[near], survey.variance[near] * process.excess**2
     inside = slice(event.first - begin, event.last + 1 - begin)
-    photon = survey.photon / survey.scale * np.maximum(flux, 0.0)
-    variance = float(counts**2 @ (noise[inside] + photon))
+    variance = float(counts**2 @ (noise[inside] + survey.photon / survey.scale * np.maximum(flux, 0.0)))
     quiet = ~in_events[near]
     if quiet.sum() >= MIN_BASELINE:
         # Variance of the sum of the level given quiescent frames: w^T K w less what they determine of it.
@@ -388,8 +385,7 @@ def measure_event(
     near = np.abs(middle[rows] - detected.peak_s) <= detected.half_width_s + frame_s
     brightness = np.where(near, flux, -np.inf) if survey.weighted and near.any() else flux
     brightest = first + int(np.argmax(brightness))
-    around = numbers[max(brightest - 1, 0) : brightest + 2]
-    missing_s = (int(np.diff(around).max()) - 1) * frame_s
+    missing_s = (int(np.diff(numbers[max(brightest - 1, 0) : brightest + 2]).max()) - 1) * frame_s
     at_end = first == 0 or last == survey.stare.n_frames - 1
     cut = at_end or bool((np.diff(numbers[[first - 1, first, last, last + 1]])[::2] > GAP_FRAMES).any())
     # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.

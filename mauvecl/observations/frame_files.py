@@ -292,7 +292,6 @@ def _check_rows(file: TableFile, quantities: Quantities) -> None:
     if not 0 < n <= MAX_FRAMES:
         expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
         raise InputError(f"{label} must have {expected}", key="frames")
-    # A light curve is that of one star in one band.
     columns = [file.find(name) for name in file.columns if key_of(name) in GROUPS and "wavelength" not in quantities]
     for column in (column for column in columns if len(column.shape) == 1):
         name, texts = column.name, column.texts()

@@ -272,8 +272,7 @@ def _replace_rays(
     """Replace bad values in some frames of `flux`, in place, and return their number in each of these frames."""
     excess = flux[at] - light
     # A robust measurement, so that errors that are stated too small make no rays.
-    scatter = PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0)
-    sd = np.maximum(noise, scatter)
+    sd = np.maximum(noise, PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0))
     spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
     basis = np.linalg.svd(spectra / np.linalg.norm(spectra, axis=1, keepdims=True) / sd, full_matrices=False)[2]
     limit = float(scipy.stats.norm.isf(CHANCE_RAYS / 2 / excess.size))

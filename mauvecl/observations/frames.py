@@ -167,8 +167,7 @@ def _in_order(key: str, column: Any, light: Float, order: NDArray[np.intp], name
         return None
     values = np.asarray(column, np.int64 if key == "quality" else np.float64)
     shape = light.shape if key == "error" else order.shape
-    if key == "error" and values.ndim == 0:
-        values = np.full(shape, values)
+    values = np.full(shape, values) if key == "error" and values.ndim == 0 else values
     if values.shape != shape:
         given, expected = f"those of shape {values.shape}", f"values of shape {shape}"
         raise InputError.of(key.removesuffix("_c"), given, expected, where=name)

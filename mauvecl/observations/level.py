@@ -80,8 +80,7 @@ def counts_per_unit(frames: Frames) -> float | None:
     finite = np.isfinite(flux)
     if flux.ndim > 1 or not finite.any() or (flux[finite] < 0).any():
         return None
-    exposure = float(np.median(frames.exposure_s))
-    for factor in (1.0, exposure):
+    for factor in (1.0, float(np.median(frames.exposure_s))):
         counts = flux[finite] * factor
         # Fluxes such as 1e-15 are near zero, but are no counts.
         integer = np.abs(counts - np.rint(counts)) <= 1e-6 * counts
@@ -98,10 +97,7 @@ def noise_of_steps(numbers: NDArray[np.int64], flux: Float) -> float:
 
 
 def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) -> Bool:
-    """Return a first guess of the frames in flares, which rise faster than the star otherwise does, shape (n_frame,).
-
-    `least` is the least standard deviation of a frame, since most of few counts are equal.
-    """
+    """Return a first guess of the frames in flares, which rise fast for a noise of `least` at least, (n_frame,)."""
     inside = np.zeros(flux.size, np.bool_)
     rises: list[tuple[float, int]] = []
     noise = max(noise_of_steps(numbers, flux), least)
@@ -129,10 +125,7 @@ def guess_flares(numbers: NDArray[np.int64], flux: Float, least: float = 0.0) ->
 
 
 def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tuple[Float, float]:
-    """Return the variance of the noise of each frame at its level as stated, and its rise with the flux.
-
-    Stated errors often follow the counts of the frame, of which the difference from the level is taken away.
-    """
+    """Return the stated variance of frames, less that of their counts above the level, and its rise with the flux."""
     squared, difference = error**2, (flux - level)[quiet]
     spread, typical = float(difference @ difference), float(np.median(squared[quiet]))
     slope = 0.0
@@ -210,16 +203,12 @@ def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, s
     draws = int(np.clip(LEVEL_VALUES // time_s.size, *LEVEL_DRAWS))
     for _ in steps.track(range(draws), draws):
         truth = simulated.coloured(rng.standard_normal(time_s.size))
-        noisy = truth + np.sqrt(noise) * rng.standard_normal(time_s.size)
-        total += (level.of(noisy) - truth) ** 2
+        total += (level.of(truth + np.sqrt(noise) * rng.standard_normal(time_s.size)) - truth) ** 2
     return np.sqrt(total / draws)
 
 
 def single_frames(numbers: NDArray[np.int64], sigmas: Float, usable: Bool) -> Bool:
-    """Return single frames far above the level, by `sigmas`, whose neighbours on both sides are not.
-
-    A flare that is shorter than a frame cannot be distinguished from a cosmic ray. Frames without a fault are `usable`.
-    """
+    """Return single `usable` frames far above the level, by `sigmas`, whose neighbours are not, as cosmic rays."""
     frames, single = np.flatnonzero(usable), np.zeros(sigmas.size, np.bool_)
     middle, before, after = frames[1:-1], frames[:-2], frames[2:]
     adjacent = (numbers[after] - numbers[before]) == 2

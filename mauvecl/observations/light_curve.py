@@ -65,8 +65,7 @@ def fit_quiet_light(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | 
     if float((other[1] ^ in_events).mean()) <= SETTLED:
         return fitted, in_events
     light = light_of_events(fitted, in_events)
-    better = criterion(*other, further=light) < criterion(fitted, in_events, light)
-    return other if better else (fitted, in_events)
+    return other if criterion(*other, further=light) < criterion(fitted, in_events, light) else (fitted, in_events)
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,10 +375,7 @@ ROUNDS = 3
 def survey_light_curve(
     frames: Frames, shape: Shape, seed: int, steps: Steps = UNREPORTED
 ) -> tuple[SeriesSurvey, levels.QuiescentLevel, Frames]:
-    """Fit the quiescent light of a light curve, and prepare its search; `seed` is that of the error of the level.
-
-    Frames of few counts are returned with a remark and without errors. `steps` reports fits, searches and draws.
-    """
+    """Fit the quiescent light of a light curve and prepare its search; frames of few counts lose their errors."""
     fits = steps.part(0.0, 0.9)
     frames, counts, reasons, steps_of_level = _prepare(frames)
     used = reasons == 0
@@ -477,9 +473,7 @@ def quiescent_light(
     used, process = reasons == 0, survey.flux_process
     quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
     error = levels.level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
-    level, sd, noise = (
-        np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
-        for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
-    )
+    searched, time_s = (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess), frames.time_s
+    level, sd, noise = (np.interp(time_s, time_s[used], values * survey.scale) for values in searched)
     spread = float(level[used].std()) / survey.level
     return levels.QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process, spread)

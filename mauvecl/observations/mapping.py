@@ -218,8 +218,7 @@ def times_of(
         remarks.append(f"the times of {label} have no date, although their unit, name or header says so: {span}")
         epoch = None
     seconds, epoch = (seconds + first_d * DAY_S, None) if epoch is None else (seconds, epoch + first_d)
-    system = replace(header, epoch_mjd=epoch, scale=scale, position=position, at=at)
-    return seconds, exposure, system, tuple(remarks)
+    return seconds, exposure, replace(header, epoch_mjd=epoch, scale=scale, position=position, at=at), tuple(remarks)
 
 
 def _stated_system(time: tuple[Values, ...], file: TableFile) -> units.TimeSystem:

@@ -186,12 +186,11 @@ class Process:
     def describe(self, unit: float) -> str:
         """Return a description of the terms; `unit` is the light of the star, to which standard deviations relate."""
         words = {"correlated": "correlated noise", "smooth": "smooth variability"}
-        descriptions = [
+        return ", ".join(
             f"{words.get(term.kind, term.kind)} ({'period' if term.rotates else 'time scale'} {_time(term.scale_s)}, "
             f"{100 * term.sd / unit:.2g} % in the process)"
             for term in self.terms
-        ]
-        return ", ".join(descriptions) or "constant light"
+        )
 
     def at(self, lags_s: Float) -> Float:
         """Return the covariance at time lags, shape of `lags_s`."""
@@ -258,16 +257,14 @@ class Covariance:
             # Innovations of each unit state.
             units = -self._u[later] * np.exp((time[last] - time[later, None]) * rates)
             units = solve(time[later], rates, self._u[later], self._w[later], units, units)
-            decay = np.exp((time[rows, None] - time[last]) * rates)
-            state = (decay * self._w[rows]).T @ innovations
+            state = (np.exp((time[rows, None] - time[last]) * rates) * self._w[rows]).T @ innovations
             total = np.einsum("jo,jo->o", state, (units / self._d[later, None]).T @ units @ state)
         return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations) + total)
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""
         out = np.array(white.reshape(len(white), -1), np.float64, order="C") * np.sqrt(self._d)[:, None]
-        product = np.array(out)
-        values = self._driver.matmul_lower(self._time, self._rates, self._u, self._w, out, product)
+        values = self._driver.matmul_lower(self._time, self._rates, self._u, self._w, out, np.array(out))
         return np.asarray(values).reshape(np.shape(white))
 
 
@@ -407,9 +404,8 @@ def _find_period(data: BinnedLightCurve, values: Float, share: float) -> float |
     if values.size < 30 or longest <= shortest:
         return None
     periodogram = LombScargle(data.time_s, values - values.mean())
-    frequency, power = periodogram.autopower(
-        minimum_frequency=1 / longest, maximum_frequency=1 / shortest, samples_per_peak=PER_PEAK, method="fast"
-    )
+    ends = {"minimum_frequency": 1 / longest, "maximum_frequency": 1 / shortest}
+    frequency, power = periodogram.autopower(**ends, samples_per_peak=PER_PEAK, method="fast")
     if not power.size or not np.isfinite(power).all():
         return None
     best = int(np.argmax(power))

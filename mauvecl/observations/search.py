@@ -132,8 +132,7 @@ class ProcessSearch:
             rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
             if above is not None:
                 # A template of which a smaller share lies in frames is not searched.
-                least = np.sqrt(LEAST_SHARE * row.without_gaps)
-                self._solve(row, (rho[0] > above * least).any(axis=0))
+                self._solve(row, (rho[0] > above * np.sqrt(LEAST_SHARE * row.without_gaps)).any(axis=0))
             per_amplitude = row.per_amplitude
             searched = per_amplitude > 0
             np.divide(rho, per_amplitude, out=rho, where=searched)
@@ -224,10 +223,7 @@ class ProcessSearch:
 
 @array_cache(maxsize=64)
 def _regular_solution(process: Process, variance: float, frame_s: float, shape: Float) -> Float:
-    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, shape (n, 2).
-
-    Searches of a light curve after each event ask for the same solutions.
-    """
+    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, (n, 2)."""
     single = np.zeros(shape.size)
     single[shape.size // 2] = 1.0
     covariance = process.covariance(np.arange(float(shape.size)) * frame_s, np.full(shape.size, variance))
@@ -235,10 +231,7 @@ def _regular_solution(process: Process, variance: float, frame_s: float, shape: 
 
 
 class Correlations:
-    """Correlations of light curves with kernels up to a largest reach, which share the transform of the light curves.
-
-    Values beyond the ends of the last axis are zero.
-    """
+    """Correlations of light curves, zero beyond their ends, with kernels up to a reach, which share their transform."""
 
     def __init__(self, values: Float, reach: int) -> None:
         self.values, self._reach = values, reach
@@ -424,8 +417,7 @@ class SimulatedRate:
         # Beyond the simulated values, it falls as the tail of normal noise.
         fall = float(np.subtract(*scipy.special.log_ndtr([-anchor, -threshold])))
         if self.heavy and above:
-            # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), or a normal
-            # tail if it falls more slowly.
+            # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), if slower.
             fall = min(fall, (threshold - anchor) / float((self.largest[-above:] - anchor).mean()))
         return rate - fall
 

@@ -81,10 +81,7 @@ class SpectralSeries:
 
     @property
     def star_level(self) -> float:
-        """Light of the star in the sum over wavelength, relative to `light`, by the shape of its spectrum.
-
-        It excludes dark current and sky that the light includes; NaN if the star is not known.
-        """
+        """Light of the star in the sum over that of `light`, which includes dark and sky; NaN if it is not known."""
         model = self.cleaned.model
         if not model.star_is_known:
             return float("nan")
@@ -156,10 +153,7 @@ def survey_spectra(
 def _weighted_sums(
     cleaned: models.CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float]
 ) -> tuple[SpectralSeries, Templates, Float]:
-    """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
-
-    Sums have unit covariance from frame to frame, and change independently over longer times.
-    """
+    """Return spectra less that of the star, weights for flares, and weighted sums, independent and of unit variance."""
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[quiet].mean(axis=0)
     unknown, excess = model.unknowns(light), frames.flux - light
@@ -313,10 +307,7 @@ class EventSpectrum:
 def event_spectrum(
     survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, event: DetectedEvent
 ) -> EventSpectrum:
-    """Compare the spectrum of an event with those of flares and of changes that resemble them.
-
-    Its spectrum is that of the template of the search, which is fitted to each pixel with a straight line.
-    """
+    """Compare the spectrum of an event, fitted by its template and a line, with flares and what resembles them."""
     model, at = series.cleaned.model, _window(survey, in_events, event)[0]
     start = survey.stare.start_s[at]
     edges = np.column_stack([start, start + survey.stare.frame_s])
@@ -402,8 +393,7 @@ def measure_flare(
     excess, model = series.excess[at], series.cleaned.model
     summed = excess[inside].sum(axis=0) - n * excess[~inside].mean(axis=0)
     # The level is that of a finite number of frames.
-    variance = series.noise.used**2 * (1 + n / base)
-    exposure = model.exposure(series.light, variance, n)
+    exposure = model.exposure(series.light, series.noise.used**2 * (1 + n / base), n)
     unknown = {name: row * n / model.per_dn for name, row in model.unknowns(series.light).items()}
     sd = drifts(survey, series, in_events, n)
     spectra, errors = np.array(list(unknown.values())), np.array([sd[name] for name in unknown])

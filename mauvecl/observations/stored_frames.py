@@ -77,7 +77,6 @@ class FolderFile(TableFile):
                 raise InputError(f"{fault}, not {numbers.size}", key=name)
             return numbers
 
-        # A column of every file, with one row per file.
         return Values(name, (len(self.paths), n), lambda piece: np.stack([*map(row, self.paths[piece])]), column.unit,
                       self.label, keywords=column.keywords)  # fmt: skip
 

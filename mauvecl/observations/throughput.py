@@ -153,10 +153,6 @@ class _Linearised:
         return disagree, chi2, dof - float(share.sum()), float(np.sqrt(variance)), *factors
 
 
-def _alike(first: Float, second: Float) -> bool:
-    return first.shape == second.shape and np.allclose(first, second)
-
-
 def _best(likelihood: Callable[[float], float], log_range: tuple[float, float]) -> float:
     """Return the positive number at which -2 log likelihood is smallest."""
     minimum = minimize_scalar(lambda log: likelihood(np.exp(log)), bounds=log_range, method="bounded")
@@ -199,7 +195,10 @@ class ThroughputModel:
         self.responses = [(s, [response_matrix(line, s.wavelength_nm, order) for line in lines]) for s in reached]
         # Stars that differ in brightness alone count once.
         flux = [star.flux_flam / star.flux_flam.max() for star in spectra]
-        self.n_stars = sum(not any(_alike(later, earlier) for earlier in flux[:k]) for k, later in enumerate(flux))
+        self.n_stars = sum(
+            all(later.shape != earlier.shape or not np.allclose(later, earlier) for earlier in flux[:k])
+            for k, later in enumerate(flux)
+        )
         # Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star.
         self.n_shape = 0 if self.n_stars < 2 else 4 if fwhm > 0 else 2
         # Derivatives of the light with respect to these, for the nominal instrument, shape (n_star, n_pixel).
@@ -338,8 +337,7 @@ def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
     half = np.diff(inner)[:, None] / 2
     nodes = inner[:-1, None] + half * (1 + np.array([-1.0, 1.0]) / np.sqrt(3.0))
     second = BSpline(full, np.eye(knots + 3), 3).derivative(2)(nodes.ravel())
-    weight = np.repeat(half, 2, axis=1).ravel()
-    return design, np.asarray((second * weight[:, None]).T @ second)
+    return design, np.asarray((second * np.repeat(half, 2, axis=1).ravel()[:, None]).T @ second)
 
 
 def _linear_basis(nm: Float) -> Float:

@@ -119,8 +119,7 @@ def recover_periods(
         found = sum(power > threshold and abs(at - 1 / period) < 0.5 / base for power, at in peaks)
         return clopper_pearson(found, trials)
 
-    noise = np.sort([peak(0.0)[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])
-    threshold = float(noise[-IN_TAIL])
+    threshold = float(np.sort([peak(0.0)[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])[-IN_TAIL])
     recovered = [[recovery(amplitude, period) for period in periods_d] for amplitude in amplitudes]
     return PeriodRecovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
 
@@ -207,10 +206,7 @@ def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | N
 
 
 def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
-    """Return the standard deviation of a weighted sum of the pixels of an exposure.
-
-    It is infinite if a free unknown changes the sum, and NaN if a pixel with a weight is near saturation.
-    """
+    """Return the standard error of a sum of pixels; infinite if a free unknown changes it, NaN near saturation."""
     if (weights[~variance_of(quiet)[1]] != 0.0).any():
         return float("nan")
     variance = float(np.sum(weights**2 * quiet.variance_dn2))
@@ -445,10 +441,7 @@ def _exposure_dn_per_electron(quiet: Expectation, instrument: Instrument) -> Flo
 
 
 def flux_per_dn(quiet: Expectation, instrument: Instrument) -> Float:
-    """Return the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each pixel, shape (n_pixel,).
-
-    This is the calibration of an observer: counts over the effective area at the wavelength of the pixel.
-    """
+    """Return the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each pixel, as observers calibrate."""
     flam = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm)
     per_flam = flam * instrument.dispersion_nm_per_pixel * _exposure_dn_per_electron(quiet, instrument)
     # Per nm in place of per Angstrom.
