@@ -149,10 +149,7 @@ class PhotonTransfer(GoodnessOfFit):
 
 
 def variance_of_steps(steps: Float, scale: Float, shared: Float) -> Float:
-    """Return the variance of each pixel from differences of frames, shape (n_step, n_pixel), without drifts.
-
-    Changes that all pixels share, with some spectra, are fitted to each difference in units of the `scale` of pixels.
-    """
+    """Return variances of pixels from steps of frames, (n_step, n_pixel), less `shared` spectra fitted over `scale`."""
     basis = np.linalg.svd(shared[shared.any(axis=1)] / scale, full_matrices=False)[2]
     white = steps / scale
     white = white - (white @ basis.T) @ basis

@@ -222,8 +222,8 @@ UNSEEN = 0.05
 def _find_kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
     """Return the kind of an event by its fits of published shapes, since the general family resembles all kinds.
 
-    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse. The sum
-    over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
+    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse; those of
+    spectra may lose light of all pixels during a flare.
     """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
     level, window = float(best.plain.level_without(best.light)), best.window

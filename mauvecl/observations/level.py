@@ -158,10 +158,7 @@ def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
 
 
 class ConditionalLevel:
-    """Means of a process at all times given quiescent values, by one factorisation for all values at these times.
-
-    The sum of the `weights` of the values is the inverse of the variance of the constant level.
-    """
+    """Means of a process at all times given quiescent values; `weights` sum to the inverse variance of its constant."""
 
     def __init__(self, process: Process, time_s: Float, variance: Float, quiet: Bool) -> None:
         self.process, self.quiet = process, quiet

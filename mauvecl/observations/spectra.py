@@ -175,10 +175,8 @@ def _weighted_sums(
                           np.array([deviations[name] for name in names]))  # fmt: skip
     # Flares that double the light of the star, in the sum over wavelength.
     flares *= abs(float(light.sum())) / flares.sum(axis=1, keepdims=True)
-    templates, steady = (
-        Templates.of_spectra(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=included, rank=rank)
-        for included in (nuisances, nuisances.without(["light"]))
-    )
+    spectra, included = (noise.used**2, flares, model.gain, TEMPERATURES_K), (nuisances, nuisances.without(["light"]))
+    templates, steady = (Templates.of_spectra(*spectra, nuisances=unknowns, rank=rank) for unknowns in included)
     snr_kept = float(np.median(templates.best / steady.best))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
     mixing = _independent(sums, pairs, quiet)
