@@ -14,27 +14,14 @@ from mauvecl.fits.spectrum import Measurement
 from mauvecl.flares import RANK
 from mauvecl.flares.shapes import shape_of
 from mauvecl.host.arrays import Float
+from mauvecl.observations import spectra as spectral
 from mauvecl.observations.events import LONG_S, Kind, ObservedEvent, detect_events, measure_events, most_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import NoiseComparison, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.process import UNREPORTED, Steps
-from mauvecl.observations.search import (
-    NO_COLOUR_K,
-    SeriesSurvey,
-    SimulatedRate,
-    innovations,
-    simulated_rates,
-)
-from mauvecl.observations.spectra import (
-    CAUSES,
-    EventSpectrum,
-    SpectralSeries,
-    event_spectrum,
-    measure_flare,
-    survey_spectra,
-)
+from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey, SimulatedRate, innovations, simulated_rates
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search.completeness import size_at
 
@@ -59,10 +46,10 @@ class InjectionCompleteness:
     detected: NDArray[np.int64]  # shape (n_width, n_size)
     injected: int  # number of injections per cell
 
-    def limit(self, width: int, power: float = POWER) -> float:
-        """Return the equivalent duration of flares that are detected with a probability; NaN if none is."""
+    def limit(self, width: int) -> float:
+        """Return the equivalent duration of flares that are detected with the probability `POWER`; NaN if none is."""
         shares = np.maximum.accumulate(self.detected[width]) / self.injected
-        size = size_at(self.equivalent_durations_s[width], shares, power)
+        size = size_at(self.equivalent_durations_s[width], shares, POWER)
         return size if np.isfinite(size) else float("nan")
 
 
@@ -80,18 +67,14 @@ def inject(
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
     kelvin = survey.templates.nearest(temperature_k)
     direction = survey.templates.directions[kelvin]
-    # Photon noise of a flare of unit amplitude.
     photon_noise = np.linalg.cholesky(survey.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
     size_of = float(np.linalg.norm(direction))
-    durations = np.zeros((WIDTHS, SIZES))
-    detected = np.zeros((WIDTHS, SIZES), np.int64)
+    durations, detected = np.zeros((WIDTHS, SIZES)), np.zeros((WIDTHS, SIZES), np.int64)
     for w, width in steps.track(enumerate(widths.tolist()), WIDTHS):
         if w == 0 or free_frames.size > MAX_FRAMES:
             # Part of a long light curve, another one for each half-width.
             start = int(rng.integers(max(free_frames.size - MAX_FRAMES, 0) + 1))
-            chosen = np.zeros(free.size, np.bool_)
-            chosen[free_frames[start : start + MAX_FRAMES]] = True
-            segment = survey.frames(chosen)
+            segment = survey.frames(np.isin(np.arange(free.size), free_frames[start : start + MAX_FRAMES]))
         starts = segment.stare.start_s
         edges = np.column_stack([starts, starts + frame_s])
         amplitudes = threshold / (size_of * _typical_snr(segment, width)) * np.geomspace(*RANGE, SIZES)
@@ -100,7 +83,7 @@ def inject(
             count = min(BATCH, TIMES - first)
             peaks = starts[rng.integers(starts.size, size=count)] + frame_s * rng.random(count)
             shapes = np.array([bank.shape.mean_over(edges, peak, width) for peak in peaks])
-            # The photon noise of the flare itself is added to that of the frames.
+            # The photon noise of the flare itself, here for unit amplitude, is added to that of the frames.
             noise = rng.standard_normal((*shapes.shape, direction.size)) @ photon_noise.T
             noise *= np.sqrt(np.maximum(shapes, 0.0))[:, :, None]
             best = _largest_near(segment, peaks, width, amplitudes, shapes[:, :, None] * direction, noise)
@@ -126,8 +109,7 @@ def _largest_near(
             near = searched & (np.abs(times - peak) <= reach)
             if near.any():
                 quiet, flare, flare_noise = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
-                total = quiet + size * flare + np.sqrt(size) * flare_noise
-                best[:, k] = np.maximum(best[:, k], total.max((1, 2)))
+                best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * flare_noise).max((1, 2)))
     return best
 
 
@@ -149,8 +131,6 @@ CHANCE_DIP = 1e-3
 #: Share of the searched frames in events, their number, and length of the light curve in half-widths of the longest
 #: event, above which the events are no exception from the light of the star (assumed).
 MOST_IN_EVENTS, MOST_EVENTS, LONG = 0.5, 2, 100.0
-
-
 #: Range of the dark current in the sum over wavelength, over the level, from which this is not the star's (assumed).
 DARK_SHARE = 0.1
 
@@ -175,8 +155,8 @@ class Analysis:
     residual: Float  # shape (n_quiet, n_sum); of quiescent frames given those before them, in standard deviations
     quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals
     likeness: NoiseComparison  # of the residuals and independent noise
-    spectra: SpectralSeries | None  # if they are searched with weights for flares
-    event_spectra: list[EventSpectrum | None]  # of these, those of the events, in their order
+    spectra: spectral.SpectralSeries | None  # if they are searched with weights for flares
+    event_spectra: list[spectral.EventSpectrum | None]  # of these, those of the events, in their order
     measurements: list[Measurement | str]  # flares fitted to these, or the reasons why none are
 
     @property
@@ -199,15 +179,10 @@ class Analysis:
         return inside
 
     @property
-    def in_events(self) -> float:
-        """Share of the searched frames in events."""
-        return float(self.inside.mean())
-
-    @property
     def crowded(self) -> bool:
         """True if most frames of a long light curve are in events, so that too few show the star without them."""
         longest = max((event.half_width_s for event in self.events), default=0.0)
-        many = len(self.events) > MOST_EVENTS and self.in_events > MOST_IN_EVENTS
+        many = len(self.events) > MOST_EVENTS and self.inside.mean() > MOST_IN_EVENTS
         return many and self.survey.stare.duration_s > min(LONG * longest, LONG_S)
 
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
@@ -222,29 +197,23 @@ class Analysis:
     @property
     def level_ratio(self) -> float:
         """Level over the light of the star: 1, unless the dark current changes it; NaN if the star is not known."""
-        if self.spectra is None or not self.dark_misleads:
-            return 1.0
-        return 1.0 / self.spectra.star_level
+        return 1.0 / self.spectra.star_level if self.spectra is not None and self.dark_misleads else 1.0
 
     @property
     def messages(self) -> list[str]:
         """Statements about the data that a reader must know, the most important first."""
-        return [
-            *self.frames.remarks,
-            *self._frame_messages(),
-            *([] if self.spectra is None else _spectral_messages(self.spectra)),
-            *self._level_messages(),
-            *self._verdict_messages(),
-        ]
+        of_pixels = () if self.spectra is None else _spectral_messages(self.spectra)
+        before = (*self.frames.remarks, *self._frame_messages(), *of_pixels)
+        return [*before, *self._level_messages(), *self._verdict_messages()]
 
     def _frame_messages(self) -> Iterator[str]:
         """Yield messages on what is searched and on the noise of frames."""
         if self.crowded:
             yield (
-                f"Events take {100 * self.in_events:.2g} % of the searched frames, so that what the star does without "
-                "them is not known, and there are no verdicts: the light probably has eclipses, transits or pulsation, "
-                "or is another column than the flux; mark the frames to leave out in a column of quality, or name the "
-                "columns in a mapping."
+                f"Events take {100 * self.inside.mean():.2g} % of the searched frames, so that what the star does "
+                "without them is not known, and there are no verdicts: the light probably has eclipses, transits or "
+                "pulsation, or is another column than the flux; mark the frames to leave out in a column of quality, "
+                "or name the columns in a mapping."
             )
         if len(self.events) >= most_events(self.survey.stare.n_frames):
             yield (
@@ -252,8 +221,7 @@ class Analysis:
                 "quiescent light; a light curve of fewer frames may show them."
             )
         reasons = self.level.reasons
-        if (reasons != 0).any():
-            lost = np.count_nonzero(reasons)
+        if lost := np.count_nonzero(reasons):
             are = "is" if lost == 1 else "are"
             yield f"{lost} of {reasons.size} frames {are} not searched; the table of frames states the reason of each."
         if lost := np.count_nonzero(reasons & Reason.LOSS):
@@ -261,9 +229,9 @@ class Analysis:
                 f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses; flares "
                 "in them are not searched."
             )
-        if self.level.excess > 1.2:
-            excess = f"{self.level.excess:.2f} times the stated errors"
-            yield f"The scatter of quiescent frames is {excess}; the measured scatter is used."
+        if (excess := self.level.excess) > 1.2:
+            fault = f"The scatter of quiescent frames is {excess:.2f} times the stated errors"
+            yield f"{fault}; the measured scatter is used."
 
     def _level_messages(self) -> Iterator[str]:
         """Yield messages on changes of the light that are not flares."""
@@ -276,8 +244,8 @@ class Analysis:
             largest = max(changes, key=lambda change: abs(change[1]))[1]
             often = "once" if len(changes) == 1 else f"{len(changes)} times"
             yield (
-                f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the most: light "
-                "is relative to the level after each change, and the table of frames has that level."
+                f"The level changes {often} suddenly for a day or more, by {100 * largest:+.2g} % at the "
+                "most: light is relative to the level after each change, and the table of frames has that level."
             )
         if self.level.process.terms and not self.dark_misleads:
             # A light curve that shows few periods of a process has another standard deviation than the process.
@@ -286,8 +254,7 @@ class Analysis:
                 "The quiescent light is not constant: its fitted level has a standard deviation of "
                 f"{100 * self.level.spread:.2g} %, by {terms}."
             )
-        if self.spectra is not None and self.dark_misleads:
-            series = self.spectra
+        if (series := self.spectra) is not None and self.dark_misleads:
             if series.cleaned.model.star_is_known:
                 reference = "relative to the light of the star by the shape of its spectrum"
             else:
@@ -322,17 +289,10 @@ class Analysis:
 
 
 def analyse_frames(
-    frames: Frames,
-    *,
-    rate: float = 1.0,
-    shape: str = "davenport2014",
-    seed: int = 1,
-    model: FrameModel | None = None,
-    rank: int = RANK,
-    jitters: Mapping[str, float] | None = None,
-    temperature_k: float = NO_COLOUR_K,
-    report: Callable[[float], None] | None = None,
-) -> Analysis:
+    frames: Frames, *, rate: float = 1.0, shape: str = "davenport2014", seed: int = 1,
+    model: FrameModel | None = None, rank: int = RANK, jitters: Mapping[str, float] | None = None,
+    temperature_k: float = NO_COLOUR_K, report: Callable[[float], None] | None = None,
+) -> Analysis:  # fmt: skip
     """Find the flares in observed frames.
 
     The `rate` is that of false alarms per star-day. The `model` is that of the pixels of spectra, which are
@@ -341,31 +301,29 @@ def analyse_frames(
     default the light, and the dark current as measured. The temperature is that of injected flares in spectra. `report`
     is called with the share of the work that is done, and may raise to stop the work.
     """
-    stages = (Steps(report).part(first, last) for first, last in pairwise(STAGES))
-    level_steps, rate_steps, search_steps, event_steps, injection_steps = stages
-    series: SpectralSeries | None = None
+    steps = [Steps(report).part(first, last) for first, last in pairwise(STAGES)]
+    series: spectral.SpectralSeries | None = None
     if model is None:
-        survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
+        survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, steps[0])
     else:
-        survey, series, level = survey_spectra(frames, model, shape_of(shape), rank, seed, jitters, level_steps)
+        survey, series, level = spectral.survey_spectra(frames, model, shape_of(shape), rank, seed, jitters, steps[0])
         frames = series.cleaned.frames
-    rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], rate, seed, rate_steps)
-    detected, in_events = detect_events(survey, candidates, search_steps)
-    spectra = [None if series is None else event_spectrum(survey, series, in_events, event) for event in detected]
+    rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], rate, seed, steps[1])
+    detected, in_events = detect_events(survey, candidates, steps[2])
+    spectra = [None if series is None else spectral.event_spectrum(survey, series, in_events, one) for one in detected]
     causes: list[Kind] = ["flare" if spectrum is None else spectrum.cause for spectrum in spectra]
-    events = measure_events(survey, in_events, detected, causes, event_steps)
+    events = measure_events(survey, in_events, detected, causes, steps[3])
     measurements = [
-        measure_flare(survey, series, in_events, event) if series is not None and measured.kind == "flare"
+        spectral.measure_flare(survey, series, in_events, event) if series is not None and measured.kind == "flare"
         else "no spectra of the instrument are given" if series is None else f"its kind is {measured.kind}"
         for measured, event in zip(events, detected, strict=True)
     ]  # fmt: skip
     quiet = ~in_events
-    residual = innovations(survey, quiet)
-    numbers = survey.stare.numbers[quiet]
+    residual, numbers = innovations(survey, quiet), survey.stare.numbers[quiet]
     return Analysis(
         frames, frames.white_light[0], level, survey, rate, *rates,
         threshold=threshold, candidates=candidates, dip=dip, events=events, measurements=measurements,
-        completeness=inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
+        completeness=inject(survey, quiet, threshold, seed, temperature_k, steps[4]),
         scatter=binned_scatter(numbers, residual @ survey.bank.directions[len(survey.bank.directions) // 2]),
         residual=residual, quiet=quiet, likeness=likeness(numbers, residual), spectra=series, event_spectra=spectra,
     )  # fmt: skip
@@ -380,9 +338,8 @@ def _thresholds(
     of light have larger dips than noise; those below `candidates` may be missed.
     """
     simulated = simulated_rates(survey, quiet, rate, seed, steps)
-    threshold, candidates = (
-        max(alarms.threshold(allowed) for alarms in simulated) for allowed in (rate, max(rate, CANDIDATES))
-    )
+    allowed = (rate, max(rate, CANDIDATES))
+    threshold, candidates = (max(alarms.threshold(most) for alarms in simulated) for most in allowed)
     down = survey.frames(quiet).inverted()
     start = down.stare.start_s
     stare = replace(down.stare, start_s=start[-1] + start[0] - start[::-1])
@@ -393,7 +350,7 @@ def _thresholds(
     return simulated, max(threshold, dip) if chance < CHANCE_DIP else threshold, candidates, dip
 
 
-def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
+def _spectral_messages(spectra: spectral.SpectralSeries) -> Iterator[str]:
     """Yield statements about the pixels of spectra that a reader must know."""
     cleaned, noise = spectra.cleaned, spectra.noise
     if count := int(cleaned.rays.sum()):
@@ -411,15 +368,15 @@ def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
         )
     if changes := spectra.changes:
         largest = max(changes, key=lambda change: abs(change.change))
-        times = "once" if len(changes) == 1 else f"{len(changes)} times"
+        often = "once" if len(changes) == 1 else f"{len(changes)} times"
         yield (
-            f"The light that all pixels share changes suddenly {times}, by up to {100 * abs(largest.change):.2g} %, as "
+            f"The light that all pixels share changes suddenly {often}, by up to {100 * abs(largest.change):.2g} %, as "
             "by pointing losses and re-acquisitions; the table of throughput states when."
         )
     for name, sd in spectra.jitters.items():
         if np.isfinite(sd):
             size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
-            yield f"The {CAUSES[name]} of single frames changes: {size}, which the search marginalises over."
+            yield f"The {spectral.CAUSES[name]} of single frames changes: {size}, which the search marginalises over."
         elif name == "light":
             yield (
                 "The level of each frame is free in the search, because pointing losses change it: flares keep "
@@ -427,4 +384,4 @@ def _spectral_messages(spectra: SpectralSeries) -> Iterator[str]:
                 "search.frame.light states its standard deviation instead (1e-6: steady)."
             )
         else:
-            yield f"The search leaves out all changes of the {CAUSES[name]} of single frames."
+            yield f"The search leaves out all changes of the {spectral.CAUSES[name]} of single frames."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 import scipy
@@ -12,12 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.arrays import Float
 from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.stars.source import Source
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    from mauvecl.host.stars.source import Source
-
 
 #: Share of saturation above which a mean raw level is not used, since clipping then changes mean and variance.
 MOST_OF_SATURATION = 0.98
@@ -53,11 +50,9 @@ class CalibrationFrames:
             fault = "dark current and bias are subtracted; use read_frames(..., raw=True)"
             raise InputError(f"{name}: {fault}", key="frames")
         temperatures = frames.temperature_c
-        if temperatures is None:
-            if temperature_c is None:
-                fault = f"{name} needs a column of detector temperatures, or temperature_c"
-                raise InputError(fault, key="temperature_c")
-            temperatures = np.full(frames.n_frames, temperature_c)
+        if temperatures is None and temperature_c is None:
+            raise InputError(f"{name} needs a column of detector temperatures, or temperature_c", key="temperature_c")
+        temperatures = np.full(frames.n_frames, temperature_c) if temperatures is None else temperatures
         good = (frames.faults == 0) & np.isfinite(temperatures)
         lengths = np.unique(frames.exposure_s[good].round(6))
         if good.sum() < 3 or lengths.size != 1:
@@ -190,8 +185,7 @@ def measured_variances(observations: Sequence[CalibrationFrames], dark: DarkFit,
             light = np.zeros(mean.size) if frames.star is None else same.raw_dn[:, usable].mean(axis=0) - mean
             counts, n = mean - dark.bias_dn[usable], len(steps)
             variance = variance_of_steps(steps, np.sqrt(np.mean(steps**2, axis=0)), np.array([light, counts]))
-            # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann
-            # 1941).
+            # Degrees of freedom of the mean square of consecutive differences of normal values (von Neumann 1941).
             dof = np.full(light.size, 2 * n**2 / (3 * n - 1))
             measured.append([variance, light, counts, dof, gains[usable], shares[usable]])
     return np.concatenate(measured, axis=1)
@@ -206,10 +200,9 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     variance, light, dark, dof, gains, shares = measured
     fits = {"DN": _fit(shares, gains * light, dark, variance, dof),
             "electrons": _fit(shares, gains * (light + dark), np.zeros_like(dark), variance, dof)}  # fmt: skip
-    better, unit = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit
-    assumed: tuple[str, ...] = ("unit of the dark counts",)
+    better, unit, assumed = fits["DN"][2] - fits["electrons"][2], nominal.dark_unit, ["unit of the dark counts"]
     if abs(better) > MIN_CHI2_DIFFERENCE:
-        unit, assumed = "electrons" if better > 0 else "DN", ()
+        unit, assumed = "electrons" if better > 0 else "DN", []
     (read, gain), covariance, chi2, model = fits[unit]
     errors = np.sqrt(np.diag(covariance))
     if not gain > MIN_SNR * errors[1]:
@@ -221,7 +214,7 @@ def fit_photon_transfer(measured: Float, nominal: Instrument, dark_error_dn: flo
     noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
     read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))
     return PhotonTransfer(noise, covariance, float(read_error), unit, float(chi2),
-                          variance.size - 2, light, variance, model, assumed)  # fmt: skip
+                          variance.size - 2, light, variance, model, tuple(assumed))  # fmt: skip
 
 
 def _fit(share: Float, column: Float, fixed: Float, variance: Float, dof: Float) -> tuple[Float, Float, float, Float]:
@@ -230,8 +223,7 @@ def _fit(share: Float, column: Float, fixed: Float, variance: Float, dof: Float)
     model = np.maximum(variance, 1.0)
     fitted, covariance = np.zeros(2), np.eye(2)
     for _ in range(ITERATIONS):
-        weight = dof / (2 * model**2)
-        weighted = design * weight[:, None]
+        weighted = design * (dof / (2 * model**2))[:, None]
         covariance = np.linalg.pinv(weighted.T @ design)
         fitted = covariance @ (weighted.T @ (variance - fixed))
         model = np.maximum(fixed + design @ fitted, ROUNDING)
@@ -304,9 +296,9 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     Without frames all are the instrument's.
     """
     bias, level = (nominal.per_pixel(*of) for of in (("bias_dn", nominal.bias_dn), ("dark", nominal.dark_dn_per_s)))
-    covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)
     if not dark:
         return _assumed_dark(nominal, level, bias)
+    covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)
     raw = np.concatenate([frames.raw_dn for frames in dark])
     temperature = np.concatenate([frames.temperature_c for frames in dark])
     exposure = np.concatenate([np.full(frames.n_frames, frames.exposure_s) for frames in dark])
@@ -315,12 +307,10 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     fits_slope, by_pixel = spread >= SLOPE_RANGE_C, float(exposure.max() / exposure.min()) >= EXPOSURE_RATIO
     shares_bias = not by_pixel and spread >= BIAS_RANGE_C
     fits_bias = by_pixel or shares_bias
-
     # The mean pixel gives what all pixels share: bias, slope, and their errors.
     free = np.array([fits_bias, True, fits_slope])
     common, shared, typical = _mean_dark(raw, exposure, offset, free, nominal, noise)
     slope, bias = float(common[2]), np.full(n_pixel, common[0]) if shares_bias else bias
-
     # With the slope known, each pixel is linear in its level and bias.
     seconds = exposure * np.exp(slope * offset)
     columns = np.column_stack([np.ones_like(seconds), seconds, seconds * offset])
@@ -333,30 +323,20 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
         change, error = fitted[-1] / level, np.sqrt(errors[:, -1, -1]) / np.abs(level)
     mean = seconds[:, None] * level
     return DarkFit(
-        reference_c=reference,
-        level_dn_per_s=level,
-        bias_dn=bias,
-        covariance=covariance,
-        shared=shared,
-        slope_per_c=slope,
-        pixel_slope_per_c=slope + change,
-        pixel_slope_error=error,
+        reference, level, bias, covariance, shared, slope, pixel_slope_per_c=slope + change, pixel_slope_error=error,
         chi2=float(np.sum((raw - bias - mean) ** 2 / noise.variance(0.0, mean))),
         dof=raw.size - len(used) * n_pixel - int(fits_slope) - int(shares_bias),
         slopes_p_value=float(scipy.stats.chi2.sf(np.sum((change / error) ** 2), n_pixel - 1)),
-        assumed=(*(() if fits_slope else ("dark slope",)), *(() if fits_bias else ("bias",))),
-    )
+        assumed=tuple(name for name, fits in (("dark slope", fits_slope), ("bias", fits_bias)) if not fits),
+    )  # fmt: skip
 
 
 def _assumed_dark(nominal: Instrument, level: Float, bias: Float) -> DarkFit:
     """Return the instrument's dark current, with an assumed error of its level."""
     shared = np.diag([0.0, (ASSUMED_DARK_ERROR * level.mean()) ** 2, 0.0])
-    unknown = np.full(level.size, np.nan)
-    return DarkFit(
-        nominal.temperature_c, level, bias, covariance=np.zeros((level.size, 2, 2)), shared=shared,
-        slope_per_c=nominal.dark_slope_per_c, pixel_slope_per_c=unknown, pixel_slope_error=unknown,
-        assumed=("dark current", "dark slope", "bias"),
-    )  # fmt: skip
+    unknown, assumed = np.full(level.size, np.nan), ("dark current", "dark slope", "bias")
+    return DarkFit(nominal.temperature_c, level, bias, np.zeros((level.size, 2, 2)), shared,
+                   nominal.dark_slope_per_c, unknown, unknown, assumed)  # fmt: skip
 
 
 def _mean_dark(

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -21,10 +20,7 @@ from numpy.typing import NDArray
 from mauvecl.flares.shapes import SHAPES, Shape
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.event_windows import GENERAL_WEIGHT, Family, FittedFlare, Likelihood, Profile, Window
-
-if TYPE_CHECKING:
-    from mauvecl.observations.search import DetectedEvent, SeriesSurvey
-
+from mauvecl.observations.search import DetectedEvent, SeriesSurvey
 
 #: Published shapes that are averaged, besides that of the search.
 AVERAGED = ("davenport2014", "tovarmendoza2022")
@@ -67,9 +63,8 @@ class NormalMixture:
             # Frames without weight do not limit it.
             return high
         # `brentq` keeps its function until the next collection of garbage, but not the arrays.
-        return float(
-            scipy.optimize.brentq(_probability_above, 0.0, high, args=(weight, mean, sd, goal), xtol=1e-9 * high)
-        )
+        given = (weight, mean, sd, goal)
+        return float(scipy.optimize.brentq(_probability_above, 0.0, high, args=given, xtol=1e-9 * high))
 
     @cached_property
     def _significant(self) -> tuple[Float, Float, Float]:
@@ -132,15 +127,12 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
 
 def flares_of(survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> tuple[list[FittedFlare], float, float]:
     """Return the flares of the bank's shape that fit an event best, and scale and photon noise of its `Window`."""
-    window = Window.of(survey, in_events, event)
-    shape = survey.bank.shape
+    window, shape = Window.of(survey, in_events, event), survey.bank.shape
     return _add_flares(window, shape, [_first_fit(window, Family.of(shape, 1.0)).best[1]]), window.scale, window.photon
 
 
 def _flare(shape: Profile, peak: float, width: float, amplitude: float) -> FittedFlare:
-    return FittedFlare(
-        float(peak), float(amplitude), float(width), float(amplitude * width * shape.equivalent_duration)
-    )
+    return FittedFlare(*map(float, (peak, amplitude, width, amplitude * width * shape.equivalent_duration)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,10 +231,8 @@ def _add_flares(window: Window, shape: Profile, flares: list[FittedFlare]) -> li
         k = int(np.argmax(gain))
         if gain[k] < FURTHER_GAIN:
             break
-        more = [*flares, _flare(shape, p[k], w[k], slope[0, k] / information[0, k])]
-        refined = _refine(likelihood, shape, more)
-        fall = float(likelihood.chi2(light) - likelihood.chi2(light_of(window, shape, refined)))
-        if fall < FURTHER_GAIN:
+        refined = _refine(likelihood, shape, [*flares, _flare(shape, p[k], w[k], slope[0, k] / information[0, k])])
+        if likelihood.chi2(light) - likelihood.chi2(light_of(window, shape, refined)) < FURTHER_GAIN:
             break
         flares = sorted(refined, key=lambda flare: -flare.equivalent_duration_s)
     return _drop_flares(window, shape, flares) if len(flares) > 2 else flares
@@ -293,9 +283,7 @@ def _parameters(flares: Sequence[FittedFlare]) -> Float:
 
 def _refine(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlare]) -> list[FittedFlare]:
     """Return the flares that fit best, by least squares from a starting point."""
-    window = likelihood.window
-    root = likelihood.root
-    start = _parameters(flares)
+    window, root, start = likelihood.window, likelihood.root, _parameters(flares)
     scale = np.tile([0.3, 1.0, 0.3], len(flares))
     scale[1::3] = [0.3 * f.half_width_s for f in flares]
     span = window.edges[window.inside]
@@ -322,10 +310,7 @@ def _refine(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlare
 def _fit_single(
     window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, parts: Float | None = None
 ) -> list[Fit]:
-    """Fit a single flare with each departure of a family, which follows from a first fit, `shape` and `flare`.
-
-    The grid begins from the range `box`; `parts` are the means of the family at its nodes, if they are known.
-    """
+    """Fit a single flare with each departure of a family, from a first fit; `box` and `parts` are those of a grid."""
     durations = family.weights @ [part.equivalent_duration for part in family.parts]
     fits = []
     for epsilon in family.epsilon:

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -28,11 +27,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.flares.shapes import SHAPES, Davenport2014, Shape, TimeProfile, consecutive_integrals
 from mauvecl.host.arrays import Bool, Float
+from mauvecl.observations.search import DetectedEvent, SeriesSurvey
 from mauvecl.search.templates import REACH
-
-if TYPE_CHECKING:
-    from mauvecl.observations.search import DetectedEvent, SeriesSurvey
-
 
 #: Departures from a shape that are averaged (assumed); a flare of the general family is never exactly of its shapes.
 EPSILON, GENERAL_EPSILON = (0.0, 0.02, 0.06, 0.2), (0.04, 0.1, 0.2)
@@ -112,10 +108,8 @@ class Family:
     @cache
     def general(cls) -> Family:
         """Return the general family, the same object in all calls: rises and decays in all combinations."""
-        rises = [
-            HalfProfile(SHAPES["davenport2014"].before),
-            *(HalfProfile(partial(_gaussian, width=-w)) for w in GAUSSIAN_RISES),
-        ]
+        rises = [HalfProfile(SHAPES["davenport2014"].before)]
+        rises += [HalfProfile(partial(_gaussian, width=-width)) for width in GAUSSIAN_RISES]
         gaussian = HalfProfile(partial(_gaussian, width=GAUSSIAN_DECAY), decays=True)
         fast = [_exponential(Davenport2014.DECAY[0][1]), gaussian]
         # An exponential is a smooth function of the logarithm of its rate: it is interpolated between Chebyshev points.
@@ -211,7 +205,6 @@ class Window:
         start, stop = numbers[first] * frame_s, (numbers[first + count - 1] + 1) * frame_s
         mean = np.add.reduceat(survey.sums[frames] @ unit, first) / count
         noise = np.add.reduceat(survey.variance[frames] * excess, first) / count**2
-        # The nearest bins on each side.
         rows = np.flatnonzero(is_inside)
         nearest = slice(max(rows[0] - MAX_OUTSIDE, 0), rows[-1] + 1 + MAX_OUTSIDE)
         return cls(
@@ -265,6 +258,7 @@ class Window:
         first_s, last_s = survey.stare.start_s[event.first], survey.stare.start_s[event.last] + frame_s
         low, high = event.peak_s - PEAK_RANGE * event.half_width_s, event.peak_s + PEAK_RANGE * event.half_width_s
         before_s = float(survey.stare.start_s[event.first - 1]) + frame_s if event.first else -np.inf
+        # A gap before the event may hold the peak, at most as long before as the event lasts.
         low = min(low, max(first_s - max(4 * event.half_width_s, last_s - first_s), before_s))
         high = min(max(high, low + frame_s), last_s)
         widest = max(survey.bank.half_widths_s[-1], event.half_width_s) * 3

@@ -74,11 +74,10 @@ def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Step
         steps.step()
         if not largest:
             break
+        extents = []
         for event in largest:
             rows, flux = light_of_flare(survey, event.peak_s, event.half_width_s, event.amplitude)
             light[rows] += flux[:, None] * survey.bank.directions[event.direction]
-        extents = []
-        for event in largest:
             first, last = _find_extent(survey, in_events, faint * noise, event)
             # Some frames remain for the level; they are the faintest of the event.
             short = MIN_QUIET - int(np.count_nonzero(~in_events)) + last - first + 1
@@ -101,14 +100,13 @@ def _merge(events: list[DetectedEvent]) -> list[DetectedEvent]:
     """Return the events in order of time, without those that overlap a larger one or are its beginning or tail."""
     merged: list[DetectedEvent] = []
     for event in sorted(events, key=lambda event: event.first):
-        if merged:
-            before = merged[-1]
-            smaller, larger = sorted((event, before), key=lambda event: event.value)
-            touching = event.first == before.last + 1 and smaller.value < BELONGING * larger.value
-            if event.first <= before.last or touching:
-                merged.pop()
-                event = replace(larger, first=min(event.first, before.first), last=max(event.last, before.last))
-        merged.append(event)
+        before = merged[-1] if merged else event
+        smaller, larger = sorted((event, before), key=lambda event: event.value)
+        touching = event.first == before.last + 1 and smaller.value < BELONGING * larger.value
+        if merged and (event.first <= before.last or touching):
+            merged[-1] = replace(larger, first=min(event.first, before.first), last=max(event.last, before.last))
+        else:
+            merged.append(event)
     return merged
 
 
@@ -159,11 +157,9 @@ def _find_extent(survey: SeriesSurvey, in_events: Bool, faint: float, event: Det
     frame_s = survey.stare.frame_s
     start = event.peak_s - BEGINNING * event.half_width_s - frame_s / 2
     stop = event.peak_s + tail * event.half_width_s + frame_s / 2
-    # Frames are looked up by their middles.
     first, last, peak = np.searchsorted(survey.stare.start_s, np.array([start, stop, event.peak_s]) - frame_s / 2)
     peak = min(int(peak), survey.stare.n_frames - 1)
     first, last = min(int(first), peak), max(int(last) - 1, peak)
-    # Other events end it.
     before, after = np.flatnonzero(in_events[first:peak]), np.flatnonzero(in_events[peak : last + 1])
     if before.size:
         first = first + int(before[-1]) + 1
@@ -181,25 +177,21 @@ def _extend(
         return extents
     steps = np.diff(survey.stare.numbers)
     sigmas = {direction: survey.along(direction, quiet) for direction in {event.direction for event in events}}
-    extended = []
+    extended, bright = [], STILL_BRIGHT
     for (first, last), event in zip(extents, events, strict=True):
         sigma, length = sigmas[event.direction], last - first + 1
         if crowded:
             peak = first + int(sigma[first : last + 1].argmax())
-            while last > peak + 1 and sigma[max(peak, last + 1 - END_FRAMES) : last + 1].mean() < STILL_BRIGHT:
+            while last > peak + 1 and sigma[max(peak, last + 1 - END_FRAMES) : last + 1].mean() < bright:
                 last -= 1
         # Gaps that are longer than it end an event.
         before, after = steps[max(0, first - length) : first] > length, steps[last : last + length] > length
         stop = last + (int(after.argmax()) if after.any() else length)
         stop = min(stop, sigma.size - 1, last + int(quiet.sum()) - MIN_QUIET)
-        while last < stop and not in_events[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > STILL_BRIGHT:
+        while last < stop and not in_events[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > bright:
             last += 1
         start = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0)
-        while (
-            first > start
-            and not in_events[first - 1]
-            and sigma[max(0, first - END_FRAMES) : first].mean() > STILL_BRIGHT
-        ):
+        while first > start and not in_events[first - 1] and sigma[max(0, first - END_FRAMES) : first].mean() > bright:
             first -= 1
         extended.append((first, last))
     return extended
@@ -230,8 +222,8 @@ UNSEEN = 0.05
 def _find_kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
     """Return the kind of an event by its fits of published shapes, since the general family resembles all kinds.
 
-    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse. The sum
-    over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
+    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse; those of
+    spectra may lose light of all pixels during a flare.
     """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
     level, window = float(best.plain.level_without(best.light)), best.window
@@ -250,10 +242,7 @@ def _find_kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
 
 
 def _sum_light(survey: SeriesSurvey, in_events: Bool, level: Float, event: DetectedEvent) -> tuple[float, float]:
-    """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
-
-    Missing frames are interpolated. The error includes that of the level given the quiescent frames.
-    """
+    """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error."""
     rows = slice(event.first, event.last + 1)
     flux, numbers = survey.flux[rows] - level[rows], survey.stare.numbers[rows]
     all_numbers = np.arange(numbers[0], numbers[-1] + 1)
@@ -267,8 +256,7 @@ def _sum_light(survey: SeriesSurvey, in_events: Bool, level: Float, event: Detec
     near = slice(begin, event.last + 1 + NEARBY)
     time, noise = survey.stare.start_s[near], survey.variance[near] * process.excess**2
     inside = slice(event.first - begin, event.last + 1 - begin)
-    photon = survey.photon / survey.scale * np.maximum(flux, 0.0)
-    variance = float(counts**2 @ (noise[inside] + photon))
+    variance = float(counts**2 @ (noise[inside] + survey.photon / survey.scale * np.maximum(flux, 0.0)))
     quiet = ~in_events[near]
     if quiet.sum() >= MIN_BASELINE:
         # Variance of the sum of the level given quiescent frames: w^T K w less what they determine of it.
@@ -293,16 +281,12 @@ def _is_step(fits: Sequence[Fit]) -> bool:
     """Return whether a step of the level fits an event better than the flares of every fit do."""
     window = fits[0].window
     inside = window.middle[window.inside]
-    if inside.size < 3:
-        return False
     starts = window.edges[(window.middle > inside[0] - np.ptp(inside)) & (window.middle < inside[-1]), 0]
-    if not starts.size:
+    if inside.size < 3 or not starts.size:
         return False
-    scores = []
-    for fit in fits:
-        # Each further flare has three parameters more (Schwarz 1978).
-        penalty = 3 * (len(fit.flares) - 1) * float(np.log(window.values.size))
-        scores.append((float(fit.plain.chi2(fit.light)) + penalty, fit.plain))
+    # Each further flare has three parameters more (Schwarz 1978).
+    size = float(np.log(window.values.size))
+    scores = [(float(fit.plain.chi2(fit.light)) + 3 * (len(fit.flares) - 1) * size, fit.plain) for fit in fits]
     least, plain = min(scores, key=itemgetter(0))
     steps = (window.middle >= starts[:, None]).astype(np.float64)
     slope = steps @ (plain.inverse @ window.values)
@@ -404,8 +388,7 @@ def measure_event(
     near = np.abs(middle[rows] - detected.peak_s) <= detected.half_width_s + frame_s
     brightness = np.where(near, flux, -np.inf) if survey.weighted and near.any() else flux
     brightest = first + int(np.argmax(brightness))
-    around = numbers[max(brightest - 1, 0) : brightest + 2]
-    missing_s = (int(np.diff(around).max()) - 1) * frame_s
+    missing_s = (int(np.diff(numbers[max(brightest - 1, 0) : brightest + 2]).max()) - 1) * frame_s
     at_end = first == 0 or last == survey.stare.n_frames - 1
     cut = at_end or bool((np.diff(numbers[[first - 1, first, last, last + 1]])[::2] > GAP_FRAMES).any())
     # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.

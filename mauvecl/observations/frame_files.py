@@ -19,27 +19,11 @@ from mauvecl.host.tables.files import check_content, parsing, without_columns
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import is_magnitude, is_missing, key_of
 from mauvecl.host.tables.opening import open_table
-from mauvecl.host.tables.table import (
-    MemoryTable,
-    TableFile,
-    Values,
-    convert,
-    unit_in,
-    without_indefinite,
-)
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values, convert, unit_in, without_indefinite
 from mauvecl.host.tables.units import is_dated, unit_and_medium, vacuum_wavelengths
+from mauvecl.observations import stored_frames as stored
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits
 from mauvecl.observations.mapping import COLUMN_NAMES, FrameMapping, recognised, times_of
-from mauvecl.observations.stored_frames import (
-    FolderFile,
-    Light,
-    PixelStatistics,
-    StoredFile,
-    open_stored,
-    read_light,
-    stored_in_fits,
-    weighted_sums,
-)
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 
@@ -131,7 +115,7 @@ class ReducedFrames:
     """Spectra reduced to weighted sums."""
 
     light_curves: tuple[Frames, ...]  #: one for each row of the weights
-    pixels: PixelStatistics  #: light and noise of each pixel of the file
+    pixels: stored.PixelStatistics  #: light and noise of each pixel of the file
 
 
 @validated
@@ -154,7 +138,7 @@ def reduce_frames(
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.label)
         bits = QualityBits.of(file.header, places.quality_bits, file.label)
-        lights, pixels = weighted_sums(flux, error, _excluding_bits(quantities.get("quality"), bits), weights)
+        lights, pixels = stored.weighted_sums(flux, error, _excluding_bits(quantities.get("quality"), bits), weights)
         return ReducedFrames(tuple(_frames_in(file, quantities, places, stem, light) for light in lights), pixels)
 
 
@@ -186,15 +170,17 @@ def _open_frames(
         if not place.is_dir():
             opened = _open_file(place, name, places, check, large=True)
         elif (place / "zarr.json").is_file():
-            opened = open_stored(place, label, name)
+            opened = stored.open_stored(place, label, name)
         elif places is None:
             fault = f"{label} is not a store of spectra; give a mapping that says where its quantities are"
             raise InputError(fault, key="mapping")
         else:
             open_file = partial(_open_file, name=name, check=check)
-            opened = nullcontext(FolderFile(place, places, label, open_file))
+            opened = nullcontext(stored.FolderFile(place, places, label, open_file))
         with opened as file:
-            yield file, places or (file.mapping(raw) if isinstance(file, StoredFile) else recognised(file)), place.stem
+            if places is None:
+                places = file.mapping(raw) if isinstance(file, stored.StoredFile) else recognised(file)
+            yield file, places, place.stem
 
 
 def _open_file(
@@ -206,9 +192,9 @@ def _open_file(
     groups = usual if places is None else [(title,) for title in places.times]
 
     def of_fits(hdus: Any, label: str) -> TableFile:
-        return stored_in_fits(FitsTables(hdus, label), name) or FitsTables(hdus, label, name, groups)
+        return stored.stored_in_fits(FitsTables(hdus, label), name) or FitsTables(hdus, label, name, groups)
 
-    of_hdf5 = partial(open_stored, name=name)
+    of_hdf5 = partial(stored.open_stored, name=name)
     return open_table(path, f"file {path.name!r}", check=check, large=large, of_fits=of_fits, of_hdf5=of_hdf5)
 
 
@@ -224,7 +210,7 @@ def _quantities(file: TableFile, mapping: FrameMapping) -> Quantities:
     quantities |= {key: file.find(name) for key, name in names.items() if name is not None}
     if (nm := _wavelength(file, mapping)) is not None:
         quantities["wavelength"], rows = nm, quantities["flux"].n_rows
-        if nm.shape == quantities["flux"].shape == quantities["time"].shape and not isinstance(file, FolderFile):
+        if nm.shape == quantities["flux"].shape == quantities["time"].shape and not isinstance(file, stored.FolderFile):
             check_content(32 * rows, f"{file.label} has {rows} rows of pixels, which need 32 bytes each and at most")
             quantities = _with_row_per_frame(_with_numeric_flags(quantities), file.label)
     _check_rows(file, quantities)
@@ -239,11 +225,8 @@ def _with_row_per_frame(quantities: Quantities, label: str) -> Quantities:
     counts = np.bincount(number, minlength=frames.size * pixels.size).reshape(frames.size, pixels.size)
     if (counts != 1).any():
         row, column = np.argwhere(counts != 1)[0]
-        raise InputError(
-            f"{label}: the frame at {frames[row]} must have one row of wavelength {pixels[column]:g}, "
-            f"not {counts[row, column]}",
-            key="wavelength",
-        )
+        fault = f"{label}: the frame at {frames[row]} must have one row of wavelength {pixels[column]:g}"
+        raise InputError(f"{fault}, not {counts[row, column]}", key="wavelength")
     place, by_frame = np.argsort(number).reshape(counts.shape), {}
     for key, values in quantities.items():
         if key in ("flux", "error", "quality"):
@@ -309,7 +292,6 @@ def _check_rows(file: TableFile, quantities: Quantities) -> None:
     if not 0 < n <= MAX_FRAMES:
         expected = f"at most {MAX_FRAMES} frames, but has {n}" if n else "a row for each frame, but has no rows"
         raise InputError(f"{label} must have {expected}", key="frames")
-    # A light curve is that of one star in one band.
     columns = [file.find(name) for name in file.columns if key_of(name) in GROUPS and "wavelength" not in quantities]
     for column in (column for column in columns if len(column.shape) == 1):
         name, texts = column.name, column.texts()
@@ -330,11 +312,8 @@ def _check_rows(file: TableFile, quantities: Quantities) -> None:
             raise InputError(f"{fault}; give one, or name wavelengths in a mapping", key=values.name)
     if len(flux.shape) > 2:
         pixels = " x ".join(map(str, flux.shape[1:]))
-        raise InputError(
-            f"{label}: {flux.name!r} holds images of {pixels} pixels, as target pixel files do; "
-            "give a light curve, such as lightkurve's `to_lightcurve` makes",
-            key="flux",
-        )
+        fault = f"{label}: {flux.name!r} holds images of {pixels} pixels, as target pixel files do"
+        raise InputError(f"{fault}; give a light curve, such as lightkurve's `to_lightcurve` makes", key="flux")
 
 
 def _conditions(
@@ -361,23 +340,23 @@ def _conditions(
 def _relative_to_level(light: Float, sd: Float | None, unit: str) -> tuple[Float, Float | None, str, list[str]]:
     """Return light and errors, as multiples of the level if they are deviations from it in parts, and remarks."""
     finite = np.sort(light[np.isfinite(light)])
+    finite, remarks = finite[finite.size // 100 : finite.size - finite.size // 100], list[str]()
     if not finite.size:
-        return light, sd, unit, []
-    finite = finite[finite.size // 100 : finite.size - finite.size // 100]
+        return light, sd, unit, remarks
     level, share = float(finite.mean()), PARTS_OF_LEVEL.get(unit.lower())
     # A tenth of the light of a star is not below zero.
     if share is not None and finite[finite.size // 10] < 0.0:
         remarks = [f"its light is a deviation from its level in {unit}, and is read as a multiple of the level"]
         return 1.0 + share * light, None if sd is None else share * sd, "", remarks
-    if level > MIN_LEVEL_SNR * float(finite.std()) / np.sqrt(finite.size):
-        return light, sd, unit, []
-    remarks = [f"the mean of its light is {level:.3g}, not significantly above zero, as after a level or an image is "
-            "subtracted: amplitudes and equivalent durations relative to it mean nothing"]  # fmt: skip
+    if not level > MIN_LEVEL_SNR * float(finite.std()) / np.sqrt(finite.size):
+        cause = "not significantly above zero, as after a level or an image is subtracted"
+        effect = "amplitudes and equivalent durations relative to it mean nothing"
+        remarks = [f"the mean of its light is {level:.3g}, {cause}: {effect}"]
     return light, sd, unit, remarks
 
 
 def _frames_in(
-    file: TableFile, quantities: Quantities, mapping: FrameMapping, stem: str, reduced: Light | None = None
+    file: TableFile, quantities: Quantities, mapping: FrameMapping, stem: str, reduced: stored.Light | None = None
 ) -> Frames:
     """Build frames from a file and its quantities; with `reduced` light, which is not read again."""
     label, header = file.label, file.header
@@ -397,43 +376,35 @@ def _frames_in(
     quality = None if flags is None else np.where(np.isfinite(flags), flags, bits.mask & -bits.mask)
     by_frame |= {"error": sd, "quality": quality}
     frames = Frames.of(
-        time[has_time],
-        light[has_time],
+        time[has_time], light[has_time],
         **{name: None if column is None else column[has_time] for name, column in by_frame.items()},
-        quality_mask=bits.mask,
-        mission=bits.mission,
+        quality_mask=bits.mask, mission=bits.mission, wavelength_nm=nm if light.ndim == 2 else None, unit=unit,
         name=mapping.name or str(header.get("OBJECT", "") or header.get("star", "") or stem),
-        wavelength_nm=nm if light.ndim == 2 else None,
-        unit=unit,
         instrument=str(header.get("INSTRUME", "") or header.get("TELESCOP", "")).strip(),
-        reference_mjd=system.epoch_mjd,
-        scale=system.scale,
-        position=system.position,
-        direction_deg=system.direction_deg,
-        net=isinstance(file, StoredFile) and mapping.flux != "raw",
-    )
+        reference_mjd=system.epoch_mjd, scale=system.scale, position=system.position,
+        direction_deg=system.direction_deg, net=isinstance(file, stored.StoredFile) and mapping.flux != "raw",
+    )  # fmt: skip
     if system.at != 0.5:
         frames = frames.shifted((0.5 - system.at) * frames.exposure_s)
     return frames.with_remarks((*remarks, *bits.remarks(frames.quality, frames.name)))
 
 
 def _read_light(
-    file: TableFile, quantities: Quantities, mapping: FrameMapping, bits: QualityBits, reduced: Light | None
+    file: TableFile, quantities: Quantities, mapping: FrameMapping, bits: QualityBits, reduced: stored.Light | None
 ) -> tuple[Float, Float | None, Float | None, str, tuple[str, ...]]:
     """Return light, errors, flags, the unit of the light, and remarks."""
     unit, flux, error, remarks = _linear_light(quantities, mapping)
-    light, sd, flags, more = reduced or read_light(flux, error, _excluding_bits(quantities.get("quality"), bits))
+    light, sd, flags, more = reduced or stored.read_light(flux, error, _excluding_bits(quantities.get("quality"), bits))
     if "wavelength" not in quantities:
         light, sd = light.ravel(), None if sd is None else sd.ravel()
     sd = None if sd is None else without_indefinite(sd)
-    notes: list[str] = []
-    unused = [name for name in file.columns if FLAGS & {*words_of(name)}]
+    notes, unused = [*file.remarks], [name for name in file.columns if FLAGS & {*words_of(name)}]
     if "quality" not in quantities and unused:
-        notes = [*notes, f"no flags are used; a mapping with quality names one of {', '.join(unused)}"]
+        notes.append(f"no flags are used; a mapping with quality names one of {', '.join(unused)}")
     if len(light.shape) == 1:
         light, sd, unit, on_level = _relative_to_level(light, sd, unit)
-        notes = [*notes, *on_level]
-    remarks += (*more, *(f"{file.label}: {text}" for text in (*file.remarks, *notes)))
+        notes += on_level
+    remarks += (*more, *(f"{file.label}: {text}" for text in notes))
     if sd is not None and not np.isfinite(sd).any():
         # lightkurve writes a column of NaN for errors that it does not know.
         sd = None
@@ -452,11 +423,10 @@ def _excluding_bits(quality: Values | None, bits: QualityBits) -> Values | None:
 
 def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
     """Return the unit of the light, light and errors in it, and remarks."""
-    flux, error = quantities["flux"], quantities.get("error")
-    remarks: tuple[str, ...] = ()
+    flux, error, remarks = quantities["flux"], quantities.get("error"), tuple[str, ...]()
     file_unit = flux.stated_unit
     unit = mapping.flux_unit or file_unit
-    if mapping.flux_unit and file_unit and mapping.flux_unit != file_unit:
+    if file_unit and unit != file_unit:
         remarks = (f"the unit of {flux.name!r} is {mapping.flux_unit} as the mapping says, not {file_unit}",)
     if not unit and (is_magnitude(flux.name) or {*words_of(flux.name)} & {"log", "ln", "dex"}):
         remedy = "convert magnitudes and logarithms first, or name a linear unit as flux_unit in a mapping"
@@ -466,11 +436,10 @@ def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, V
         raise InputError.of("flux_unit", unit, expected, where=flux.label)
     if error is None:
         return unit, flux, None, remarks
-    named = f"{error.label}: {error.name!r}"
+    named, error_unit = f"{error.label}: {error.name!r}", error.stated_unit
     if error.shape != flux.shape:
         fault = f"{named} must have the shape of the flux, {flux.shape}, not {error.shape}"
         raise InputError(fault, key="error")
-    error_unit = error.stated_unit
     if error_unit and not unit and error_unit.lower() in PARTS_OF_LEVEL:
         remedy = "give errors in the unit of the light, or flux_unit = '1' in a mapping if its level is 1"
         raise InputError(f"{named} is in {error_unit}, and {flux.name!r} is not; {remedy}", key="error")
@@ -489,9 +458,9 @@ def _vacuum_nm(wavelength: Values, mapping: FrameMapping, file: TableFile) -> Fl
     unit, medium = unit_and_medium(mapping.wavelength_unit or "")
     stated_unit, stated_medium = unit_and_medium(wavelength.unit)
     nm = convert(replace(wavelength, unit=stated_unit or ""), unit, "nm", "wavelength_unit")
-    pixels = nm.rows(slice(0, 1))[0] if len(nm.shape) == 2 else nm.numbers().ravel()
-    for piece in nm.pieces if len(nm.shape) == 2 else []:
-        if not np.allclose(nm.rows(piece), pixels, rtol=1e-9, atol=0.0):
-            fault = f"{wavelength.label}: the wavelengths must be the same in every frame, but change"
-            raise InputError(fault, key="wavelength")
+    by_frame = len(nm.shape) == 2
+    pixels = nm.rows(slice(0, 1))[0] if by_frame else nm.numbers().ravel()
+    if by_frame and not all(np.allclose(nm.rows(piece), pixels, rtol=1e-9, atol=0.0) for piece in nm.pieces):
+        fault = f"{wavelength.label}: the wavelengths must be the same in every frame, but change"
+        raise InputError(fault, key="wavelength")
     return vacuum_wavelengths(pixels, wavelength.name, "", medium or stated_medium, (file.header,))[0]

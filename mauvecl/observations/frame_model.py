@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import spectrum_of
+from mauvecl.fits.flare_model import FlareModel
 from mauvecl.host.arrays import PER_MAD, Bool, Float
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.host.tables.units import counts_in, unit_of
+from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
-
-if TYPE_CHECKING:
-    from mauvecl.fits.flare_model import FlareModel
-    from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.observations.frames import Frames
-
 
 #: Share of bias and dark current below which the median of a pixel cannot include them.
 LEAST_OF_OFFSET = 0.5
@@ -67,12 +64,10 @@ class FrameModel:
         elif elements is not None:
             bins = (~quiet.saturated * (quiet.element == elements[:, None])).astype(np.float64)
         else:
-            raise InputError(
-                f"the spectra must have the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} "
-                f"resolution elements of {quiet.instrument}, but have {frames.wavelength_nm.size} wavelengths from "
-                f"{frames.wavelength_nm[0]:.1f} nm",
-                key="wavelength_nm",
-            )
+            expected = f"{quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements"
+            given = f"{frames.wavelength_nm.size} wavelengths from {frames.wavelength_nm[0]:.1f} nm"
+            fault = f"the spectra must have the {expected} of {quiet.instrument}, but have {given}"
+            raise InputError(fault, key="wavelength_nm")
         if flux is not None:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
@@ -130,19 +125,11 @@ class FrameModel:
         nm, none = self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1), np.zeros(electrons.size)
         dark: dict[str, Any] = dict.fromkeys(("sky_electrons", "neighbour_electrons", "dark_dn", "bias_dn"), none)
         return replace(
-            self.quiet,
-            **dark,
-            source_electrons=electrons,
-            read_noise_dn=np.sqrt(read_variance),
-            gain_dn_per_electron=gain,
-            wavelength_nm=nm,
-            element=np.arange(nm.size, dtype=np.int32),
-            element_wavelength_nm=nm,
-            n_frames=self.quiet.n_frames * n_frames,
-            adc_max_dn=NO_CEILING_DN,
-            saturation_dn=float(NO_CEILING_DN),
-            messages=(),
-        )
+            self.quiet, **dark, source_electrons=electrons, gain_dn_per_electron=gain, wavelength_nm=nm,
+            read_noise_dn=np.sqrt(read_variance), element=np.arange(nm.size, dtype=np.int32),
+            element_wavelength_nm=nm, n_frames=self.quiet.n_frames * n_frames,
+            adc_max_dn=NO_CEILING_DN, saturation_dn=float(NO_CEILING_DN), messages=(),
+        )  # fmt: skip
 
 
 def _per_flam(text: str, wavelength_nm: Float) -> Float | None:
@@ -293,13 +280,11 @@ def _replace_rays(
     """Replace bad values in some frames of `flux`, in place, and return their number in each of these frames."""
     excess = flux[at] - light
     # A robust measurement, so that errors that are stated too small make no rays.
-    scatter = PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0)
-    sd = np.maximum(noise, scatter)
+    sd = np.maximum(noise, PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0))
     spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
     basis = np.linalg.svd(spectra / np.linalg.norm(spectra, axis=1, keepdims=True) / sd, full_matrices=False)[2]
     limit = float(scipy.stats.norm.isf(CHANCE_RAYS / 2 / excess.size))
-    bad = np.zeros(excess.shape, np.bool_)
-    rows = np.arange(at.size)
+    bad, rows = np.zeros(excess.shape, np.bool_), np.arange(at.size)
     for _ in range(RAY_ROUNDS):
         fit = (excess[rows] / sd) @ basis.T @ basis * sd
         residual = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
@@ -314,10 +299,9 @@ def _replace_rays(
         if not rows.size:
             break
     # An excess in the same pixel of a neighbouring frame as well is not a ray, but light that the fit does not include.
-    adjacent = np.diff(numbers[at]) == 1
-    persistent = bad[1:] & bad[:-1] & adjacent[:, None]
+    persistent = bad[1:] & bad[:-1] & (np.diff(numbers[at]) == 1)[:, None]
     bad[1:] &= ~persistent
     bad[:-1] &= ~persistent
-    where = np.nonzero(bad)
-    flux[at[where[0]], where[1]] = (excess + light)[where]
+    frame, pixel = np.nonzero(bad)
+    flux[at[frame], pixel] = (excess + light)[bad]
     return np.asarray(bad.sum(axis=1), np.int64)

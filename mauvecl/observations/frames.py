@@ -167,12 +167,10 @@ def _in_order(key: str, column: Any, light: Float, order: NDArray[np.intp], name
         return None
     values = np.asarray(column, np.int64 if key == "quality" else np.float64)
     shape = light.shape if key == "error" else order.shape
-    if key == "error" and values.ndim == 0:
-        values = np.full(shape, values)
+    values = np.full(shape, values) if key == "error" and values.ndim == 0 else values
     if values.shape != shape:
-        raise InputError.of(
-            key.removesuffix("_c"), f"those of shape {values.shape}", f"values of shape {shape}", where=name
-        )
+        given, expected = f"those of shape {values.shape}", f"values of shape {shape}"
+        raise InputError.of(key.removesuffix("_c"), given, expected, where=name)
     return values[order]
 
 
@@ -248,10 +246,8 @@ class Frames:
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise refused("exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
         flags = np.zeros(n) if quality is None else quality
-        by_frame: dict[str, Any] = {
-            key: _in_order(key, column, light, order, name)
-            for key, column in (("error", error), ("temperature_c", temperature_c), ("quality", flags))
-        }
+        columns = {"error": error, "temperature_c": temperature_c, "quality": flags}
+        by_frame = {key: _in_order(key, column, light, order, name) for key, column in columns.items()}
         nm = None if wavelength_nm is None else np.asarray(wavelength_nm, np.float64)
         frames = cls(time[order], exposure[order], light[order], wavelength_nm=nm, name=name, **by_frame, **how)
         if (np.diff(time) < 0).any():

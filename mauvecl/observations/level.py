@@ -83,8 +83,7 @@ def counts_per_unit(frames: Frames) -> float | None:
     finite = np.isfinite(flux)
     if flux.ndim > 1 or not finite.any() or (flux[finite] < 0).any():
         return None
-    exposure = float(np.median(frames.exposure_s))
-    for factor in (1.0, exposure):
+    for factor in (1.0, float(np.median(frames.exposure_s))):
         counts = flux[finite] * factor
         # Fluxes such as 1e-15 are near zero, but are no counts.
         integer = np.abs(counts - np.rint(counts)) <= 1e-6 * counts
@@ -136,13 +135,11 @@ def quiet_variance(flux: Float, error: Float, level: Float, quiet: Bool) -> tupl
 
     Stated errors often follow the counts of the frame, of which the difference from the level is taken away.
     """
-    squared = error**2
-    difference = (flux - level)[quiet]
-    spread = float(difference @ difference)
+    squared, difference = error**2, (flux - level)[quiet]
+    spread, typical = float(difference @ difference), float(np.median(squared[quiet]))
     slope = 0.0
     if spread > 0:
         slope = max(float(difference @ (squared[quiet] - squared[quiet].mean())) / spread, 0.0)
-    typical = float(np.median(squared[quiet]))
     return np.maximum(squared - slope * (flux - level), LEAST_VARIANCE * typical), slope
 
 
@@ -165,9 +162,8 @@ def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
         raise InputError(f"{frames.name} needs at least {MIN_USABLE} frames without a fault, but has {n}", key="frames")
     flux = frames.white_light[0][usable]
     if np.median(np.abs(np.diff(flux))) <= LEAST_NOISE * np.abs(np.median(flux)) and counts_per_unit(frames) is None:
-        raise InputError(
-            f"{frames.name} must be a light curve with noise, but the flux of most frames is the same", key="flux"
-        )
+        fault = "must be a light curve with noise, but the flux of most frames is the same"
+        raise InputError(f"{frames.name} {fault}", key="flux")
 
 
 class ConditionalLevel:
@@ -216,8 +212,7 @@ def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, s
     draws = int(np.clip(LEVEL_VALUES // time_s.size, *LEVEL_DRAWS))
     for _ in steps.track(range(draws), draws):
         truth = simulated.coloured(rng.standard_normal(time_s.size))
-        noisy = truth + np.sqrt(noise) * rng.standard_normal(time_s.size)
-        total += (level.of(noisy) - truth) ** 2
+        total += (level.of(truth + np.sqrt(noise) * rng.standard_normal(time_s.size)) - truth) ** 2
     return np.sqrt(total / draws)
 
 
@@ -226,8 +221,7 @@ def single_frames(numbers: NDArray[np.int64], sigmas: Float, usable: Bool) -> Bo
 
     A flare that is shorter than a frame cannot be distinguished from a cosmic ray. Frames without a fault are `usable`.
     """
-    frames = np.flatnonzero(usable)
-    single = np.zeros(sigmas.size, np.bool_)
+    frames, single = np.flatnonzero(usable), np.zeros(sigmas.size, np.bool_)
     middle, before, after = frames[1:-1], frames[:-2], frames[2:]
     adjacent = (numbers[after] - numbers[before]) == 2
     low = (np.abs(sigmas[before]) < NEAR) & (np.abs(sigmas[after]) < NEAR)
@@ -276,9 +270,7 @@ def likeness(numbers: NDArray[np.int64], residual: Float) -> NoiseComparison:
         if first.size > 10:
             correlations[:, k] = (scaled[first] * scaled[second]).mean(axis=0)
             errors[k] = first.size**-0.5
-    return max(
-        (NoiseComparison(row, errors) for row in correlations), key=lambda likeness: float(likeness.excess.max())
-    )
+    return max((NoiseComparison(row, errors) for row in correlations), key=lambda noise: float(noise.excess.max()))
 
 
 @dataclass(frozen=True)
@@ -300,7 +292,7 @@ class Scatter:
 
 def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]:
     """Measure the scatter of means of consecutive frames without gaps, in units of the noise of a frame."""
-    scatter = []
+    scatter = list[Scatter]()
     # Place of each frame among consecutive ones, and their number.
     first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 2) != 1)
     lengths = np.diff(np.append(first, numbers.size))
@@ -308,12 +300,11 @@ def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]
     for size in BINS:
         # Bins do not overlap, and begin with the first frame after a gap.
         starts = np.flatnonzero((place % size == 0) & (place + size <= length))
-        if len(starts) < MIN_BINS:
+        if (dof := len(starts) - 1) < MIN_BINS - 1:
             break
         means = residual[starts[:, None] + np.arange(size)].mean(axis=1)
-        dof = len(starts) - 1
         low, high = np.sqrt(scipy.stats.chi2.ppf([0.025, 0.975], dof) / dof / size).tolist()
-        scatter.append(Scatter(size, len(starts), float(means.std(ddof=1)), size**-0.5, low, high))
+        scatter.append(Scatter(size, dof + 1, float(means.std(ddof=1)), size**-0.5, low, high))
     return scatter
 
 
@@ -341,15 +332,14 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
     Sudden changes are steps if each is larger than its error, with and without the frames in which a flare may have
     begun there, and if together they lower the Bayesian information criterion. No frame has a fault.
     """
-    constant = np.ones(flux.size)
+    constant, process = np.ones(flux.size), None
     values = flux / BinnedLightCurve(time_s, flux, constant, frame_s).noise
     places, sizes = _find_sudden_changes(time_s, values)
-    process: Process | None = None
     if not places.size or not np.median(values) > 0:
         return constant
 
     def binned(light: Float) -> BinnedLightCurve:
-        return BinnedLightCurve.of(time_s[quiet], light[quiet], np.ones(int(quiet.sum())), frame_s, MAX_TRIED)
+        return BinnedLightCurve(time_s[quiet], light[quiet], constant[quiet], frame_s).binned(MAX_TRIED)
 
     for _ in range(ROUNDS):
         without_steps = values - np.cumsum(np.bincount(places, sizes, values.size))
@@ -382,9 +372,7 @@ def relative_level(time_s: Float, numbers: NDArray[np.int64], flux: Float, frame
 def _find_sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
     """Return the first frames after sudden changes that last, in order of time, and the changes of the flux."""
     changes: dict[int, tuple[float, float]] = {}
-    for side in SIDES:
-        if flux.size < 4 * side:
-            continue
+    for side in (side for side in SIDES if flux.size >= 4 * side):
         # Parabolas through the frames before and after, half a frame beyond their ends.
         weights = np.linalg.pinv(np.vander(np.arange(side) - (side - 0.5), 3))[-1]
         before = np.convolve(flux, weights[::-1], mode="valid")[:-side]
@@ -400,10 +388,9 @@ def _find_sudden_changes(time_s: Float, flux: Float) -> tuple[Places, Float]:
         ends = time_s[place] + np.array([-length_s, FLARE_S, FLARE_S + length_s])
         first, later, last = np.searchsorted(time_s, ends)
         before, after = flux[first:place], flux[later:last]
-        if min(before.size, after.size) >= SIDES[0]:
-            share = float(np.median(after) - np.median(before)) / size
-            if 1 / LASTS < share < LASTS:
-                lasting.add(place)
+        enough = min(before.size, after.size) >= SIDES[0]
+        if enough and 1 / LASTS < float(np.median(after) - np.median(before)) / size < LASTS:
+            lasting.add(place)
     places = sorted(sorted(lasting, key=lambda place: changes[place], reverse=True)[:MOST_STEPS])
     return np.array(places, np.intp), np.array([changes[place][1] for place in places])
 
@@ -412,14 +399,12 @@ def _fit_steps(
     process: Process, time_s: Float, flux: Float, quiet: Bool, places: Places, frame_s: float
 ) -> tuple[Float, Float]:
     """Return the steps of a light curve by generalised least squares, and their standard errors, (n_step,) each."""
-    rows, time = np.flatnonzero(quiet), time_s[quiet]
-
-    def binned(column: Float | Bool) -> BinnedLightCurve:
-        return BinnedLightCurve.of(time, column.astype(np.float64), np.ones(rows.size), frame_s)
-
-    data = binned(flux[quiet])
-    columns = [np.ones(data.values.size), *(binned(rows >= place).values for place in places), data.values]
+    data = BinnedLightCurve(time_s[quiet], flux[quiet], np.ones(int(quiet.sum())), frame_s)
+    after = np.flatnonzero(quiet) >= places[:, None]
+    steps = [replace(data, values=step.astype(np.float64)).binned().values for step in after]
+    data = data.binned()
     covariance = process.covariance(data.time_s, data.variance * process.excess**2)
-    white = covariance.whitened(np.column_stack(columns))
-    spread = np.linalg.pinv(white[:, :-1].T @ white[:, :-1])
-    return (spread @ (white[:, :-1].T @ white[:, -1]))[1:], np.sqrt(np.diag(spread))[1:]
+    white = covariance.whitened(np.column_stack([np.ones(data.values.size), *steps, data.values]))
+    design, values = white[:, :-1], white[:, -1]
+    spread = np.linalg.pinv(design.T @ design)
+    return (spread @ (design.T @ values))[1:], np.sqrt(np.diag(spread))[1:]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,22 +16,10 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
 from mauvecl.host.arrays import PER_MAD, Bool, Float, true_runs
+from mauvecl.observations import level as levels
 from mauvecl.observations.event_fits import flares_of
 from mauvecl.observations.events import END_FRAMES, LONG_S, MIN_QUIET, detect_events, light_of_flare
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.level import (
-    FAR,
-    MOST_BELOW,
-    QuiescentLevel,
-    check_usable,
-    counts_per_unit,
-    guess_flares,
-    level_error,
-    noise_of_frames,
-    noise_of_steps,
-    relative_level,
-    single_frames,
-)
 from mauvecl.observations.process import UNREPORTED, BinnedLightCurve, Process, Steps, criterion_of_process, fit_process
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey, bank_of
 from mauvecl.schema.errors import InputError
@@ -51,9 +39,11 @@ FASTEST_ROTATION_S, SEEN_ONCE, REPEATED = 17_280.0, 20.0, 10.0
 SETTLED, RAN_AWAY = 0.002, 0.02
 
 
-def fit_quiet_light(
-    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps = UNREPORTED
-) -> tuple[SeriesSurvey, Bool]:
+#: A survey with processes, and its frames in events.
+Fitted = tuple[SeriesSurvey, Bool]
+
+
+def fit_quiet_light(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None, steps: Steps) -> Fitted:
     """Fit process and events in alternation, from the guess and, if need be, from the events in independent noise.
 
     A bright, slow flare resembles a process that is seen once. There, the fit with the events in independent noise is
@@ -62,24 +52,20 @@ def fit_quiet_light(
     fitted, in_events = alternate(survey, guessed, before, steps)
     if before is not None and float((in_events ^ guessed).mean()) > RAN_AWAY:
         # Nearly the same frames had other events: which of them explain the light better?
-        previous = replace(survey, processes=before.processes, flux_process=before.flux_process)
-        states = (previous, guessed), (fitted, in_events)
-        cost, refitted = (criterion(state, light_of_events(state, events), events) for state, events in states)
-        if cost < refitted:
-            return previous, guessed
+        previous = survey.fitted(before), guessed
+        if criterion(*previous) < criterion(fitted, in_events):
+            return previous
     if not _seen_once(fitted):
         return fitted, in_events
     noise = tuple(Process((), process.excess) for process in fitted.processes)
     events, guessed = detect_events(replace(survey, processes=noise), PROVISIONAL)
     if len(events) > MAX_COMPARED or not (guessed & ~in_events).any():
         return fitted, in_events
-    other, in_others = alternate(survey, guessed, None, steps)
-    if float((in_others ^ in_events).mean()) <= SETTLED:
+    other = alternate(survey, guessed, None, steps)
+    if float((other[1] ^ in_events).mean()) <= SETTLED:
         return fitted, in_events
     light = light_of_events(fitted, in_events)
-    cost = criterion(fitted, light, in_events)
-    other_cost = criterion(other, light_of_events(other, in_others), in_others, light)
-    return (other, in_others) if other_cost < cost else (fitted, in_events)
+    return other if criterion(*other, further=light) < criterion(fitted, in_events, light) else (fitted, in_events)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,21 +94,17 @@ def light_of_events(survey: SeriesSurvey, in_events: Bool) -> list[EventLight]:
 
 
 def criterion(
-    survey: SeriesSurvey,
-    fits: Sequence[EventLight],
-    in_events: Bool,
-    further: Sequence[EventLight] = (),
-    *,
-    shapeless: bool = False,
-) -> float:
+    survey: SeriesSurvey, in_events: Bool, fits: Sequence[EventLight] | None = None,
+    further: Sequence[EventLight] = (), *, shapeless: bool = False,
+) -> float:  # fmt: skip
     """Return the Bayesian information criterion of the processes of a survey and of the flares of `light_of_events`.
 
     A process of minutes that is hardly seen to repeat costs `SEEN_ONCE`: stars and instruments repeat what they do. If
     `shapeless`, or in independent noise, the light of an event may have any smooth shape, or depart from that of its
     flares, or of `further` ones, by a process.
     """
-    all_frames = np.ones(survey.stare.n_frames, np.bool_)
-    total = min(_criterion_of(survey, fits, all_frames, epsilon) for epsilon in DEPARTURES)
+    fits = light_of_events(survey, in_events) if fits is None else fits
+    total = min(_criterion_of(survey, fits, np.ones_like(in_events), epsilon) for epsilon in DEPARTURES)
     shapeless = shapeless or not any(process.terms for process in survey.processes)
     if fits and shapeless and survey.sums.shape[1] == 1:
         in_fits = sum(_shapeless_cost(survey, fit.event, (fits, further)) for fit in fits)
@@ -176,20 +158,16 @@ def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], chosen: Bool
 
 def _seen_once(survey: SeriesSurvey) -> bool:
     """Return whether a process is faster than rotation, but too slow to be seen to repeat."""
-    span = survey.stare.duration_s
-    return any(
-        span / REPEATED < term.scale_s < FASTEST_ROTATION_S for process in survey.processes for term in process.terms
-    )
+    span, terms = survey.stare.duration_s, (term for process in survey.processes for term in process.terms)
+    return any(span / REPEATED < term.scale_s < FASTEST_ROTATION_S for term in terms)
 
 
-def alternate(
-    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None, steps: Steps
-) -> tuple[SeriesSurvey, Bool]:
+def alternate(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None, steps: Steps) -> Fitted:
     """Fit process and events in alternation; return the survey with processes, and the frames above `PROVISIONAL`.
 
     The terms of `before`, a survey of nearly the same frames, are kept as long as the events hardly change.
     """
-    in_events, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], tuple[SeriesSurvey, Bool]]()
+    in_events, rounds = guessed, dict[tuple[bytes, SeriesSurvey | None], Fitted]()
     for _ in range(ALTERNATIONS):
         key = in_events.tobytes(), before
         if key in rounds:
@@ -215,7 +193,7 @@ def _fit_processes(survey: SeriesSurvey, quiet: Bool, before: SeriesSurvey | Non
     starts = [None] * len(columns) if before is None else [*before.processes, before.flux_process]
     for column, start in zip(columns, starts, strict=False):
         time, values, variance = survey.stare.start_s[quiet], column[quiet], survey.variance[quiet]
-        fits.append(fit_process(BinnedLightCurve.of(time, values, variance, survey.stare.frame_s), start, steps))
+        fits.append(fit_process(BinnedLightCurve(time, values, variance, survey.stare.frame_s).binned(), start, steps))
     return replace(survey, processes=tuple(fits[: survey.sums.shape[1]]), flux_process=fits[-1])
 
 
@@ -274,12 +252,8 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, s
     rotates = any(term.rotates for term in process.terms)
     slow_s = min(survey.stare.duration_s / 3, SLOW_S)
     noise = process.excess * float(np.sqrt(np.median(fitted.variance)))
-    fast = any(
-        not term.rotates
-        and term.scale_s < slow_s
-        and term.sd * np.sqrt(term.scale_s / survey.stare.frame_s) > LEAST_LOSS * noise
-        for term in process.terms
-    )
+    short = [term for term in process.terms if not term.rotates and term.scale_s < slow_s]
+    fast = any(term.sd * np.sqrt(term.scale_s / survey.stare.frame_s) > LEAST_LOSS * noise for term in short)
     active = in_events.mean() > MOST_ACTIVE
     many = active or (in_events.mean() > MOST_FLARING and not rotates)
     if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
@@ -289,12 +263,8 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, s
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
     guessed = detect_events(down, PROVISIONAL, steps)[1]
-
-    @cache
-    def usual() -> float:
-        """Return the criterion of flares without losses."""
-        return criterion(fitted, light_of_events(fitted, in_events), in_events)
-
+    # The criterion of flares without losses, which takes long.
+    usual = cache(partial(criterion, fitted, in_events))
     # Those of a star that varies are most of its frames; eclipses repeat.
     if active and guessed.mean() >= MOST_LOST and (eclipses := _find_eclipses(survey, usual)).any():
         lost[dark] = eclipses
@@ -306,8 +276,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, s
     if 0 < losses.mean() < (MOST_LOST_CONSTANT if constant else MOST_LOST):
         # Beside flares in even more frames, the star would be more than its noise.
         simpler = constant and losses.mean() < in_events.mean() and process.excess > MOST_EXCESS
-        light = light_of_events(other, losses)
-        if simpler or criterion(other, light, losses, shapeless=True) < usual():
+        if simpler or criterion(other, losses, shapeless=True) < usual():
             lost[dark] = losses
     return lost
 
@@ -315,21 +284,20 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, in_events: Bool, s
 def _find_eclipses(survey: SeriesSurvey, usual: Callable[[], float]) -> Bool:
     """Return the frames in periodic losses if these lower the criterion, which is `usual()` without them."""
     guessed = guess_eclipses(survey)
-    lost = np.zeros_like(guessed)
+    lost, size = np.zeros_like(guessed), float(np.log(guessed.size))
     if not 0 < guessed.mean() < MOST_LOST:
         return lost
     bright, dim = survey.frames(~guessed), survey.frames(guessed)
-    fitted, in_events = fit_quiet_light(bright, guess_flares(bright.stare.numbers, bright.flux))
+    guess = levels.guess_flares(bright.stare.numbers, bright.flux)
+    fitted, in_events = fit_quiet_light(bright, guess, None, UNREPORTED)
     # The light in eclipses may have any smooth shape.
     data = BinnedLightCurve(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
-    size = float(np.log(guessed.size))
     cost = EPHEMERIS * size + criterion_of_process(fit_process(data), data, size)
-    if criterion(fitted, light_of_events(fitted, in_events), in_events) + cost >= usual():
+    if criterion(fitted, in_events) + cost >= usual():
         return lost
     quiet = ~guessed
     quiet[quiet] = ~in_events
-    survey = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
-    sigma = uniform_filter1d(survey.along(0, quiet), END_FRAMES)
+    sigma = uniform_filter1d(survey.fitted(fitted).along(0, quiet), END_FRAMES)
     # Frames at the ends of the guess that are as bright as the star are searched.
     for first, end in true_runs(guessed):
         faint = first + np.flatnonzero(sigma[first:end] < -FAINT)
@@ -348,7 +316,7 @@ def guess_eclipses(survey: SeriesSurvey) -> Bool:
 
     time = survey.stare.start_s
     inside = np.zeros(time.size, np.bool_)
-    data = BinnedLightCurve.of(time, survey.flux, survey.variance, survey.stare.frame_s, MOST_BINNED)
+    data = BinnedLightCurve(time, survey.flux, survey.variance, survey.stare.frame_s).binned(MOST_BINNED)
     period = max(SHORTEST_PERIOD_S, 2 * data.step_s / ECLIPSES[0])
     grids = []
     while period < data.span_s / 3:
@@ -406,7 +374,7 @@ ROUNDS = 3
 
 def survey_light_curve(
     frames: Frames, shape: Shape, seed: int, steps: Steps = UNREPORTED
-) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
+) -> tuple[SeriesSurvey, levels.QuiescentLevel, Frames]:
     """Fit the quiescent light of a light curve, and prepare its search; `seed` is that of the error of the level.
 
     Frames of few counts are returned with a remark and without errors. `steps` reports fits, searches and draws.
@@ -418,15 +386,15 @@ def survey_light_curve(
     flux, error = flux / steps_of_level, None if error is None else error / steps_of_level
     # A frame of no count at the least has the Poisson noise of one.
     least = 0.0 if counts is None else float(np.sqrt(max(np.median(flux[used]) * counts, 1.0))) / counts
-    guessed = np.zeros(flux.size, np.bool_)
     survey: SeriesSurvey | None = None
     for number in range(ROUNDS):
         used = reasons == 0
         if survey is None:
-            guessed[used] = guess_flares(frames.numbers[used], flux[used], least)
+            guessed = np.zeros(flux.size, np.bool_)
+            guessed[used] = levels.guess_flares(frames.numbers[used], flux[used], least)
             level = np.full(flux.size, _mean(frames.name, flux[used & ~guessed], least))
         quiet = used & ~guessed
-        variance, photon = noise_of_frames(frames, flux, error, level, quiet, counts)
+        variance, photon = levels.noise_of_frames(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
         survey, in_events = fit_quiet_light(new, guessed[used], survey, fits)
@@ -443,7 +411,7 @@ def survey_light_curve(
             break
         reasons = np.where(used, reasons | flagged, reasons)
     assert survey is not None
-    below = np.isfinite(flux) & (reasons != 0) & (flux - level < -FAR * sd)
+    below = np.isfinite(flux) & (reasons != 0) & (flux - level < -levels.FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     survey = survey.frames((reasons == 0)[np.searchsorted(frames.time_s, survey.time_s)])
     light = quiescent_light(frames, survey, reasons, ~guessed, seed, steps.part(0.9, 1.0))
@@ -455,23 +423,23 @@ def _prepare(frames: Frames) -> tuple[Frames, float | None, NDArray[np.int64], F
 
     Frames of few counts have no errors; for others, counts are None. Raises InputError if too few frames are usable.
     """
-    if (counts := counts_per_unit(frames)) is not None:
+    if (counts := levels.counts_per_unit(frames)) is not None:
         remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
         frames = replace(frames, error=None).with_remarks((remark,))
     flux, error = frames.white_light
     reasons, level = frames.faults.copy(), np.ones(flux.size)
-    check_usable(frames, reasons)
+    levels.check_usable(frames, reasons)
     if counts is None:
         # Single frames far above the frames around them, as the level is not known yet.
         usable, sigmas = reasons == 0, np.zeros(flux.size)
-        scatter = noise_of_steps(frames.numbers[usable], flux[usable])
+        scatter = levels.noise_of_steps(frames.numbers[usable], flux[usable])
         sd = np.full(int(usable.sum()), scatter) if error is None else np.maximum(error[usable], scatter)
         above = flux[usable] - median_filter(flux[usable], size=SPIKE_FRAMES, mode="nearest")
         sigmas[usable] = np.divide(above, sd, out=np.zeros(sd.size), where=sd > 0)
-        reasons[single_frames(frames.numbers, sigmas, usable)] |= Reason.SPIKE
+        reasons[levels.single_frames(frames.numbers, sigmas, usable)] |= Reason.SPIKE
         if np.ptp(frames.time_s) > LONG_S:
             rows = np.flatnonzero(reasons == 0)
-            relative = relative_level(frames.time_s[rows], frames.numbers[rows], flux[rows], frames.cadence_s)
+            relative = levels.relative_level(frames.time_s[rows], frames.numbers[rows], flux[rows], frames.cadence_s)
             # Frames that are not searched have the level of the next one that is.
             level = relative[np.clip(np.searchsorted(rows, np.arange(flux.size)), 0, rows.size - 1)]
     return frames, counts, reasons, level
@@ -481,7 +449,7 @@ def _mean(name: str, flux: Float, least: float) -> float:
     """Return the mean without outliers, which must not be zero; a median of whole numbers would be one of them."""
     middle = float(np.median(flux))
     spread = max(PER_MAD * float(np.median(np.abs(flux - middle))), least)
-    near = np.abs(flux - middle) <= max(FAR * spread, 1e-12 * abs(middle))
+    near = np.abs(flux - middle) <= max(levels.FAR * spread, 1e-12 * abs(middle))
     if (mean := float(flux[near].mean())) == 0.0:
         raise InputError(f"{name}: the level of the star's light must not be zero", key="flux")
     return mean
@@ -493,24 +461,22 @@ def _flag_single_frames(
     """Return the reasons not to search single frames: far below the level, or alone far above it."""
     sigmas = np.where(used, (flux - level) / sd, 0.0)
     flagged = np.zeros(flux.size, np.int64)
-    below = (sigmas < -FAR) & ~events
-    if below.mean() <= MOST_BELOW:
+    below = (sigmas < -levels.FAR) & ~events
+    if below.mean() <= levels.MOST_BELOW:
         flagged[below] = Reason.BELOW
     if counts is None:
-        flagged[single_frames(frames.numbers, sigmas, used)] |= Reason.SPIKE
+        flagged[levels.single_frames(frames.numbers, sigmas, used)] |= Reason.SPIKE
     return flagged
 
 
 def quiescent_light(
     frames: Frames, survey: SeriesSurvey, reasons: NDArray[np.int64], outside: Bool, seed: int, steps: Steps
-) -> QuiescentLevel:
+) -> levels.QuiescentLevel:
     """Return level, its error, and noise of all frames, from those that are searched and `outside` of events."""
     used, process = reasons == 0, survey.flux_process
     quiet, excess = outside[used], process.excess if frames.error is not None else float("nan")
-    error = level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
-    level, sd, noise = (
-        np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
-        for values in (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess)
-    )
+    error = levels.level_error(process, survey.stare.start_s, survey.variance, quiet, seed, steps)
+    searched, time_s = (survey.flux_level(quiet), error, np.sqrt(survey.variance) * process.excess), frames.time_s
+    level, sd, noise = (np.interp(time_s, time_s[used], values * survey.scale) for values in searched)
     spread = float(level[used].std()) / survey.level
-    return QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process, spread)
+    return levels.QuiescentLevel(level, sd, noise, excess, used & outside, reasons, process, spread)

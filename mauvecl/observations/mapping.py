@@ -158,7 +158,6 @@ def recognised(file: TableFile) -> FrameMapping:
         timed = [name for name in times if re.match(r"t(?:ime)?[\s_.]", name, re.IGNORECASE)]
         columns["time"] = dated[0] if dated else first_of((*OTHER_TIMES, *timed), names, file.label)
     if columns["time"] is None:
-        # The start and the end of each frame.
         edges = tuple(first_of((name,), names, file.label) for name in ("t0", "t1"))
         columns["time"] = None if None in edges else edges
     flux = divided_unit(columns["flux"] or "")[0]
@@ -168,17 +167,12 @@ def recognised(file: TableFile) -> FrameMapping:
     errors += [flux.lower().replace("flux_", "flux_err_")] if "flux_" in flux.lower() else []
     columns["error"] = first_of((*errors, "error", "err", "uncertainty", "unc", "sigma"), names, file.label)
     if columns["flux"] is None and (magnitudes := [name for name in names if is_magnitude(name)]):
-        raise InputError(
-            f"{file.label} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light; "
-            "give light in a linear unit, in a column named flux or that a mapping names",
-            key="flux",
-        )
+        fault = f"{file.label} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light"
+        remedy = "give light in a linear unit, in a column named flux or that a mapping names"
+        raise InputError(f"{fault}; {remedy}", key="flux")
     if columns["time"] is None or columns["flux"] is None:
-        raise InputError(
-            f"{file.label} must have columns named time and flux, or a mapping that names them, but has the columns "
-            f"{shortened(', '.join(file.names), 300)}",
-            key="mapping",
-        )
+        fault = f"{file.label} must have columns named time and flux, or a mapping that names them"
+        raise InputError(f"{fault}, but has the columns {shortened(', '.join(file.names), 300)}", key="mapping")
     if "SPECTRUM" in file.names and "WAVELENGTH/WAVELENGTH" in file.names:
         columns |= {"flux": "SPECTRUM", "error": "SPECTRUM_ERR", "wavelength": "WAVELENGTH/WAVELENGTH"}
     return FrameMapping(**{key: value for key, value in columns.items() if value is not None})
@@ -224,8 +218,7 @@ def times_of(
         remarks.append(f"the times of {label} have no date, although their unit, name or header says so: {span}")
         epoch = None
     seconds, epoch = (seconds + first_d * DAY_S, None) if epoch is None else (seconds, epoch + first_d)
-    system = replace(header, epoch_mjd=epoch, scale=scale, position=position, at=at)
-    return seconds, exposure, system, tuple(remarks)
+    return seconds, exposure, replace(header, epoch_mjd=epoch, scale=scale, position=position, at=at), tuple(remarks)
 
 
 def _stated_system(time: tuple[Values, ...], file: TableFile) -> units.TimeSystem:

@@ -144,10 +144,7 @@ class ProcessTerm:
         quality, ratio = shape
         sizes = ratio ** np.arange(float(HARMONICS))
         sizes *= size / np.linalg.norm(sizes)
-        oscillators = (
-            terms.SHOTerm(sigma=sd, rho=scale / harmonic, Q=harmonic * quality) for harmonic, sd in enumerate(sizes, 1)
-        )
-        return terms.TermSum(*oscillators)
+        return terms.TermSum(*(terms.SHOTerm(sigma=sd, rho=scale / n, Q=n * quality) for n, sd in enumerate(sizes, 1)))
 
 
 @dataclass(frozen=True)
@@ -171,6 +168,7 @@ class Process:
         try:
             from celerite2 import terms
         except ImportError as error:
+            # It has no wheels for some machines.
             fault = "celerite2, which models the light of stars, is not installed; use pip install celerite2"
             raise InputError(fault, key="celerite2") from error
         return terms.TermSum(*(term.kernel() for term in self.terms)) if self.terms else terms.RealTerm(a=0.0, c=1.0)
@@ -194,12 +192,11 @@ class Process:
     def describe(self, unit: float) -> str:
         """Return a description of the terms; `unit` is the light of the star, to which standard deviations relate."""
         words = {"correlated": "correlated noise", "smooth": "smooth variability"}
-        descriptions = [
+        return ", ".join(
             f"{words.get(term.kind, term.kind)} ({'period' if term.rotates else 'time scale'} {_time(term.scale_s)}, "
             f"{100 * term.sd / unit:.2g} % in the process)"
             for term in self.terms
-        ]
-        return ", ".join(descriptions) or "constant light"
+        )
 
     def at(self, lags_s: Float) -> Float:
         """Return the covariance at time lags, shape of `lags_s`."""
@@ -232,10 +229,8 @@ class Covariance:
         from celerite2 import driver
 
         self._driver = driver
-        self._time = np.ascontiguousarray(time_s, np.float64)
-        self._rates, diagonal, self._u, v = kernel.get_celerite_matrices(
-            self._time, np.ascontiguousarray(variance, np.float64)
-        )
+        self._time, noise = (np.ascontiguousarray(values, np.float64) for values in (time_s, variance))
+        self._rates, diagonal, self._u, v = kernel.get_celerite_matrices(self._time, noise)
         # In place, as celerite2 does it.
         self._d, self._w = driver.factor(self._time, self._rates, diagonal, self._u, v, diagonal, v)
         if not (self._d > 0).all():
@@ -272,16 +267,14 @@ class Covariance:
             # Innovations of each unit state.
             units = -self._u[later] * np.exp((time[last] - time[later, None]) * rates)
             units = solve(time[later], rates, self._u[later], self._w[later], units, units)
-            decay = np.exp((time[rows, None] - time[last]) * rates)
-            state = (decay * self._w[rows]).T @ innovations
+            state = (np.exp((time[rows, None] - time[last]) * rates) * self._w[rows]).T @ innovations
             total = np.einsum("jo,jo->o", state, (units / self._d[later, None]).T @ units @ state)
         return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations) + total)
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""
         out = np.array(white.reshape(len(white), -1), np.float64, order="C") * np.sqrt(self._d)[:, None]
-        product = np.array(out)
-        values = self._driver.matmul_lower(self._time, self._rates, self._u, self._w, out, product)
+        values = self._driver.matmul_lower(self._time, self._rates, self._u, self._w, out, np.array(out))
         return np.asarray(values).reshape(np.shape(white))
 
 
@@ -315,8 +308,9 @@ class BinnedLightCurve:
     @cached_property
     def noise(self) -> float:
         """Robust standard deviation of a value, from differences of neighbours."""
-        steps = np.diff(self.values)[np.diff(self.time_s) < 1.5 * self.step_s]
-        steps = steps if steps.size else np.diff(self.values)
+        steps = np.diff(self.values)
+        near = np.diff(self.time_s) < 1.5 * self.step_s
+        steps = steps[near] if near.any() else steps
         spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
         return spread if spread > 0 else float(np.std(self.values))
 
@@ -325,23 +319,18 @@ class BinnedLightCurve:
         """Logarithm of this noise over the typical stated one."""
         return float(np.log(max(self.noise / float(np.sqrt(np.median(self.variance))), 1e-6)))
 
-    @classmethod
-    def of(
-        cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED
-    ) -> BinnedLightCurve:
+    def binned(self, largest: int = MAX_FITTED) -> BinnedLightCurve:
         """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
-        factor = -(-time_s.size // largest)
+        factor = -(-self.time_s.size // largest)
         if factor == 1:
-            return cls(time_s, values, variance, step_s)
-        number = np.floor((time_s - time_s[0]) / (factor * step_s) + 0.5 / factor).astype(np.int64)
+            return self
+        step_s = factor * self.step_s
+        number = np.floor((self.time_s - self.time_s[0]) / step_s + 0.5 / factor).astype(np.int64)
         _, first, count = np.unique(number, return_index=True, return_counts=True)
         full = count >= factor / 2
-
-        def total(column: Float) -> Float:
-            return np.asarray(np.add.reduceat(column, first)[full])
-
-        count = count[full]
-        return cls(total(time_s) / count, total(values) / count, total(variance) / count**2, factor * step_s)
+        totals = np.add.reduceat([self.time_s, self.values, self.variance], first, axis=1)[:, full]
+        time_s, values, variance = totals / np.array([count[full], count[full], count[full] ** 2])
+        return BinnedLightCurve(time_s, values, variance, step_s)
 
 
 def criterion_of_process(process: Process, data: BinnedLightCurve, size: float) -> float:
@@ -383,9 +372,9 @@ def _sharpen(data: BinnedLightCurve, process: Process) -> tuple[Process, float] 
     size, period, quality, *_ = process.terms[-1].parameters
     sharp = ProcessTerm("sharp rotation", (size, period, quality, float(np.log(EACH_HARMONIC))))
     terms, log_excess = (*process.terms[:-1], sharp), float(np.log(process.excess))
-    coarse = BinnedLightCurve.of(data.time_s, data.values, data.variance, data.step_s, MAX_TRIED)
+    coarse = data.binned(MAX_TRIED)
     fitted, bic = _fit_terms(coarse, terms, log_excess)
-    if coarse.step_s != data.step_s:
+    if coarse is not data:
         if bic + STRONG >= _fit_terms(coarse, process.terms, log_excess)[1]:
             return None
         fitted, bic = _fit_terms(data, fitted.terms, log_excess)
@@ -422,10 +411,7 @@ def _rotation(size: float, period: float) -> ProcessTerm:
 
 
 def _find_period(data: BinnedLightCurve, values: Float, share: float) -> float | None:
-    """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
-
-    The values may be residuals of the data; `share` is the longest period over the length of the data.
-    """
+    """Return the most significant period of values, s, up to a `share` of the length of the data; None for noise."""
     from astropy.timeseries import LombScargle
 
     # Visits over years have few frames and many frequencies.
@@ -434,9 +420,8 @@ def _find_period(data: BinnedLightCurve, values: Float, share: float) -> float |
     if values.size < 30 or longest <= shortest:
         return None
     periodogram = LombScargle(data.time_s, values - values.mean())
-    frequency, power = periodogram.autopower(
-        minimum_frequency=1 / longest, maximum_frequency=1 / shortest, samples_per_peak=PER_PEAK, method="fast"
-    )
+    ends = {"minimum_frequency": 1 / longest, "maximum_frequency": 1 / shortest}
+    frequency, power = periodogram.autopower(**ends, samples_per_peak=PER_PEAK, method="fast")
     if not power.size or not np.isfinite(power).all():
         return None
     best = int(np.argmax(power))
@@ -480,10 +465,8 @@ def _fit_terms(data: BinnedLightCurve, terms: tuple[ProcessTerm, ...], log_exces
     options: Any = {"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(x)), 1.0)}
     # The estimate of the curvature may mislead a fit, which another one from its end on shows.
     for _ in range(STARTS):
-        result = scipy.optimize.minimize(
-            cost_and_slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options
-        )
-        x, before, value = result.x, value, float(result.fun)
+        best = scipy.optimize.minimize(cost_and_slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        x, before, value = best.x, value, float(best.fun)
         if before - value < SAME:
             break
     return process_of(x), 2 * value + start.size * float(np.log(data.values.size))

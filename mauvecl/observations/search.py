@@ -17,26 +17,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
+from mauvecl.flares.shapes import Shape
 from mauvecl.flares.stare import Stare, select_frames
 from mauvecl.host.arrays import Bool, Float, array_cache, map_in_threads
+from mauvecl.observations.frames import Frames
 from mauvecl.observations.level import ConditionalLevel
-from mauvecl.observations.process import UNREPORTED, Process, Steps, level_fit
+from mauvecl.observations.process import UNREPORTED, Covariance, Process, Steps, level_fit
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search.search import largest_values
 from mauvecl.search.templates import LEAST_SHARE, Bank, Baseline, Template, Templates
-
-if TYPE_CHECKING:
-    from mauvecl.flares.shapes import Shape
-    from mauvecl.observations.frames import Frames
-    from mauvecl.observations.process import Covariance
-
 
 #: Flux of a template, relative to its peak, below which it is neglected.
 NEGLECTED = 1e-4
@@ -100,9 +96,8 @@ class ProcessSearch:
     @cached_property
     def covariances(self) -> tuple[Covariance, ...]:
         """Covariance of each sum."""
-        return tuple(
-            process.covariance(self.stare.start_s, self.variance * process.excess**2) for process in self.processes
-        )
+        start_s, variance = self.stare.start_s, self.variance
+        return tuple(process.covariance(start_s, variance * process.excess**2) for process in self.processes)
 
     @cached_property
     def _levels(self) -> tuple[Float, ...]:
@@ -143,8 +138,7 @@ class ProcessSearch:
             rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
             if above is not None:
                 # A template of which a smaller share lies in frames is not searched.
-                least = np.sqrt(LEAST_SHARE * row.without_gaps)
-                self._solve(row, (rho[0] > above * least).any(axis=0))
+                self._solve(row, (rho[0] > above * np.sqrt(LEAST_SHARE * row.without_gaps)).any(axis=0))
             per_amplitude = row.per_amplitude
             searched = per_amplitude > 0
             np.divide(rho, per_amplitude, out=rho, where=searched)
@@ -176,9 +170,8 @@ class ProcessSearch:
         on_grid = np.zeros(self.n_grid)
         for k, (process, level) in enumerate(zip(self.processes, self._levels, strict=True)):
             if process.terms:
-                norms[k], unsolved[k], units[k] = self._approximate_norms(k, shape, first, peaks)
+                norms[k], unsolved[k], units[k] = self._approximate_norms(process, shape, first, peaks)
             else:
-                # Independent noise.
                 variance = self.variance * process.excess**2
                 on_grid[self.at] = 1.0 / variance
                 norms[k] = _correlate(on_grid, shape**2, first)[peaks]
@@ -189,10 +182,9 @@ class ProcessSearch:
         return Filter(template, phase, shape, first, peaks, norms, unsolved, lost, weights, weights @ units)
 
     def _approximate_norms(
-        self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]
+        self, process: Process, shape: Float, first: int, peaks: NDArray[np.int64]
     ) -> tuple[Float, Bool, float]:
         """Return s^T C^-1 s of a sum at peaks, whether it must be solved there, and its value without gaps."""
-        process = self.processes[k]
         variance = self.variance * process.excess**2
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
         typical, size = float(np.median(variance)), shape.size + 2 * margin
@@ -217,10 +209,7 @@ class ProcessSearch:
         return norm, share > IRREGULAR * diagonal * np.maximum(norm, IRREGULAR * unit), unit
 
     def _solve(self, row: Filter, chosen: Bool) -> None:
-        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved.
-
-        Innovations of a template are neglected `MOST_MARGIN` frames after it.
-        """
+        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved."""
         padded, size = np.pad(row.shape, 1), row.shape.size
         for covariance, norms, unsolved in zip(self.covariances, row.norms, row.unsolved, strict=True):
             onsets = np.flatnonzero(unsolved & chosen)
@@ -240,10 +229,7 @@ class ProcessSearch:
 
 @array_cache(maxsize=64)
 def _regular_solution(process: Process, variance: float, frame_s: float, shape: Float) -> Float:
-    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, shape (n, 2).
-
-    Searches of a light curve after each event ask for the same solutions.
-    """
+    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, (n, 2)."""
     single = np.zeros(shape.size)
     single[shape.size // 2] = 1.0
     covariance = process.covariance(np.arange(float(shape.size)) * frame_s, np.full(shape.size, variance))
@@ -328,15 +314,12 @@ class SeriesSurvey:
 
         The flux is searched, or sums of spectra, which are given by `weighted` with their templates.
         """
-        stare = stare_of(frames, used)
-        scale = float(np.sqrt(np.median(variance[used])))
-        typical = abs(level)
+        stare, scale, typical = stare_of(frames, used), float(np.sqrt(np.median(variance[used]))), abs(level)
         net, relative_variance = flux[used] / scale, variance[used] / scale**2
         if weighted is None:
-            size, noise, directions, sums = typical / scale, photon * typical / scale**2, np.ones((1, 1)), net[:, None]
-            templates = Templates(
-                (NO_COLOUR_K,), directions, np.full((1, 1), size), np.array([size]), np.full((1, 1, 1), noise)
-            )
+            directions, sums, size = np.ones((1, 1)), net[:, None], np.full((1, 1), typical / scale)
+            noise = np.full((1, 1, 1), photon * typical / scale**2)
+            templates = Templates((NO_COLOUR_K,), directions, size, size[0], noise)
         else:
             templates, sums = weighted[0], weighted[1][used]
             directions = templates.directions[list(templates.chosen)]
@@ -353,10 +336,11 @@ class SeriesSurvey:
 
     def levels(self, quiet: Bool) -> Float:
         """Return the mean of the process of each sum given quiescent frames, shape (n_frame, n_sum)."""
-        return np.column_stack([
-            ConditionalLevel(process, self.stare.start_s, self.variance, quiet).of(column)
-            for process, column in zip(self.processes, self.sums.T, strict=True)
-        ])  # fmt: skip
+        pairs = zip(self.processes, self.sums.T, strict=True)
+        return np.column_stack([self._level_of(process, column, quiet) for process, column in pairs])
+
+    def _level_of(self, process: Process, column: Float, quiet: Bool) -> Float:
+        return ConditionalLevel(process, self.stare.start_s, self.variance, quiet).of(column)
 
     def along(self, direction: int, quiet: Bool) -> Float:
         """Return the sum along a direction of the bank less its level, in standard deviations, shape (n_frame,)."""
@@ -371,11 +355,15 @@ class SeriesSurvey:
         """
         if quiet.sum() < MIN_BASELINE:
             return np.full(quiet.size, self.level / self.scale)
-        return ConditionalLevel(self.flux_process, self.stare.start_s, self.variance, quiet).of(self.flux)
+        return self._level_of(self.flux_process, self.flux, quiet)
 
     def inverted(self) -> SeriesSurvey:
         """Return the survey upside down: losses of light become flares."""
         return replace(self, sums=-self.sums, flux=-self.flux)
+
+    def fitted(self, other: SeriesSurvey) -> SeriesSurvey:
+        """Return the survey with the processes of another one."""
+        return replace(self, processes=other.processes, flux_process=other.flux_process)
 
     def frames(self, chosen: Bool) -> SeriesSurvey:
         """Return the survey of some of the frames."""
@@ -385,12 +373,9 @@ class SeriesSurvey:
 
 def stare_of(frames: Frames, used: Bool) -> Stare:
     """Return the searched frames as a stare on the regular grid of the cadence."""
-    numbers = frames.numbers[used]
+    numbers, frame_s = frames.numbers[used], frames.cadence_s
     unit = np.ones(numbers.size)
-    return Stare(
-        np.asarray((numbers - numbers[0]) * frames.cadence_s, np.float64), frames.cadence_s, unit, unit, unit,
-        np.zeros(numbers.size),
-    )  # fmt: skip
+    return Stare(np.asarray((numbers - numbers[0]) * frame_s), frame_s, unit, unit, unit, np.zeros(numbers.size))
 
 
 def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
@@ -447,10 +432,10 @@ class SimulatedRate:
         rate = float(np.log(-np.log1p(-float(scipy.stats.beta.ppf(UPPER, above + 1, n - above))) / self.days))
         if threshold <= anchor:
             return rate
+        # Beyond the simulated values, it falls as the tail of normal noise.
         fall = float(np.subtract(*scipy.special.log_ndtr([-anchor, -threshold])))
         if self.heavy and above:
-            # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), or a normal
-            # tail if it falls more slowly.
+            # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), if slower.
             fall = min(fall, (threshold - anchor) / float((self.largest[-above:] - anchor).mean()))
         return rate - fall
 
@@ -474,8 +459,7 @@ def simulated_rates(
     quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough are drawn for
     `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
     """
-    residual = innovations(survey, quiet)
-    beginning = survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
+    residual, beginning = innovations(survey, quiet), survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
     n, n_sum = beginning.sums.shape
     days = beginning.stare.observed_s / DAY_S
     most = max(MIN_SIMULATED, MAX_VALUES // (n * n_sum))
@@ -523,9 +507,8 @@ def block_length(residual: Float) -> int:
     n = residual.size
     centred = residual - residual.mean()
     power = float(centred @ centred)
-    limit = 2.0 / np.sqrt(n)
     for lag in range(1, n // 4):
-        if float(centred[:-lag] @ centred[lag:]) / power < limit:
+        if float(centred[:-lag] @ centred[lag:]) / power < 2.0 / np.sqrt(n):
             # A block of the optimal order for a correlation of this length.
             return max(lag, round(n ** (1 / 3))) if lag > 1 else 1
     return max(1, n // 4)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -16,19 +15,12 @@ from numpy.typing import NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.spectrum import Measurement, fit
+from mauvecl.flares.shapes import Shape
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.noise.unknowns import NUISANCES
+from mauvecl.observations import frame_model as models
 from mauvecl.observations.detector import variance_of_steps
 from mauvecl.observations.events import Kind
-from mauvecl.observations.frame_model import (
-    CLEARLY,
-    CleanedSpectra,
-    FrameModel,
-    LightChange,
-    chi2_of_one,
-    clean_spectra,
-    light_changes,
-)
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import QuiescentLevel, check_usable, guess_flares, single_frames
 from mauvecl.observations.light_curve import fit_quiet_light, quiescent_light
@@ -36,10 +28,6 @@ from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.errors import InputError
 from mauvecl.search.templates import TEMPERATURES_K, Templates
-
-if TYPE_CHECKING:
-    from mauvecl.flares.shapes import Shape
-
 
 #: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0
@@ -85,9 +73,9 @@ class SpectralSeries:
     excess: Float  # shape (n_frame, n_pixel); spectra less that of the quiescent star
     light: Float  # shape (n_pixel,); spectrum of the quiescent star
     noise: PixelNoise
-    cleaned: CleanedSpectra
+    cleaned: models.CleanedSpectra
     jitters: Mapping[str, float]  # standard deviations of unknowns of frames; infinite if they are projected out
-    changes: list[LightChange]  # sudden changes of the light that all pixels share
+    changes: list[models.LightChange]  # sudden changes of the light that all pixels share
     snr_kept: float  # S/N of flares over that with a steady level of the frames
     dark_drift: float  # range of the slow changes of the dark current over the light in the sum; 0 if they are small
 
@@ -124,20 +112,15 @@ def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared:
 
 
 def survey_spectra(
-    frames: Frames,
-    model: FrameModel,
-    shape: Shape,
-    rank: int,
-    seed: int,
-    jitters: Mapping[str, float] | None = None,
-    steps: Steps = UNREPORTED,
-) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
+    frames: Frames, model: models.FrameModel, shape: Shape, rank: int, seed: int,
+    jitters: Mapping[str, float] | None = None, steps: Steps = UNREPORTED,
+) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:  # fmt: skip
     """Prepare the search of spectra that is weighted for flares; `rank` and `jitters` are those of `analyse_frames`.
 
     Slow changes of what the weights let through are processes of the weighted sums. The level that is returned is that
     of the sum over wavelength, with flags of single frames that only the weighted sums show.
     """
-    fits, cleaned = steps.part(0.0, 0.9), clean_spectra(frames, model)
+    fits, cleaned = steps.part(0.0, 0.9), models.clean_spectra(frames, model)
     frames = cleaned.frames
     flux, error = frames.white_light
     assert error is not None
@@ -147,7 +130,7 @@ def survey_spectra(
     events = np.zeros(flux.size, np.bool_)
     events[used] = guess_flares(frames.numbers[used], flux[used])
     for _ in range(ROUNDS):
-        series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
+        series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters or {})
         lit, level = np.maximum(series.light, 0.0), float(np.median(flux[used & ~events]))
         # Frames without light, such as dark frames, have no photon noise that could weight the gains.
         photon = float(np.average(cleaned.model.gain, weights=lit if lit.any() else None))
@@ -171,40 +154,32 @@ def survey_spectra(
 
 
 def _weighted_sums(
-    cleaned: CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float] | None
+    cleaned: models.CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float]
 ) -> tuple[SpectralSeries, Templates, Float]:
-    """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
-
-    Sums have unit covariance from frame to frame, and change independently over longer times.
-    """
+    """Return spectra less that of the star, weights for flares, and weighted sums, independent and of unit variance."""
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[quiet].mean(axis=0)
-    unknown = model.unknowns(light)
-    excess = frames.flux - light
-    neighbours = np.diff(frames.numbers) == 1
-    pairs = np.flatnonzero(quiet[:-1] & quiet[1:] & neighbours)
+    unknown, excess = model.unknowns(light), frames.flux - light
+    pairs = np.flatnonzero(quiet[:-1] & quiet[1:] & (np.diff(frames.numbers) == 1))
     if not pairs.size:
-        raise InputError(
-            f"{frames.name} needs neighbouring frames without a flare, from which the noise follows", key="frames"
-        )
+        fault = "needs neighbouring frames without a flare, from which the noise follows"
+        raise InputError(f"{frames.name} {fault}", key="frames")
     assert frames.wavelength_nm is not None
     shared = np.array([unknown["light"], unknown["dark"]])
     noise = measure_noise(excess, pairs, cleaned.stated, shared, frames.wavelength_nm)
     flares = model.flares(TEMPERATURES_K)
     compared = np.flatnonzero(reasons == 0)
     alternatives = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
-    changes = light_changes(excess, compared, frames.numbers, light, alternatives, noise.used)
+    changes = models.light_changes(excess, compared, frames.numbers, light, alternatives, noise.used)
     dark, drift = _dark_changes(excess, pairs, quiet, noise.used, shared)
-    deviations = {"light": np.inf} | dark | dict(jitters or {})
+    deviations = {"light": np.inf} | dark | dict(jitters)
     names = tuple(name for name in deviations if name in unknown)
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
                           np.array([deviations[name] for name in names]))  # fmt: skip
     # Flares that double the light of the star, in the sum over wavelength.
     flares *= abs(float(light.sum())) / flares.sum(axis=1, keepdims=True)
-    templates, steady = (
-        Templates.of(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=included, rank=rank)
-        for included in (nuisances, nuisances.without(["light"]))
-    )
+    spectra, included = (noise.used**2, flares, model.gain, TEMPERATURES_K), (nuisances, nuisances.without(["light"]))
+    templates, steady = (Templates.of(*spectra, nuisances=unknowns, rank=rank) for unknowns in included)
     snr_kept = float(np.median(templates.best / steady.best))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
     mixing = _independent(sums, pairs, quiet)
@@ -215,9 +190,8 @@ def _weighted_sums(
 
 def _independent(sums: Float, pairs: NDArray[np.intp], quiet: Bool) -> Float:
     """Return the matrix of sums of unit covariance, as measured, along the axes on which they change slowly."""
-    n = sums.shape[1]
+    n, steps = sums.shape[1], sums[pairs + 1] - sums[pairs]
     mixing = np.eye(n)
-    steps = sums[pairs + 1] - sums[pairs]
     covariance = steps.T @ steps / (2 * pairs.size)
     if (np.abs(covariance - mixing) > DEPARTS * 2 * relative_error(pairs.size)).any():
         mixing = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -274,11 +248,9 @@ def event_colour(spectra: Float, error: Float, event: Bool, quiet: Bool) -> tupl
     excess = spectra[event].mean(axis=0) - star
     count, base = np.count_nonzero(event), np.count_nonzero(quiet)
     variance = (error[event] ** 2).sum(axis=0) / count**2 + (error[quiet] ** 2).sum(axis=0) / base**2
-    scale = _multiple(excess, star, variance)
-    chi2 = ((excess - scale[0] * star) ** 2 / variance).sum()
-    half = fine.sum() // 2
-    halves = (slice(None, half), slice(half, None))
-    blue, red = (_multiple(excess[pixels], star[pixels], variance[pixels]) for pixels in halves)
+    scale, half = _multiple(excess, star, variance)[0], fine.sum() // 2
+    chi2 = ((excess - scale * star) ** 2 / variance).sum()
+    blue, red = (_multiple(excess[k], star[k], variance[k]) for k in (slice(None, half), slice(half, None)))
     ratio = blue[0] / red[0]
     relative = np.hypot(blue[1] / blue[0], red[1] / red[0])
     return float(ratio), float(abs(ratio) * relative), float(scipy.stats.chi2.sf(chi2, fine.sum() - 1))
@@ -319,7 +291,7 @@ class EventSpectrum:
     def ambiguous(self) -> bool:
         """True if a flare explains the spectrum best, but hardly better than a change of the instrument does."""
         rival = min(value for cause, value in self.chi2.items() if cause != "flare")
-        return self.cause == "flare" and rival < self.chi2["flare"] + CLEARLY
+        return self.cause == "flare" and rival < self.chi2["flare"] + models.CLEARLY
 
     @property
     def reason(self) -> str:
@@ -356,7 +328,7 @@ def event_spectrum(
     flares, unknown = model.flares(TEMPERATURES_K), model.unknowns(series.light)
     causes: dict[Kind, Float] = {"flare": flares}
     causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
-    fits = {cause: chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
+    fits = {cause: models.chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
     chi2 = {cause: float(values.min()) for cause, values in fits.items()}
     # Light is added, never taken away.
     rises = flares @ (spectrum / variance) > 0
@@ -364,19 +336,16 @@ def event_spectrum(
     together = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.full(len(unknown), np.inf))
     rows = together.rows(variance, together.spectra)
     optimal = flares / variance - (flares @ rows.T) @ rows
-    values = (optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))
-    snr = float(values.max())
+    snr = float(((optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))).max())
     left = float((spectrum**2 / variance).sum() - ((rows @ spectrum) ** 2).sum() - max(snr, 0.0) ** 2)
     p_together = float(scipy.stats.chi2.sf(left, spectrum.size - 1 - len(unknown)))
     cause: Kind = min(chi2, key=lambda name: chi2[name])
-    dof = spectrum.size - 1
-    least = chi2[cause]
-    row = causes[cause][fits[cause].argmin()]
+    dof, least, row = spectrum.size - 1, chi2[cause], causes[cause][fits[cause].argmin()]
     residual = spectrum - (row @ (spectrum / variance)) / (row @ (row / variance)) * row
     p_value = float(scipy.stats.chi2.sf(least, dof))
     if p_value < NO_FIT and (residual**2 / variance).max() > RAY_SHARE * least:
         cause = "cosmic ray"
-    elif cause != "flare" and (chi2["flare"] - least < CLEARLY or snr >= FLARE_SNR):
+    elif cause != "flare" and (chi2["flare"] - least < models.CLEARLY or snr >= FLARE_SNR):
         cause = "flare"
     return EventSpectrum(cause, snr, chi2, dof, p_value, p_together)
 
@@ -399,8 +368,7 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, n_fram
     of noise, and what noise may hide. With fewer than `MIN_PARTS` means, shorter ones are taken, and changes are
     assumed to grow in proportion to time. The sky has its documented prior.
     """
-    unknown = series.cleaned.model.unknowns(series.light)
-    names = ("light", "dark")
+    unknown, names = series.cleaned.model.unknowns(series.light), ("light", "dark")
     spectra = np.array([unknown[name] for name in names])
     amplitudes, covariance = fit_changes(series.excess, spectra, series.noise.used)
     drift = dict.fromkeys(names, np.inf)
@@ -413,9 +381,8 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, n_fram
         means, counts = [amplitudes[(segment == k) & ~in_events].mean(axis=0) for k in enough], counts[enough]
         size = size if len(means) >= MIN_PARTS else size // 2
     if len(means) >= MIN_PARTS:
-        bends = np.diff(np.array(means), 2, axis=0) / 2
+        bends, share = np.diff(np.array(means), 2, axis=0) / 2, 1.0 / counts
         for k, name in enumerate(names):
-            share = 1.0 / counts
             # A mean less that of its neighbours has 3/2 of the variance of a mean, where all are of as many frames.
             expected = float(covariance[k, k]) * float((share[:-2] / 4 + share[1:-1] + share[2:] / 4).mean())
             beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
@@ -436,12 +403,10 @@ def measure_flare(
     n, base = int(inside.sum()), int((~inside).sum())
     if base < MIN_BASELINE:
         return f"{base} frames around it show the quiescent star, {MIN_BASELINE} are needed"
-    excess = series.excess[at]
+    excess, model = series.excess[at], series.cleaned.model
     summed = excess[inside].sum(axis=0) - n * excess[~inside].mean(axis=0)
-    model = series.cleaned.model
     # The level is that of a finite number of frames.
-    variance = series.noise.used**2 * (1 + n / base)
-    exposure = model.exposure(series.light, variance, n)
+    exposure = model.exposure(series.light, series.noise.used**2 * (1 + n / base), n)
     unknown = {name: row * n / model.per_dn for name, row in model.unknowns(series.light).items()}
     sd = drifts(survey, series, in_events, n)
     spectra, errors = np.array(list(unknown.values())), np.array([sd[name] for name in unknown])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,6 @@ from mauvecl.observations.frames import MAX_FRAMES, live_pixels
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError, missing_package
 
-T = TypeVar("T")
 #: Largest number of files in a folder.
 MAX_FILES = 2**20
 
@@ -78,7 +77,6 @@ class FolderFile(TableFile):
                 raise InputError(f"{fault}, not {numbers.size}", key=name)
             return numbers
 
-        # A column of every file, with one row per file.
         return Values(name, (len(self.paths), n), lambda piece: np.stack([*map(row, self.paths[piece])]), column.unit,
                       self.label, keywords=column.keywords)  # fmt: skip
 
@@ -86,7 +84,7 @@ class FolderFile(TableFile):
         """Return the wavelengths of the first file's image; raise InputError if another file has others."""
         if dimension != 1:
             return super().axis(name, dimension)
-        axes = self._from_each(lambda file: file.axis(name, 1))
+        axes = (file.axis(name, 1) for file in self._files())
         first = next(axes)
         for path, axis in zip(self.paths[1:], axes, strict=True):
             if axis.shape != first.shape or not np.allclose(axis.numbers(), first.numbers(), rtol=1e-9, atol=0.0):
@@ -94,14 +92,14 @@ class FolderFile(TableFile):
                 raise InputError(fault, key="wavelength")
         return first
 
-    def _from_each(self, function: Callable[[TableFile], T]) -> Iterator[T]:
+    def _files(self) -> Iterator[TableFile]:
         for path in self.paths:
             with self.open_file(path) as file:
-                yield function(file)
+                yield file
 
     @cached_property
     def _headers(self) -> list[dict[str, Any]]:
-        return list(self._from_each(lambda file: file.header))
+        return [file.header for file in self._files()]
 
 
 #: Attributes that every scene has, and calibrations of its pixels.
@@ -276,9 +274,8 @@ def weighted_sums(
     if notes:
         statistics, finite, _ = _statistics(flux, error, quality)
     live, remarks = live_pixels(finite, n, flux.label)
-    columns = factors[:, live].T
+    columns, flags = factors[:, live].T, _flags_of_frames(quality)
     sums = np.concatenate([flux.rows(piece)[:, live] @ columns for piece in flux.pieces])
-    flags = _flags_of_frames(quality)
     errors: Any = [None] * len(factors)
     if error is not None:
         errors = np.concatenate([np.sqrt(error.rows(piece)[:, live] ** 2 @ columns**2) for piece in error.pieces]).T
@@ -301,12 +298,8 @@ def _without_flagged_pixels(flux: Values, quality: Values | None) -> Values:
 def _without_marks(flux: Values, ends: tuple[float, float]) -> tuple[Values, tuple[str, ...]]:
     """Return light that is NaN where a number such as -999 marks a missing value, and remarks; see `marks_in`."""
     marks, notes = marks_in(flux, ends, "value", "values")
-
-    def read(piece: slice) -> Float:
-        values = flux.rows(piece)
-        return np.where(np.isin(values, marks), np.nan, values)
-
-    return replace(flux, read=read) if marks else flux, tuple(f"{flux.label}: {text}" for text in notes)
+    unmarked = flux.mapped(lambda values: np.where(np.isin(values, marks), np.nan, values), flux.unit)
+    return unmarked if marks else flux, tuple(f"{flux.label}: {text}" for text in notes)
 
 
 def _flags_of_frames(quality: Values | None) -> Float | None:
@@ -355,9 +348,7 @@ def read_light(flux: Values, error: Values | None, quality: Values | None) -> Li
         light = _without_flagged_pixels(flux, quality).numbers()
         whole, notes = _without_marks(replace(flux, read=light.__getitem__), ends_of(light))
         return whole.numbers(), None if error is None else error.numbers(), _flags_of_frames(quality), notes
-    remark = (
-        f"{flux.label} has {n_bytes / 2**20:.0f} MiB of spectra, more than {limit >> 20} MiB: they were summed over "
-        "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit"
-    )
+    size = f"{n_bytes / 2**20:.0f} MiB of spectra, more than {limit >> 20} MiB"
+    done = "they were summed over wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit"
     ((light, sd, flags, more),) = weighted_sums(flux, error, quality)[0]
-    return light, sd, flags, (remark, *more)
+    return light, sd, flags, (f"{flux.label} has {size}: {done}", *more)

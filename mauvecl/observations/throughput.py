@@ -118,9 +118,7 @@ class _Linearised:
             return np.asarray(np.einsum("pi,pi->p", basis @ values[:n, :n], basis))
 
         variance, bias = spread(covariance), basis @ (pull @ self.solution)[:n]
-        of_noise, expected = (
-            float(np.mean(spread(matrix) / variance)) for matrix in (pull @ noise @ pull.T, pull @ noise)
-        )
+        of_noise, expected = (float(np.mean(spread(m) / variance)) for m in (pull @ noise @ pull.T, pull @ noise))
         if not expected > of_noise:
             return covariance
         scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
@@ -133,8 +131,7 @@ class _Linearised:
         each pixel, the relative standard deviation of these factors, which is zero if the spline follows the
         throughput, their logarithms, shape (n_pixel,), and the variances of these.
         """
-        n_star, n_pixel = model.observed_dn.shape
-        design = self.design
+        (n_star, n_pixel), design = model.observed_dn.shape, self.design
         residuals = self.values - design @ self.solution
         by_star = residuals.reshape(n_star, n_pixel)
         # The columns of the spline sum to one.
@@ -305,14 +302,13 @@ def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) 
     light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
-    assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
-               *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
+    known = {"wavelength zero point": m > 0, "line width": m == 4, "errors of the star's spectrum": several}
     # Widths are relative to the nominal one.
     scale, errors = np.array([1.0, 1.0, fwhm, fwhm]), np.append(np.sqrt(np.diag(joint))[nm.size :], [np.nan] * (4 - m))
     return ThroughputFit(
         nm, log_factor, joint, scale * (np.append(shape, np.zeros(4 - m)) + [0, 0, 1, 0]), scale * errors,
         residual=residual, chi2=chi2, dof=dof,
-        spectrum_error=apart or error, structure=structure, assumed=tuple(assumed),
+        spectrum_error=apart or error, structure=structure, assumed=tuple(name for name in known if not known[name]),
     )  # fmt: skip
 
 
@@ -330,11 +326,9 @@ def _iterated(model: ThroughputModel, error: float) -> _Linearised:
         shape = np.clip(linear.solution[n : n + m], -LIMITS[:m], LIMITS[:m])
         if not np.abs(model.basis @ coefficients).max() < LARGEST_LOG:
             break
-    raise InputError(
-        "no throughput makes the spectra of the stars those of the frames; give frames of the stated stars, with dark "
-        "frames if the dark current is not nominal",
-        key="observations",
-    )
+    fault = "no throughput makes the spectra of the stars those of the frames"
+    remedy = "give frames of the stated stars, with dark frames if the dark current is not nominal"
+    raise InputError(f"{fault}; {remedy}", key="observations")
 
 
 def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
@@ -346,8 +340,7 @@ def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
     half = np.diff(inner)[:, None] / 2
     nodes = inner[:-1, None] + half * (1 + np.array([-1.0, 1.0]) / np.sqrt(3.0))
     second = BSpline(full, np.eye(knots + 3), 3).derivative(2)(nodes.ravel())
-    weight = np.repeat(half, 2, axis=1).ravel()
-    return design, np.asarray((second * weight[:, None]).T @ second)
+    return design, np.asarray((second * np.repeat(half, 2, axis=1).ravel()[:, None]).T @ second)
 
 
 def _linear_basis(nm: Float) -> Float:

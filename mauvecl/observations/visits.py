@@ -8,29 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import Annotated, Self
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
 from mauvecl.detection.distributions import Interval, clopper_pearson
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import variance_of
 from mauvecl.host.arrays import Float
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.host.exposure.response import W_PER_NM_IN_FLAM, Order, electrons_per_second
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.orbit.visibility import Windows
 from mauvecl.host.stars.flare import BALMER_EDGE_NM, EmissionLine
+from mauvecl.host.stars.source import Source
 from mauvecl.host.stars.spectrum import photons
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.schema.fields import DEFAULT_SEED, Positive, Probability, Range, Seed, Unit, Wavelength
-
-if TYPE_CHECKING:
-    from mauvecl.detection.nuisances import Nuisances
-    from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.host.orbit.visibility import Windows
-    from mauvecl.host.stars.source import Source
-
 
 #: Frequencies per resolution of the time base.
 OVERSAMPLING = 5
@@ -109,24 +106,21 @@ def recover_periods(
     frequency = _frequencies(base, 1 / (longest_d or max(periods_d)), 1 / (shortest_d or min(periods_d)))
     generator = np.random.default_rng(seed)
 
-    def peak(values: Float) -> tuple[float, float]:
+    def peak(light: Float | float) -> tuple[float, float]:
+        """Return the highest power in a light curve with noise, and its frequency."""
+        values = light + generator.standard_normal(time.size)
         power = LombScargle(time, values).power(frequency, method="fast", assume_regular_frequency=True)
         best = int(np.argmax(power))
         return float(power[best]), float(frequency[best])
 
-    noise = np.sort([peak(generator.standard_normal(time.size))[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])
-    threshold = float(noise[-IN_TAIL])
-    recovered = []
-    for amplitude in amplitudes:
-        row = []
-        for period in periods_d:
-            recoveries = 0
-            for phase in generator.uniform(0, 2 * np.pi, trials):
-                values = amplitude * np.sin(2 * np.pi * time / period + phase) + generator.standard_normal(time.size)
-                power, at = peak(values)
-                recoveries += power > threshold and abs(at - 1 / period) < 0.5 / base
-            row.append(clopper_pearson(recoveries, trials))
-        recovered.append(row)
+    def recovery(amplitude: float, period: float) -> Interval:
+        phases = generator.uniform(0, 2 * np.pi, trials)
+        peaks = [peak(amplitude * np.sin(2 * np.pi * time / period + phase)) for phase in phases]
+        found = sum(power > threshold and abs(at - 1 / period) < 0.5 / base for power, at in peaks)
+        return clopper_pearson(found, trials)
+
+    threshold = float(np.sort([peak(0.0)[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])[-IN_TAIL])
+    recovered = [[recovery(amplitude, period) for period in periods_d] for amplitude in amplitudes]
     return PeriodRecovery(time, threshold, np.asarray(periods_d), np.asarray(amplitudes), recovered)
 
 
@@ -177,10 +171,10 @@ def smallest_change(
     >>> round(smallest_change(1.0, 2, 0.05, 0.9).one, 3)
     4.584
     """
-    dof = visits - 1
-    cut = float(scipy.stats.chi2.isf(fap, dof))
     if power <= fap:
         return SmallestChanges(0.0, 0.0)
+    dof = visits - 1
+    cut = float(scipy.stats.chi2.isf(fap, dof))
     # Non-centrality with which the test exceeds its threshold with this probability.
     centre = scipy.special.chndtrinc(cut, dof, 1.0 - power)
     ratio = cut / float(scipy.stats.chi2.isf(power, dof))
@@ -220,9 +214,8 @@ def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None
         return float("nan")
     variance = float(np.sum(weights**2 * quiet.variance_dn2))
     if unknown:
-        moved = unknown.spectra @ weights
-        free = np.isinf(unknown.sd)
-        if np.any(np.abs(moved[free]) > 0):
+        moved, free = unknown.spectra @ weights, np.isinf(unknown.sd)
+        if moved[free].any():
             return float("inf")
         variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))
     return float(np.sqrt(variance))
@@ -247,11 +240,7 @@ class LineIndex:
 
 
 def _integral_of_line(x: Float, weight: Float, share: Float) -> Float:
-    """Return the factors of pixels in the integral of the straight line fitted to them, shape (..., n_pixel).
-
-    It is a linear function of the pixels, by the weights of the least squares; `share` is the width of each pixel that
-    is integrated.
-    """
+    """Return the factors of pixels in the integral over `share` of each of the line fitted to them, (..., n_pixel)."""
     design = np.stack([np.ones_like(x), x])
     normal = np.einsum("ap,...p,bp->...ab", design, weight, design)
     coefficients = np.linalg.solve(normal, (design @ share)[:, None])[..., 0]
@@ -421,9 +410,8 @@ class Change:
             try:
                 line = EmissionLine.named(name)
             except InputError:
-                expected = (
-                    f"a line such as {', '.join(INDICES)}, a band such as 200-320, balmer jump, colour or spectrum"
-                )
+                lines = ", ".join(INDICES)
+                expected = f"a line such as {lines}, a band such as 200-320, balmer jump, colour or spectrum"
                 raise InputError.of("change.of", shortened(name), expected) from None
             nm = np.unique(np.concatenate([nm, line.nodes_nm]))
             flux, unit, meaning = line.profile(nm), "erg / (s cm2)", f"flux of {line.name}"
