@@ -137,12 +137,18 @@ def test_plan_takes_completeness_as_argument() -> None:
         edge = np.array([1e30, 1e33 * (1 - 1e-12), 1e33, 1e40])
         return completeness.Completeness(edge, np.array([0.0, 0.0, 1.0, 1.0]), "bolometric", "a step")
 
-    one = STUDY.with_settings(["plan.targets=[{name = 'eps Eri', alpha = 2.0, rate_per_day = 0.5, at_erg = 1e33}]"])
-    answer = plan(one, completeness=none_below)
-    assert answer.table["expected"][0] == pytest.approx(0.5 * 5, rel=0.02)
-    mean = answer.table["expected"][0]
+    asked = [{"name": "eps Eri", "alpha": 2.0, "rate_per_day": 0.5, "at_erg": 1e33}]
+    asked.append(asked[0] | {"name": "GJ 205", "rate_per_day": 1e-3})
+    answer = plan(STUDY.with_changes({"plan": {"targets": asked}}, None), completeness=none_below)
+    mean = answer.table["expected"].tolist()
+    assert mean[0] == pytest.approx(0.5 * 5, rel=0.02)
     # The user's own rates have no scatter beyond Poisson noise.
-    assert [answer.table["low"][0], answer.table["high"][0]] == stats.poisson.ppf([0.025, 0.975], mean).tolist()
+    assert [answer.table["low"][0], answer.table["high"][0]] == stats.poisson.ppf([0.025, 0.975], mean[0]).tolist()
+    bars, dots = answer.pictures["plan"]().axes[0].lines
+    assert dots.get_xdata().tolist() == mean
+    edge = bars.axes.get_xlim()[0]
+    assert edge < mean[1]
+    np.testing.assert_array_equal(bars.get_xdata()[:5], [edge, answer.table["high"][0], np.nan, np.nan, np.nan])
 
 
 def test_conditions_equal_those_of_stares_along_the_orbit() -> None:
