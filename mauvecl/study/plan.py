@@ -242,10 +242,15 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     return targets
 
 
-def read_targets(path: str | Path) -> list[dict[str, Any]]:
-    """Read targets from a table of any format; see `targets_in`. Paths in it are relative to its folder."""
+def read_targets(path: str | Path | Table | Any) -> list[dict[str, Any]]:
+    """Read targets from a table of any format or in memory; see `targets_in`.
+
+    Paths in a file are relative to its folder, those in a table in memory to the working folder.
+    """
     from mauvecl.host.tables.opening import read_table
 
+    if fields.is_table(path):
+        return targets_in(read_table(path, "table of targets"), "table of targets", Path())
     named = f"table of targets {shortened(Path(path).name)}"
     return targets_in(read_table(Path(path), "table of targets"), named, Path(path).parent)
 
