@@ -328,10 +328,12 @@ class CalibrateAnswer(Answer):
                 by_pixel[name] = column
         if "read_noise_dn" in by_pixel:
             # The fit determines the mean variance of the pixels that are read.
-            rms_dn = np.sqrt(np.mean(by_pixel["read_noise_dn"][read] ** 2))
-            by_pixel["read_noise_dn"] = (
-                by_pixel["read_noise_dn"] * u.DN * self.changes.get("read_noise_dn", rms_dn) / rms_dn
-            )
+            noise_dn = by_pixel["read_noise_dn"]
+            rms_dn = np.sqrt(np.mean(noise_dn[read] ** 2))
+            fitted_dn = self.changes.get("read_noise_dn", rms_dn)
+            # A nominal map of zeros does not tell how pixels differ.
+            noise_dn = noise_dn * fitted_dn / rms_dn if rms_dn > 0 else np.full(moved.pixels, fitted_dn)
+            by_pixel["read_noise_dn"] = noise_dn * u.DN
         if np.ptp(bias) > 0:
             by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -81,10 +82,12 @@ class OrbitQuestion(Section):
         return Orbit.load(self.tle, self.kind)
 
     def times(self) -> TimeGrid:
-        """Return the time grid."""
+        """Return the time grid, with steps that are shortened where the last one would end after the days."""
         from mauvecl.host.orbit.orbit import TimeGrid
 
-        return TimeGrid(self.start, self.days, self.step_s)
+        times = TimeGrid(self.start, self.days, self.step_s)
+        step_s = self.days * fields.DAY_S / times.n
+        return times if math.isclose(step_s, self.step_s) else replace(times, step_s=step_s)
 
 
 #: Keys of a target that hold paths, relative to its table or the study file.

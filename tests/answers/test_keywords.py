@@ -70,6 +70,8 @@ def test_times_may_be_dates_of_python_numpy_and_astropy() -> None:
         assert Sky.at("10 40", time) == Sky.at("10 40", Time(noon))
         if not isinstance(time, str):
             assert Frames.of(np.arange(20), np.ones(20), reference_mjd=time).reference_mjd == 61_465.5
+    # Steps end with the days.
+    assert [Study.of(days=0.05, step=step).orbit.times().step_s for step in (60, 3600)] == [60.0, 2160.0]
     assert Study.of(start=noon.date()).orbit.start == str(np.datetime64(noon, "D"))
 
 
