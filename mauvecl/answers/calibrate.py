@@ -202,7 +202,7 @@ class CalibrateAnswer(Answer):
             lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
         for row in self.fits:
             if row["p_value"] < REJECTED:
-                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
+                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}, below {REJECTED:g}.")
         if self.dark.slopes_p_value < REJECTED:
             lines.append(
                 "The dark current of single pixels rises differently with temperature: the instrument file has the "
