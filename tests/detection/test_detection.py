@@ -9,9 +9,11 @@ import pytest
 from answers import STATISTICS, small, twice
 from scenes import instrument, star
 from scipy import stats
+from scipy.sparse import csr_array
 
 import mauvecl
 from mauvecl import Comparison, Detection, Engine, Linear, Normal, Nuisances, Processes, Uniform, departures, detect
+from mauvecl.detection.chi2 import Smoothing
 
 N = 1_000_000
 #: The paper's G2V star, with flares around the edge of detection for one statistic or another.
@@ -313,3 +315,18 @@ def test_many_flares_share_table_rows(engine: Engine) -> None:
     for rows in answer.roc.group_by(["statistic", "amplitude"]).groups:
         assert (rows["fap"].min(), rows["fap"].max()) == (0.0, 1.0)
     assert answer.plot() is not None
+
+
+def test_smoothing_in_chunks_equals_its_rows_across_a_gap_wider_than_it_reaches() -> None:
+    rng, centres, pixels = np.random.default_rng(1), np.arange(0, 400, 8), np.arange(400)
+    distance = centres[:, None] - pixels
+    rows = np.exp(-((distance / 8) ** 2)) * (abs(distance) < 24) * ((pixels < 100) | (pixels >= 300))
+    bands, finished = Smoothing(centres, np.eye(1), 8.0, csr_array(rows)).bands(416, 32)
+    values, unfinished, sums = rng.standard_normal(416), np.zeros(bands.shape[1]), list[float]()
+    for weights, part, n in zip(bands, values.reshape(-1, 32), finished, strict=True):
+        unfinished += weights @ part
+        sums += unfinished[:n].tolist()
+        unfinished = np.append(unfinished[n:], np.zeros(n))
+    np.testing.assert_allclose(sums, rows @ values[:400], rtol=1e-5, atol=1e-5)
+    # Those within reach of 32 pixels, in fours; centres in the gap do not wait for its end.
+    assert bands.shape[1] == 12
