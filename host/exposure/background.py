@@ -22,7 +22,7 @@ from mauvecl.host.tables.files import parse_numbers
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.fields import Share, SkyBrightness, SolidAngle
+from mauvecl.schema.fields import DateText, Share, SkyBrightness, SolidAngle, date_text
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -40,7 +40,7 @@ def parse_time(time: Time | str, name: str = "time") -> Time:
     """Return a finite time between 1990 and 2100, `name` in errors; text is ISO 8601, UTC. Call inside `offline`."""
     from astropy.time import Time
 
-    moment = time
+    moment = time if isinstance(time, Time) else date_text(time)
     if isinstance(moment, str):
         with contextlib.suppress(ValueError):
             moment = Time(moment.strip().removesuffix("Z"), scale="utc")
@@ -107,7 +107,7 @@ class Sky:
         return cls(brightness, f"fixed V = {brightness:.2f} mag/arcsec2")
 
     @classmethod
-    def at(cls, target: SkyCoord | str, time: Time | str, lookup: Lookup = "bilinear") -> Sky:
+    def at(cls, target: SkyCoord | str, time: Time | DateText, lookup: Lookup = "bilinear") -> Sky:
         """Return the zodiacal light towards a target, from the table of the MauveSim paper (COS Instrument Handbook).
 
         The table has a cell every 15 deg. Magnitudes are interpolated bilinearly, or taken from the nearest cell as in
@@ -120,7 +120,7 @@ class Sky:
             Single position; a string is a well-known star ("AU Mic"), or ICRS in degrees ("290.0 -11.2") or sexagesimal
             ("19h22m00s -11d12m00s").
         time : Time or str
-            Single time in 1990-2100; a string is ISO 8601, UTC.
+            Single time in 1990-2100; a string is ISO 8601, UTC, and so are dates of Python, NumPy and pandas.
         lookup : {"bilinear", "nearest"}
         """
         with offline():

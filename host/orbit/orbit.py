@@ -25,7 +25,7 @@ from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import records
 from mauvecl.schema.errors import InputError, printable, shortened
-from mauvecl.schema.fields import DAY_S, Duration, Range, Unit
+from mauvecl.schema.fields import DAY_S, DateText, Duration, Range, Unit
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -59,7 +59,7 @@ class TimeGrid:
     Raises InputError if the start is outside 1990-2100 or the number of steps is outside 1 to `MAX_STEPS`.
     """
 
-    start: str  # ISO 8601, UTC
+    start: DateText  # ISO 8601, UTC
     days: Annotated[float, Unit("d"), Range(0, open_low=True)]  # length of the plan
     step_s: Duration = 60.0  # length of a step; conditions are evaluated at its middle
 

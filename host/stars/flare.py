@@ -23,7 +23,7 @@ from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.schema import fields
 from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, shortened, shown
-from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.fields import Range, Unit, is_table
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -550,15 +550,15 @@ STARTS, STOPS = ("tstart", "start", "t_start", "time_start"), ("tstop", "stop", 
 MAX_FLARES = 500
 
 
-def read_flares(path: str | Path) -> QTable:
+def read_flares(path: str | Path | Table | Any) -> QTable:
     """Read amplitudes, and times if present, from a table of flares, with a column named as in `AMPLITUDES`.
 
-    The file is CSV, ECSV or FITS. The columns are ``amplitude``, and ``start`` and ``stop`` in days of the table's own
-    time system. Columns that are not used are named in ``meta["comments"]``.
+    The file is CSV, ECSV or FITS, or a table in memory, as of `flares_of`. The columns are ``amplitude``, and ``start``
+    and ``stop`` in days of the table's own time system. Columns that are not used are named in ``meta["comments"]``.
     """
     from mauvecl.host.tables.opening import read_table
 
-    return flares_of(read_table(path, "flare table"), shortened(Path(path).name))
+    return flares_of(read_table(path, "flare table"), "flare table" if is_table(path) else shortened(Path(path).name))
 
 
 def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
@@ -566,13 +566,12 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
 
     It is an astropy table, or a DataFrame such as AltaiPony's ``flares``; errors call it by `name`.
     """
-    from astropy.table import QTable, Table
+    from astropy.table import QTable
 
+    from mauvecl.host.tables.opening import read_table
     from mauvecl.host.tables.table import Rows
 
-    if not isinstance(table, Table):
-        table = Table.from_pandas(table)
-    rows = Rows(table, name, "amplitude")
+    rows = Rows(read_table(table, "flare table"), name, "amplitude")
     amplitude, start, stop = map(rows.first, (AMPLITUDES, STARTS, STOPS))
     if amplitude is None:
         names = shown(", ".join(rows.names), 300)

@@ -123,6 +123,11 @@ def text_at(header: Any, key: str) -> str:
     return "" if value is None else str(value).strip()
 
 
+def header_text(text: str) -> str:
+    """Return a text as FITS headers admit it: printable ASCII, other characters as escapes of Python."""
+    return text.encode("unicode_escape").decode()
+
+
 def first_of(candidates: Sequence[str], names: Iterable[str], label: str = "") -> str | None:
     """Return the name of the first candidate among some names, in any spelling, with or without a unit in brackets."""
     keys = [(name, key_of(name), key_of(divided_unit(name)[0])) for name in names]

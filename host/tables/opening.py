@@ -20,6 +20,7 @@ from mauvecl.host.tables.names import match_name
 from mauvecl.host.tables.table import REMARKS, MemoryTable, TableFile, Values
 from mauvecl.host.tables.text_tables import Layout, rows_of_text, text_table
 from mauvecl.schema.errors import InputError, shortened
+from mauvecl.schema.fields import is_table
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -290,10 +291,12 @@ def _check_rows(file: TableFile) -> TableFile:
     return file
 
 
-def read_table(path: str | Path, kind: str) -> Table:
-    """Read a small table into memory; see `open_table`."""
+def read_table(path: str | Path | Table | Any, kind: str) -> Table:
+    """Read a small table into memory, see `open_table`; one in memory, such as a DataFrame, is returned as a Table."""
     from astropy.table import MaskedColumn, Table
 
+    if is_table(path):
+        return path if isinstance(path, Table) else Table.from_pandas(path)
     path = Path(path)
     with open_table(path, f"{kind} {shortened(str(path))}", kind) as file:
         if isinstance(file, MemoryTable):

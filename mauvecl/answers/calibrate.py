@@ -200,7 +200,7 @@ class CalibrateAnswer(Answer):
             lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
         for row in self.fits:
             if row["p_value"] < REJECTED:
-                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
+                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}, below {REJECTED:g}.")
         if self.dark.slopes_p_value < REJECTED:
             lines.append(
                 "The dark current of single pixels rises differently with temperature: the instrument file has the "
@@ -326,10 +326,12 @@ class CalibrateAnswer(Answer):
                 by_pixel[name] = column
         if "read_noise_dn" in by_pixel:
             # The fit determines the mean variance of the pixels that are read.
-            rms_dn = np.sqrt(np.mean(by_pixel["read_noise_dn"][read] ** 2))
-            by_pixel["read_noise_dn"] = (
-                by_pixel["read_noise_dn"] * u.DN * self.changes.get("read_noise_dn", rms_dn) / rms_dn
-            )
+            noise_dn = by_pixel["read_noise_dn"]
+            rms_dn = np.sqrt(np.mean(noise_dn[read] ** 2))
+            fitted_dn = self.changes.get("read_noise_dn", rms_dn)
+            # A nominal map of zeros does not tell how pixels differ.
+            noise_dn = noise_dn * fitted_dn / rms_dn if rms_dn > 0 else np.full(moved.pixels, fitted_dn)
+            by_pixel["read_noise_dn"] = noise_dn * u.DN
         if np.ptp(bias) > 0:
             by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}

@@ -28,6 +28,7 @@ from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import Arrays, Float
 from mauvecl.host.exposure.background import parse_position, parse_time
+from mauvecl.host.tables.names import header_text
 from mauvecl.host.tables.units import offline
 from mauvecl.runs.checkpoint import Checkpoint, checkpointed
 from mauvecl.schema.columns import Column, View, interval_columns, number, percent, table_of, with_error
@@ -58,11 +59,12 @@ def light_curve_file(star: StarStare, sky: SkyLight, *, seed: int, number: int) 
     from astropy.io import fits
 
     primary, times = fits.PrimaryHDU(), _times(star.staring.stare, sky)
+    instrument = header_text(star.staring.quiet.instrument)
     primary.header.update({
-        "OBJECT": (star.label, "star, simulated"),
-        "TELESCOP": ("Mauve", "simulated"),
-        "INSTRUME": (star.staring.quiet.instrument, ""),
-        "CCD-TEMP": (star.staring.quiet.conditions["temperature_c"], "[Celsius] detector, where nothing heats it"),
+        "OBJECT": (header_text(star.label), "star, simulated"),
+        "TELESCOP": (instrument, "simulated"),
+        "INSTRUME": (instrument, ""),
+        "CCD-TEMP": (float(star.staring.stare.temperature_c.mean()), "[Celsius] detector, mean of the frames"),
         "CREATOR": (f"mauvecl {VERSION}", ""),
         "SEED": (str(seed), "of the draws"),
         "STARENO": (number, "number of the stare"),

@@ -49,16 +49,19 @@ def overview(answer: PlanAnswer) -> Picture:
     """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
     planned, nothing = answer.planned, [np.nan] * 3
     yields = [target.recovered for target in planned]
+    flares = np.array([(it.low, it.high, it.expected) if it else nothing for it in yields], np.float64)
     # A logarithmic axis cannot show zero.
-    flares = np.array([(it.low, it.high, it.expected) if it and it.high > 0 else nothing for it in yields])
+    flares[flares == 0] = np.nan
+    edge = 0.5 * float(np.fmin.reduce(flares[:, 2], initial=0.1))
+    flares[np.isnan(flares[:, 0]) & np.isfinite(flares[:, 1]), 0] = edge
     energies = np.array([[target.energy_at(share) for share in (0.5, 0.9, 0.5)] for target in planned])
     energies[np.isinf(energies)] = np.nan
     # Limits at whole decades avoid labels that overlap.
     logs = np.log10(energies[np.isfinite(energies)])
     decades = (10 ** np.floor(logs.min()), 10 ** np.ceil(logs.max())) if logs.size else None
     names = range(len(planned)), [f"{target.name} ({target.hours:.0f} h)" for target in planned]
-    y, x = PlotAxis(limits=(len(planned) - 0.5, -0.5), ticks=names), PlotAxis("flares recovered", True, (0.05, None))
-    left = Panel(x, y, _bars(np.maximum(flares, 0.05), "star"), "mean (dot), and 95 % of campaigns")
+    y, x = PlotAxis(limits=(len(planned) - 0.5, -0.5), ticks=names), PlotAxis("flares recovered", True, (edge, None))
+    left = Panel(x, y, _bars(flares, "star"), "mean (dot), 95 % of campaigns (edge: 0)")
     x = PlotAxis("bolometric energy (erg)", True, decades)
     right = Panel(x, y, _bars(energies, "flare"), "recovered in 50 % (dot) to 90 %")
     return Picture([[left, right]], (7.4, 0.24 * len(planned) + 1.5), share_y=True)

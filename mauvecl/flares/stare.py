@@ -21,7 +21,7 @@ from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import STARE_CHANGES, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import DAY_S, Amplitude, Duration, Energy, Moment, Range, Temperature, Unit
+from mauvecl.schema.fields import DAY_S, Amplitude, DateText, Duration, Energy, Moment, Range, Temperature, Unit
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
@@ -544,7 +544,7 @@ class OrbitStare:
 def stare_along(
     orbit: Orbit,
     target: Target | str,
-    start: str,
+    start: DateText,
     duration_s: Duration,
     *,
     frame_s: Duration = 5.0,
@@ -561,7 +561,7 @@ def stare_along(
     target : Target or str
         A name of the embedded list, or coordinates.
     start : str
-        ISO 8601, UTC.
+        ISO 8601, UTC; dates of Python, NumPy and pandas, and times of astropy, are converted.
     duration_s : float
         From the first frame, including times at which the target is not visible.
     frame_s : float

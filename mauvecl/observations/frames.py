@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import warnings
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.tables.units import SCALES, mission_of, offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import DAY_S, AnyUnit, Moment, Unit, is_quantity, without_unit
+from mauvecl.schema.fields import DAY_S, AnyUnit, Moment, Unit, date_text, is_quantity, without_unit
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -174,6 +175,18 @@ def _in_order(key: str, column: Any, light: Float, order: NDArray[np.intp], name
     return values[order]
 
 
+def _with_mjd(reference: Any, scale: str) -> dict[str, Any]:
+    """Return the attributes of a reference that is a time or a date, on a time scale; nothing for others."""
+    if isinstance(reference, str) or not isinstance(text := date_text(reference), str):
+        return {}
+    from astropy.time import Time
+
+    with offline(), contextlib.suppress(ValueError):
+        moment = reference if isinstance(reference, Time) else Time(text, scale="utc")
+        return {"reference_mjd": float(getattr(moment, scale).mjd), "scale": scale}
+    return {}
+
+
 Degrees = Annotated[float, Unit("deg")]
 
 
@@ -232,8 +245,10 @@ class Frames:
             Temperature of the detector.
         name : str
         **how
-            Other attributes.
+            Other attributes; ``reference_mjd`` may be a Time, or a date in UTC.
         """
+        if (scale := how.get("scale") or "utc") in SCALES.values():
+            how |= _with_mjd(how.get("reference_mjd"), scale)
         flux, error, how["unit"] = _in_one_unit(flux, error, how.get("unit", ""), name)
         time, light = np.asarray(time_s, np.float64), np.asarray(flux, np.float64)
         cadence, refused = _cadence_of(name, time, light), partial(InputError.of, where=name)

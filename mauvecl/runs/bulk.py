@@ -20,6 +20,7 @@ from mauvecl.device.launches import Progress
 from mauvecl.host import VERSION
 from mauvecl.host.arrays import map_in_threads
 from mauvecl.host.tables.files import UNFINISHED, check_folder, check_size, parsing, read_bytes, write_whole
+from mauvecl.host.tables.names import header_text
 from mauvecl.runs.checkpoint import locked
 from mauvecl.runs.pool import PREPARED, Pool
 from mauvecl.runs.store import CALIBRATION, DRAWS, Chunk, Store, StoredScene, digest, exposure_attributes, is_intact
@@ -480,7 +481,7 @@ def _fits(selection: Selection) -> HDUList:
     primary.header["SEED"] = (str(store.study.run.seed), "of the random numbers")
     primary.header["FIRSTROW"] = (selection.first, "realisation of the first row of each image")
     for line in store.remarks.values():
-        primary.header["COMMENT"] = line
+        primary.header["COMMENT"] = header_text(line)
     primary.header["HISTORY"] = "The table STUDY holds the study that gives these spectra again."
     extensions: list[ImageHDU | BinTableHDU] = []
     for group in dict.fromkeys(scene.group for scene in selection.scenes):
@@ -509,16 +510,15 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     hdu = fits.ImageHDU(selection.rows(scene), name=scene.path.upper().replace("/", "_"))
     header = hdu.header
     header["BUNIT"] = "adu"
-    # FITS is restricted to ASCII, and files of spectra may have any name.
-    header["OBJECT"] = scene.star.encode("ascii", "backslashreplace").decode()
+    header["OBJECT"] = header_text(scene.star)
     header["AMPLITUD"] = (scene.amplitude, "flare amplitude, 0 without a flare")
     header["EXPTIME"] = (x.frame_s if scene.frames is not None else x.exposure_s, "[s] of one row")
     header["TELAPSE"] = (x.exposure_s, "[s] of one realisation")
-    header["INSTRUME"] = x.instrument
+    header["INSTRUME"] = header_text(x.instrument)
     header["SATURATE"] = (float(x.saturation_dn), "[adu] of a single frame, with bias")
     header["DARKUNIT"] = (x.dark_unit, "in which dark counts follow Poisson's law")
     if "temperature_c" in x.conditions:
-        header["CCD-TEMP"] = (x.conditions["temperature_c"], "[Celsius]")
+        header["CCD-TEMP"] = (x.conditions["temperature_c"], "[Celsius] of the mean")
     header["NFRAMES"] = (1 if scene.frames is not None else x.n_frames, "frames summed in one row")
     # Axis 1 is the vacuum wavelength, by pixel from the calibration table.
     header["CTYPE1"], header["CUNIT1"] = "WAVE-TAB", "nm"

@@ -11,6 +11,7 @@ signature of a validated function. A field of a section states everything about 
 
 from __future__ import annotations
 
+import datetime
 import math
 import operator
 import re
@@ -93,6 +94,25 @@ def with_unit(text: str, unit: str) -> float | None:
         except (TypeError, ValueError, ArithmeticError):
             continue
     raise ValueError(text)
+
+
+def date_text(value: Any) -> Any:
+    """Return dates of Python, NumPy and pandas, and single times of astropy, as text in UTC; others unchanged."""
+    if isinstance(value, datetime.datetime) and value.tzinfo is not None:
+        value = value.astimezone(datetime.UTC).replace(tzinfo=None)
+    if isinstance(value, datetime.date):
+        return value.isoformat()
+    if getattr(value, "ndim", 0):
+        return value
+    if getattr(getattr(value, "dtype", None), "kind", "") == "M":
+        return str(value)
+    return str(value.utc.isot) if hasattr(value, "utc") and hasattr(value, "isot") else value
+
+
+def is_table(value: Any) -> bool:
+    """Return whether a value is a table of astropy or a DataFrame."""
+    # A row of a table has the columns of the table, which it names.
+    return hasattr(value, "columns") and not hasattr(value, "table")
 
 
 Metadata = TypeVar("Metadata")
@@ -298,6 +318,13 @@ class Accepted:
         return or_error(handler(source), self.words)
 
 
+class Date:
+    """A time as text, ISO 8601 and UTC; dates of Python, NumPy and pandas, and times of astropy, are converted."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return or_error(handler(source), "a UTC time such as '2026-03-01T12:00:00'", before=date_text)
+
+
 @dataclass(frozen=True)
 class Help:
     """Description of a field, for ``--help``, tooltips of the page and the reference."""
@@ -465,6 +492,8 @@ Radius = Annotated[float, Unit("solRad"), Range(1e-4, 1e4)]
 SolidAngle = Annotated[float, Unit("arcsec2"), Range(1e-6, 1e12)]
 #: Wavelength in vacuum; also a frequency or an energy of photons.
 Wavelength = Annotated[float, Unit("nm"), Range(0, open_low=True)]
+#: Date and time.
+DateText = Annotated[str, Date()]
 #: Moment, from the start of an observation, and length of time.
 Moment = Annotated[float, Unit("s"), Range()]
 Duration = Annotated[float, Unit("s"), Range(0, open_low=True)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import difflib
 import math
 from collections.abc import Iterator, Sequence
@@ -131,16 +130,15 @@ def plain(value: Any) -> Any:
 
     Quantities remain, since the type of a number converts them to its unit.
     """
-    if isinstance(value, datetime.datetime) and value.tzinfo is not None:
-        value = value.astimezone(datetime.UTC).replace(tzinfo=None)
-    if isinstance(value, datetime.date):
-        return value.isoformat()
+    value = fields.date_text(value)
+    is_date = hasattr(value, "isot") or getattr(getattr(value, "dtype", None), "kind", "") == "M"
+    is_array = bool(getattr(value, "ndim", 0))
+    if isinstance(value, list | tuple) or (is_array and (is_date or hasattr(value, "icrs"))):
+        return (tuple if isinstance(value, tuple) else list)(map(plain, value))
     if fields.is_quantity(value):
-        return list(map(plain, fields.as_quantity(value))) if getattr(value, "ndim", 0) else value
+        return list(map(plain, fields.as_quantity(value))) if is_array else value
     if hasattr(value, "tolist"):
         return value.tolist()
-    if hasattr(value, "utc") and hasattr(value, "isot"):
-        return str(value.utc.isot)
     if hasattr(value, "icrs") and hasattr(value, "to_string"):
         return str(value.icrs.to_string("decimal", precision=6))
     return value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -81,10 +82,12 @@ class OrbitQuestion(Section):
         return Orbit.load(self.tle, self.kind)
 
     def times(self) -> TimeGrid:
-        """Return the time grid."""
+        """Return the time grid, with steps that are shortened where the last one would end after the days."""
         from mauvecl.host.orbit.orbit import TimeGrid
 
-        return TimeGrid(self.start, self.days, self.step_s)
+        times = TimeGrid(self.start, self.days, self.step_s)
+        step_s = self.days * fields.DAY_S / times.n
+        return times if math.isclose(step_s, self.step_s) else replace(times, step_s=step_s)
 
 
 #: Keys of a target that hold paths, relative to its table or the study file.
@@ -239,10 +242,15 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     return targets
 
 
-def read_targets(path: str | Path) -> list[dict[str, Any]]:
-    """Read targets from a table of any format; see `targets_in`. Paths in it are relative to its folder."""
+def read_targets(path: str | Path | Table | Any) -> list[dict[str, Any]]:
+    """Read targets from a table of any format or in memory; see `targets_in`.
+
+    Paths in a file are relative to its folder, those in a table in memory to the working folder.
+    """
     from mauvecl.host.tables.opening import read_table
 
+    if fields.is_table(path):
+        return targets_in(read_table(path, "table of targets"), "table of targets", Path())
     named = f"table of targets {shortened(Path(path).name)}"
     return targets_in(read_table(Path(path), "table of targets"), named, Path(path).parent)
 

@@ -373,7 +373,7 @@ class FlareLight(Section):
         return type(self)(**(self.model_dump() | {key: value}))
 
 
-def amplitudes_in(path: Path, _: str) -> list[float]:
+def amplitudes_in(path: Path | Any, _: str) -> list[float]:
     """Read the amplitudes of a table of flares, each value once, and warn of columns that are not used."""
     from mauvecl.host.stars.flare import read_flares
 

@@ -95,6 +95,9 @@ class StareQuestion(Section):
         for low, high in self.bands_nm:
             if not 0 < low < high:
                 raise InputError.of("stare.bands_nm", (low, high), "ascending wavelengths", unit="nm")
+        for start, end in self.gaps:
+            if not start < end:
+                raise InputError.of("stare.gaps", (start, end), "two times, ascending", unit="s")
 
 
 #: Keys of the size of an event.

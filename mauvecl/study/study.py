@@ -26,7 +26,7 @@ from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, NUISANCES, Processes
 from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, as_quantity, metadata_of
+from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, as_quantity, is_table, metadata_of
 from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
 from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
@@ -452,7 +452,9 @@ class Keyword(NamedTuple):
     def value(self, value: Any) -> Any:
         """Convert a value of the kind that the command line takes to that of the key; return others unchanged."""
         kinds = {str: (str,), Path: (str, Path)}.get(self.item_kind, (str, int, float))
-        if self.flag.read is None or not all(isinstance(item, kinds) for item in (value if self.many else [value])):
+        is_read = all(isinstance(item, kinds) for item in (value if self.many else [value]))
+        # Readers of files also take tables in memory.
+        if self.flag.read is None or not (is_read or (self.item_kind is Path and is_table(value))):
             return value
         return self.flag.read(value, self.name)
 
@@ -486,6 +488,8 @@ def values_of(values: Mapping[str, Any], keywords: Mapping[str, Keyword], where:
         raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(near)}")
     by_name = {name: values.get(name) for name in keywords}
     for name, value in by_name.items():
+        if keywords[name].many and is_table(value):
+            raise InputError.of(name, value, "a value or a list of values")
         if keywords[name].many and value is not None and not isinstance(value, Mapping):
             # Neither a sequence nor an array.
             is_single = isinstance(value, str | Path) or getattr(value, "ndim", 1) == 0 or not hasattr(value, "__len__")

@@ -142,11 +142,18 @@ def test_plan_takes_completeness_as_argument_whose_shares_are_those_by_hand() ->
         edge = np.array([1e30, 1e33 * (1 - 1e-12), 1e33, 1e40])
         return completeness.Completeness(edge, np.array([0.0, 0.0, 1.0, 1.0]), "bolometric", "a step")
 
-    one = STUDY.with_settings(["plan.targets=[{name = 'eps Eri', alpha = 2.0, rate_per_day = 0.5, at_erg = 1e33}]"])
-    (row,) = plan(one, completeness=none_below).table
-    assert row["expected"] == pytest.approx(0.5 * 5, rel=0.02)
+    asked = [{"name": "eps Eri", "alpha": 2.0, "rate_per_day": 0.5, "at_erg": 1e33}]
+    asked.append(asked[0] | {"name": "GJ 205", "rate_per_day": 1e-3})
+    answer = plan(STUDY.with_changes({"plan": {"targets": asked}}, None), completeness=none_below)
+    mean = answer.table["expected"].tolist()
+    assert mean[0] == pytest.approx(0.5 * 5, rel=0.02)
     # The user's own rates have no scatter beyond Poisson noise.
-    assert [row["low"], row["high"]] == stats.poisson.ppf([0.025, 0.975], row["expected"]).tolist()
+    assert [answer.table["low"][0], answer.table["high"][0]] == stats.poisson.ppf([0.025, 0.975], mean[0]).tolist()
+    bars, dots = answer.pictures["plan"]().axes[0].lines
+    assert dots.get_xdata().tolist() == mean
+    edge = bars.axes.get_xlim()[0]
+    assert edge < mean[1]
+    np.testing.assert_array_equal(bars.get_xdata()[:5], [edge, answer.table["high"][0], np.nan, np.nan, np.nan])
     # Two half-widths; every flare of an energy has one half-width, in the middle of their logarithms.
     critical = np.array([[[1.0, 2.0, 3.0, 4.0]], [[10.0, 20.0, 0.0, 30.0]]])
     injected = completeness.InjectedCompleteness((10.0, 1000.0), np.ones(1), np.ones((2, 1)), critical)
@@ -291,9 +298,11 @@ def test_spectra_summed_over_frames_equal_exposures_of_the_engine(stares):
     assert 5.0 * one.light.flux[:, 2].sum() == pytest.approx(net[band].sum(), abs=0.1)
 
 
-def test_light_scatters_by_its_standard_deviation_in_bands_of_a_sweep_and_files(stares):
+def test_light_scatters_by_its_standard_deviation_in_bands_of_a_sweep_and_files(stares, tmp_path):
     """Files have the columns of lightkurve; a sweep goes over magnitude and temperature, in bands that overlap."""
-    found = stare(SHORT, stares)
+    (tmp_path / "i.toml").write_text('version = 2\nextends = "mauvesim"\nname = "λ"\ntemperature_c = 20.0')
+    asked = SHORT.with_settings([f"observation.instrument='{tmp_path / 'i.toml'}'"])
+    found = stare(asked, stares)
     light = found.stares[0].light
     z = (light.flux - light.mean) / light.sd
     spectrum = (light.spectrum - light.spectrum_mean) / light.spectrum_sd
@@ -310,7 +319,10 @@ def test_light_scatters_by_its_standard_deviation_in_bands_of_a_sweep_and_files(
         assert table.header["MJDREFI"] == 61041
         assert (table.header["TIMESYS"], table.header["TREFPOS"]) == ("UTC", "TOPOCENTER")
         np.testing.assert_allclose([86_400 * table.header[name] for name in ("EXPOSURE", "TSTOP")], [250, 300])
-        assert hdus[0].header["CCD-TEMP"] == 21.0
+        assert hdus[0].header["TELESCOP"] == hdus[0].header["INSTRUME"] == r"\u03bb"
+        # 2 deg C times the mean of the sine over 0-100 s and 150-300 s of 600 s; frames of 5 s give it to 1e-4.
+        warmth = 2 * 600 / (2 * np.pi) * (1 - np.cos(np.pi / 3) + 1) / 250
+        assert hdus[0].header["CCD-TEMP"] == pytest.approx(20 + warmth, rel=1e-4)
         assert table.columns.names[:6] == ["TIME", "CADENCENO", "QUALITY", "FLUX", "FLUX_ERR", "MEAN"]
         assert table.columns["TIME"].unit == "d"
         np.testing.assert_allclose(table.data["FLUX"], light.flux[:, 0], rtol=1e-6)
@@ -321,7 +333,7 @@ def test_light_scatters_by_its_standard_deviation_in_bands_of_a_sweep_and_files(
         assert hdus[0].header["OBJECT"] == "G2V V = 7.4"
     bands = [[200, 300], [200, 300], [250, 450], *([300 + 10 * k, 400 + 10 * k] for k in range(9))]
     axes = '{quantity="magnitude", values=[7.4, 9]}, {quantity="flare_temperature", values=[10000, 20000]}'
-    swept = stare(SHORT.with_settings([f"stare.bands_nm={bands}", f"sweep.axes=[{axes}]"]), stares)
+    swept = stare(asked.with_settings([f"stare.bands_nm={bands}", f"sweep.axes=[{axes}]"]), stares)
     assert swept.table["magnitude"].value.tolist() == [7.4, 7.4, 9.0, 9.0]
     assert swept.table["frame_noise"][2] > 2 * swept.table["frame_noise"][0]
     assert [one.flares[0].event.hottest_k for one in swept.stares] == [10_000.0, 20_000.0] * 2

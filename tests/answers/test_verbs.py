@@ -4,20 +4,23 @@ import io
 import json
 import re
 import shlex
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 import pytest
 from answers import FEW, QUICK
+from astropy.coordinates import SkyCoord
 from astropy.table import QTable
+from astropy.time import Time
 from commands import run
 from marks import long_but
 from scenes import paper
 from tables import toml
 
 import mauvecl
-from mauvecl import Engine, FlareModel, Instrument, Source, Study, expect, fit
+from mauvecl import Engine, FlareModel, Frames, Instrument, Sky, Source, Study, expect, fit
 
 SLOW = {
     "measure": ["measure.fits=20"],
@@ -116,10 +119,32 @@ def test_studies_are_built_from_and_changed_by_the_same_keywords() -> None:
     assert Study.of(**asked, paper=True, ideal=True).toml() == paper(*settings).toml()
     by_name = Study.of(targets=["AU Mic", {"name": "eps Eri", "age_myr": 400, "mass_msun": 0.8}]).plan.targets
     assert [target.name for target in by_name] == ["AU Mic", "eps Eri"]
+    places = SkyCoord([10.5, 20], [-20, 5], unit="deg")
+    table = QTable({"name": ["AU Mic", "X"], "place": places, "amplitude": [0.1, 0.2]})
+    of_table = Study.of(targets=table, flares=table["name", "amplitude"])
+    assert [target.coordinates for target in of_table.plan.targets] == ["10.5 -20.0", "20.0 5.0"]
+    assert of_table.flare.amplitudes == (0.1, 0.2)
+    assert Study.of(look_at=[places[0], "AU Mic"]).orbit.targets == ("10.500000 -20.000000", "AU Mic")
+    assert Study.of(look_at=places).orbit.targets == ("10.500000 -20.000000", "20.000000 5.000000")
     pairs = Study.of(gap="10 min:0.5 h", skip=["322:3680 Angstrom"], declination="-30 deg:1800 arcmin")
     assert pairs.stare.gaps == ((600.0, 1800.0),)
     assert pairs.measure.skipped_nm == ((322.0, 368.0),)
     assert pairs.orbit.limits.declination_deg == (-30.0, 30.0)
+
+
+def test_times_may_be_dates_of_python_numpy_and_astropy() -> None:
+    noon = datetime(2027, 3, 1, 12)
+    zoned = datetime(2027, 3, 1, 14, tzinfo=timezone(timedelta(hours=2)))
+    grid = type(Study().orbit.times())
+    for time in (noon, zoned, np.datetime64(noon), Time(noon), noon.isoformat()):
+        assert Study.of(start=time).orbit.start.startswith("2027-03-01T12:00:00"), time
+        assert grid(time, 1.0).first == grid("2027-03-01T12:00", 1.0).first
+        assert Sky.at("10 40", time) == Sky.at("10 40", Time(noon))
+        if not isinstance(time, str):
+            assert Frames.of(np.arange(20), np.ones(20), reference_mjd=time).reference_mjd == 61_465.5
+    # Steps end with the days.
+    assert [Study.of(days=0.05, step=step).orbit.times().step_s for step in (60, 3600)] == [60.0, 2160.0]
+    assert Study.of(start=noon.date()).orbit.start == str(np.datetime64(noon, "D"))
 
 
 def test_too_few_realisations_are_warned_of() -> None:

@@ -11,6 +11,7 @@ from marks import long_but
 from scenes import instrument, star
 from scipy import optimize, stats
 from scipy.ndimage import gaussian_filter1d
+from scipy.sparse import csr_array
 
 import mauvecl
 from mauvecl import Comparison, Detection, Engine, Expectation, Linear, Normal, Nuisances, Processes, Uniform
@@ -380,20 +381,30 @@ def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
     np.testing.assert_allclose(smoothing.rows, rows)
 
 
+def followed(weights: np.ndarray, finished: np.ndarray, x: np.ndarray) -> list[float]:
+    """Follow the bands in chunks as the kernel does."""
+    window, out = np.zeros(weights.shape[1]), list[float]()
+    for bands, part, count in zip(weights, x.reshape(len(weights), -1), finished, strict=True):
+        window += bands @ part
+        out += window[:count].tolist()
+        window = np.append(window[count:], np.zeros(count))
+    return out
+
+
 @pytest.mark.parametrize("chunk", [4, 32])
 def test_bands_hold_the_rows(chunk: int) -> None:
-    """Follow the bands in chunks as the kernel does."""
     (quiet,) = star()
     smoothing, n = smoothing_of(quiet, quiet), quiet.wavelength_nm.size
     x = np.zeros(-(-n // 32) * 32)
     x[:n] = np.random.default_rng(3).normal(size=n)
-    weights, finished = smoothing.bands(x.size, chunk)
-    window, out = np.zeros(weights.shape[1]), []
-    for c, count in enumerate(finished):
-        window += weights[c] @ x[c * chunk : (c + 1) * chunk]
-        out += list(window[:count])
-        window = np.append(window[count:], np.zeros(count))
-    np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
+    np.testing.assert_allclose(followed(*smoothing.bands(x.size, chunk), x), smoothing.rows @ x[:n], atol=1e-6)
+    # A gap that is wider than the reach.
+    centres, pixels = np.arange(0, 400, 8), np.arange(400)
+    distance = centres[:, None] - pixels
+    rows = np.exp(-((distance / 8) ** 2)) * (abs(distance) < 24) * ((pixels < 100) | (pixels >= 300))
+    bands, finished = type(smoothing)(centres, np.eye(1), 8.0, csr_array(rows)).bands(416, chunk)
+    np.testing.assert_allclose(followed(bands, finished, x[:416]), rows @ x[:400], rtol=1e-5, atol=1e-5)
+    assert bands.shape[1] < 15, "centres in the gap do not wait for its end"
 
 
 def test_comparisons_and_all_statistics_are_read_from_words() -> None:

@@ -147,7 +147,11 @@ def test_maps_of_the_nominal_pixels_count_once() -> None:
     maps = mauvecl.PixelMap(gain=1 + slope, dark=1.2 - slope, read_noise_dn=10 + 50 * slope)
     true, rng = NOMINAL.with_(pixel_map=replace(maps, read_noise_dn=30 + 150 * slope)), np.random.default_rng(6)
     study = study_of((("A0V", 5.0),), dark=False).with_instrument({"pixel_map": maps})
-    found = calibrate(study, frames=(frames_of(true, star("A0V", 5.0), [21.0], 40, rng),))
+    frames = (frames_of(true, star("A0V", 5.0), [21.0], 40, rng),)
+    found = calibrate(study, frames=frames)
+    silent = calibrate(study.with_instrument({"pixel_map": replace(maps, read_noise_dn=0 * slope)}), frames=frames)
+    even = expected(star("A0V", 5.0), silent.instrument).read_noise_dn
+    np.testing.assert_allclose(even, value_of(silent, "read noise").value)
     right, fitted = (expected(star("A0V", 5.0), one) for one in (true, found.instrument))
     np.testing.assert_allclose(fitted.light_dn[5:-5], right.light_dn[5:-5], rtol=0.03)
     np.testing.assert_allclose(fitted.dark_dn, right.dark_dn)

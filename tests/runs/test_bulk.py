@@ -239,7 +239,9 @@ def test_exports_contain_the_rows_and_any_study(tmp_path: Path, engine: Engine) 
     star = tmp_path / f'{"long/" * 30}ein "Stern" \\ λ Vir 🌟.txt'
     star.parent.mkdir(parents=True)
     star.write_text("".join(f"{nm} 1e-12\n" for nm in range(150, 1200, 5)))
-    sections = study(50).model_dump() | {"star": [{"file": star, "magnitude": 5.0}]}
+    (payload := tmp_path / "own.toml").write_text('version = 2\nextends = "mauvesim"\nname = "λ"\nnotice = "für\\n🌟"')
+    own = {"star": [{"file": star, "magnitude": 5.0}], "observation": {"instrument": str(payload)}}
+    sections = study(50).model_dump() | own
     made = bulk.realise(Study.build(sections, "test"), tmp_path / "s.zarr", engine)
     run("export", "s.zarr", "s.fits", "--rows", "10:30", folder=tmp_path)
     path = tmp_path / "s.fits"
@@ -251,6 +253,7 @@ def test_exports_contain_the_rows_and_any_study(tmp_path: Path, engine: Engine) 
             wavelength, row = wcs.pixel_to_world_values(pixels, 3 + 0 * pixels)
             np.testing.assert_allclose(wavelength, scene.expectation.wavelength_nm, rtol=1e-12)
             np.testing.assert_array_equal(row, 13)
+            assert hdu.header["INSTRUME"] == r"\u03bb"
         np.testing.assert_array_equal(hdus[3].data["DARK_DN"][0], made.scenes[0].expectation.dark_dn)
         assert "table STUDY" in str(hdus[0].header["HISTORY"])
         lines = "\n".join(hdus["STUDY"].data["LINE"])

@@ -362,6 +362,10 @@ def test_prior_of_zero_width_changes_nothing(engine: Engine) -> None:
     sure = {"light_loss": {"uniform": [0.34, 0.34]}, "known": [name for name in ALL if name != "light_loss"]}
     first, second = (limit(unsure(given), engine) for given in (sure | {"draws": 2}, {"draws": 0}))
     (one,), (two,) = first.limits, second.limits
+    assert [one.views[0].title.rpartition(" test, ")[2] for one in (first, second)] == [
+        "20,000 realisations of each draw",
+        "40,000 realisations",
+    ]
     assert first.table["matters_most"].tolist() == [""], "nothing moves the limit"
     assert one.closed_form == pytest.approx(two.closed_form, abs=1e-4)
     assert one.unknown.range == pytest.approx((two.closed_form, two.closed_form), abs=1e-4)
