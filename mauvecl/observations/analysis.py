@@ -301,18 +301,21 @@ def analyse_frames(
     default the light, and the dark current as measured. The temperature is that of injected flares in spectra. `report`
     is called with the share of the work that is done, and may raise to stop the work.
     """
-    steps = [Steps(report).part(first, last) for first, last in pairwise(STAGES)]
+    stages = (Steps(report).part(first, last) for first, last in pairwise(STAGES))
+    level_steps, rate_steps, search_steps, event_steps, injection_steps = stages
     series: spectral.SpectralSeries | None = None
     if model is None:
-        survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, steps[0])
+        survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
     else:
-        survey, series, level = spectral.survey_spectra(frames, model, shape_of(shape), rank, seed, jitters, steps[0])
+        survey, series, level = spectral.survey_spectra(
+            frames, model, shape_of(shape), rank, seed, jitters, level_steps
+        )
         frames = series.cleaned.frames
-    rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], rate, seed, steps[1])
-    detected, in_events = detect_events(survey, candidates, steps[2])
+    rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], rate, seed, rate_steps)
+    detected, in_events = detect_events(survey, candidates, search_steps)
     spectra = [None if series is None else spectral.event_spectrum(survey, series, in_events, one) for one in detected]
     causes: list[Kind] = ["flare" if spectrum is None else spectrum.cause for spectrum in spectra]
-    events = measure_events(survey, in_events, detected, causes, steps[3])
+    events = measure_events(survey, in_events, detected, causes, event_steps)
     measurements = [
         spectral.measure_flare(survey, series, in_events, event) if series is not None and measured.kind == "flare"
         else "no spectra of the instrument are given" if series is None else f"its kind is {measured.kind}"
@@ -323,7 +326,7 @@ def analyse_frames(
     return Analysis(
         frames, frames.white_light[0], level, survey, rate, *rates,
         threshold=threshold, candidates=candidates, dip=dip, events=events, measurements=measurements,
-        completeness=inject(survey, quiet, threshold, seed, temperature_k, steps[4]),
+        completeness=inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
         scatter=binned_scatter(numbers, residual @ survey.bank.directions[len(survey.bank.directions) // 2]),
         residual=residual, quiet=quiet, likeness=likeness(numbers, residual), spectra=series, event_spectra=spectra,
     )  # fmt: skip
