@@ -46,10 +46,10 @@ class InjectionCompleteness:
     detected: NDArray[np.int64]  # shape (n_width, n_size)
     injected: int  # number of injections per cell
 
-    def limit(self, width: int) -> float:
-        """Return the equivalent duration of flares that are detected with the probability `POWER`; NaN if none is."""
+    def limit(self, width: int, power: float = POWER) -> float:
+        """Return the equivalent duration of flares that are detected with a probability; NaN if none is."""
         shares = np.maximum.accumulate(self.detected[width]) / self.injected
-        size = size_at(self.equivalent_durations_s[width], shares, POWER)
+        size = size_at(self.equivalent_durations_s[width], shares, power)
         return size if np.isfinite(size) else float("nan")
 
 
