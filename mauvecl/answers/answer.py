@@ -26,6 +26,7 @@ from mauvecl.host.arrays import ContentEquality
 from mauvecl.host.exposure.background import rate_of
 from mauvecl.host.instrument import shipped_names
 from mauvecl.host.tables.files import check_size, json_text, open_regular, read_text, write_whole, writing
+from mauvecl.host.tables.names import header_text
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, View, percent, records, stacked, table_of
 from mauvecl.schema.errors import InputError
@@ -460,7 +461,8 @@ def write_table(table: Table, path: Path) -> Path:
     if path.suffix == ".fits":
         plain, packed = table.copy(), io.BytesIO()
         # FITS keywords are limited to eight letters and short values, so the study has its own file.
-        plain.meta = {FITS_KEYWORDS[k]: v for k, v in plain.meta.items() if k in FITS_KEYWORDS}
+        values = {keyword: table.meta[key] for key, keyword in FITS_KEYWORDS.items() if key in table.meta}
+        plain.meta = {key: header_text(value) if isinstance(value, str) else value for key, value in values.items()}
         plain.write(packed, format="fits")
         write_whole(path, packed.getbuffer())
     else:

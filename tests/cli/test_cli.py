@@ -52,20 +52,22 @@ def test_schema_describes_every_key(tmp_path: Path) -> None:
 
 def test_spectrum_of_a_file_is_simulated_as_asked_and_written_in_two_formats(tmp_path: Path) -> None:
     flags = ("--wavelength-unit", "Angstrom", "--extend", "M3V", "--bin-nm", "2", "-m", "8", "-a", "0.24", "-t", "10")
-    words = ("--star", DATA / "spectra" / "10lac_stis_001.txt", *flags, "--no-pictures", "-o", "out")
+    shutil.copy(DATA / "spectra" / "10lac_stis_001.txt", tmp_path / "étoile.txt")
+    words = ("--star", "étoile.txt", *flags, "--no-pictures", "-o", "out")
     shown = " ".join(run("simulate", *words, folder=tmp_path).stdout.split())
     table = QTable.read(tmp_path / "out" / "observation-2.ecsv")
     assert table["raw"].unit == "adu"
     with fits.open(tmp_path / "out" / "observation-2.fits") as hdus:
         hdus.verify("exception")
         assert hdus[1].header["EXPTIME"] == 10.0
+        assert hdus[1].header["OBJECT"].startswith(r"\xe9toile"), "headers are ASCII"
         assert hdus[1].columns["wavelength"].unit == "nm"
         np.testing.assert_array_equal(hdus[1].data["raw"], table["raw"].value)
     if shutil.which("fitsverify"):
         verified = ["fitsverify", tmp_path / "out" / "observation-2.fits"]
         reported = subprocess.run(verified, capture_output=True, text=True, check=True).stdout
         assert "0 warning(s) and 0 error(s)" in reported, reported
-    assert "seed 1 10lac_stis_001: ASSUMED: flux in erg" in shown, "the first message"
+    assert "seed 1 étoile: ASSUMED: flux in erg" in shown, "the first message"
     assert "ASSUMED: flux in erg" in (tmp_path / "out" / "run.json").read_text()
     # The study that was written reads the same star again; another star has none of its keys.
     again = Study.read(tmp_path / "out" / "study.toml")
