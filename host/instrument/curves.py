@@ -23,7 +23,10 @@ from mauvecl.schema.fields import Range, Unit
 
 @contextmanager
 def _opened(path: str | Path, title: str) -> Iterator[tuple[Numbers, str]]:
-    """Read an ECSV table of numbers, and their origin, "tag: source"; errors in the block name the file."""
+    """Read an ECSV table of numbers, and the origin of its values, "tag: source", from its metadata.
+
+    Errors that are raised in the block begin with the name of the file.
+    """
     table = parse_numbers(*text_and_name(path, title))
     source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
     try:

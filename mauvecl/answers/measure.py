@@ -260,7 +260,10 @@ def matched_filter(
 
 
 def _quantiles(estimates: Float, shares: float | list[float]) -> Float:
-    """Return quantiles of estimates, (n, n_derived), of the fits that have a quantity; NaN if none has it."""
+    """Return quantiles of estimates, (n, n_derived), along their first axis; NaN where no fit has the quantity.
+
+    A fit in which one blackbody is best has no second temperature, and is left out.
+    """
     quantiles = np.full((*np.shape(shares), estimates.shape[1]), np.nan)
     has = np.isfinite(estimates).any(axis=0)
     quantiles[..., has] = np.nanquantile(estimates[:, has], shares, axis=0)

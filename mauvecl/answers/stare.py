@@ -503,7 +503,10 @@ def log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
 
 
 def _found_energy(case: Case, event: Event) -> float:
-    """Return the bolometric energy of a flare, erg; NaN if the star's size is unknown, or its photosphere is hotter."""
+    """Return the bolometric energy of a detected flare, erg; NaN if the star's size is unknown.
+
+    Also NaN if flares replace photosphere and the fitted temperature is not above the photosphere's.
+    """
     flare = case.study.flare
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:

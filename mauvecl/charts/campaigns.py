@@ -262,7 +262,10 @@ def plan_report(answer: PlanAnswer) -> tuple[str, list[ReportPart]]:
 
 
 def _target_lines(answer: PlanAnswer, k: int, cells: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Return the lines on a target: quantity, value, and its file and column; `cells` are those of the plan's table."""
+    """Return the lines on a target: quantity, value, and the file and column of the value.
+
+    `cells` has the texts of the target in the table of the plan, by column.
+    """
     target, observation = answer.planned[k], answer.planned[k].observation
     place, star, visible = observation.target, observation.case.star, answer.seen
     lines = [

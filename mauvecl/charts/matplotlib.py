@@ -84,7 +84,10 @@ def new_figure(size: tuple[float, float], **options: Any) -> Any:
 
 
 def _subfigure_of(ax: Any) -> Any:
-    """Return the part of the caller's figure that axes of a grid occupy, for a picture of several panels."""
+    """Return the part of the caller's figure that axes occupy, for a picture of several panels.
+
+    Raises InputError if the axes are not part of a grid.
+    """
     spec = ax.get_subplotspec()
     if spec is None:
         raise InputError(
@@ -247,7 +250,10 @@ def _wrap(text: Any, width: float) -> None:
 
 
 def _finish(axis: Any, panel: Panel) -> None:
-    """Set ranges and ticks of axes, which may be shared, when all is drawn; logarithmic ticks are plain numbers."""
+    """Set ranges and ticks of axes, which may be shared, when all panels are drawn.
+
+    Logarithmic ticks are plain numbers (0.1, 20, 500), with intermediate ones only over few decades.
+    """
     from matplotlib.ticker import LogLocator, NullFormatter
 
     for side, of in ((axis.xaxis, panel.x), (axis.yaxis, panel.y)):

@@ -341,7 +341,10 @@ def _divided(columns: list[list[str]], room: int) -> list[list[list[str]]]:
 
 
 def _flags(name: str, *, off: bool = False) -> list[str]:
-    """Return the flags, the long one first, that set a key or turn it off, of the called command or of all."""
+    """Return the flags that set a parameter or a key of the study, or turn it off, the long one first.
+
+    They are those of the called command, or else of all keys of the study.
+    """
     from typer.main import get_command
 
     from mauvecl.study.study import keys_of

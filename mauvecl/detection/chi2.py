@@ -276,7 +276,10 @@ class Smoothing:
 
 @lru_cache(maxsize=4)
 def _interpolation(n: int, step: int) -> tuple[NDArray[np.int64], Float]:
-    """Return even pixels with both ends, and the polynomials through the nearest eight that lead to all pixels."""
+    """Return evenly spaced pixels, including both ends, and the interpolation from them to all pixels.
+
+    The interpolation, (n, n_centre), is by Lagrange polynomials through the nearest eight centres.
+    """
     even = np.linspace(0, n - 1, -(-(n - 1) // step) + 1).round().astype(int)
     # One more centre next to each end, where interpolation is least accurate.
     centres = np.unique([*even, step // 2, n - 1 - step // 2]) if step > 1 else np.arange(n)

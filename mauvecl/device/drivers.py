@@ -270,7 +270,10 @@ def set_processor_name(device: Any, name: str) -> bool:
 
 
 def _name_address(device: Any) -> int | None:
-    """Return the address of the pointer to the processor's name in PoCL's record, or None to leave the name."""
+    """Return the address of the pointer to the processor's name in PoCL's record.
+
+    None if the name needs no change, or is not found.
+    """
     match = TARGET.search(str(device.version))
     if match is None or not (CHOOSES_LIBRARY in str(device.platform.version) or match[2] == UNKNOWN):
         return None

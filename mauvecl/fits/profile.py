@@ -403,7 +403,10 @@ def _ratio_ends(faces: list[Face], per: Float, n_linear: int, least: Float) -> t
 
 
 def _linear_ends(faces: list[Face], factors: Float, least: Float, factor_at: FactorAt | None) -> tuple[Float, Float]:
-    """Return the ends of a sum of amplitudes, with factors (n_linear, n, n_sample), over the factor on all light."""
+    """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
+
+    It is divided by the factor on all light, or by another linear function of the amplitudes, if there is one.
+    """
     lows, highs = np.full(factors.shape[1:], np.inf), np.full(factors.shape[1:], -np.inf)
     for face in faces:
         room = face.gain - least

@@ -158,7 +158,10 @@ class Event:
 
 
 def check_contributions(events: Sequence[Event], start_s: Float, frame_s: float) -> list[str]:
-    """Return messages on flares that peak outside the frames; raises InputError if one adds no light to them."""
+    """Return a message for each flare that peaks outside the frames but contributes light to them.
+
+    Raises InputError if a flare contributes no light.
+    """
     frames = np.column_stack([start_s, start_s + frame_s])
     sentences = []
     for number, event in enumerate(events, 1):

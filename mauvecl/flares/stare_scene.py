@@ -393,7 +393,10 @@ class SumTable:
 
     @classmethod
     def of(cls, components: Components) -> Self:
-        """Compute the table; raises InputError if weights depend on each other, or counts are too few to expand."""
+        """Compute the table.
+
+        Raises InputError if weights are linearly dependent, or counts are too few for the expansion.
+        """
         n = components.n_statistics
         constant, each = components.sum_cumulants(2)
         covariance = constant + each[: len(STEADY)].sum(axis=0)
@@ -449,7 +452,10 @@ def method_for(components: Components, stare: Stare, processes: Processes = NONE
 
 
 def _fourths_are_needed(components: Components) -> bool:
-    """Return whether fourth cumulants could be noticed; raises InputError if higher ones could."""
+    """Return whether neglecting cumulants beyond the third could be noticed.
+
+    Raises InputError if neglecting those beyond the fourth could be noticed.
+    """
     x, w = components.quiet, components.weights
     photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
     sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))

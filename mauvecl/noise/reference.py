@@ -430,7 +430,10 @@ def _split(
 
 
 def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:
-    """Draw dark counts, DN, (n_pixel, n_draw), given their sum with Gaussian noise, by inversion at `chance`."""
+    """Draw dark counts, DN, given their sum with a Gaussian of this variance, by inversion at `chance`.
+
+    All arrays have the shape (n_pixel, n_draw) but `step`, which has the shape (n_pixel,).
+    """
     dark = np.where((mean > 0) & (variance == 0), total, 0.0)
     for p in np.flatnonzero(mean.any(axis=1)):
         drawn = (mean[p] > 0) & (variance[p] > 0)

@@ -310,7 +310,10 @@ def _refine(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlare
 def _fit_single(
     window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, parts: Float | None = None
 ) -> list[Fit]:
-    """Fit a single flare with each departure of a family, from a first fit; `box` and `parts` are those of a grid."""
+    """Fit a single flare with each departure of a family, which follows from a first fit, `shape` and `flare`.
+
+    The grid begins from the range `box`; `parts` are the means of the family at its nodes, if they are known.
+    """
     durations = family.weights @ [part.equivalent_duration for part in family.parts]
     fits = []
     for epsilon in family.epsilon:

@@ -222,8 +222,8 @@ UNSEEN = 0.05
 def _find_kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
     """Return the kind of an event by its fits of published shapes, since the general family resembles all kinds.
 
-    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse; those of
-    spectra may lose light of all pixels during a flare.
+    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse. The sum
+    over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
     """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
     level, window = float(best.plain.level_without(best.light)), best.window
@@ -242,7 +242,10 @@ def _find_kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
 
 
 def _sum_light(survey: SeriesSurvey, in_events: Bool, level: Float, event: DetectedEvent) -> tuple[float, float]:
-    """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error."""
+    """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
+
+    Missing frames are interpolated. The error includes that of the level given the quiescent frames.
+    """
     rows = slice(event.first, event.last + 1)
     flux, numbers = survey.flux[rows] - level[rows], survey.stare.numbers[rows]
     all_numbers = np.arange(numbers[0], numbers[-1] + 1)

@@ -411,7 +411,10 @@ def _rotation(size: float, period: float) -> ProcessTerm:
 
 
 def _find_period(data: BinnedLightCurve, values: Float, share: float) -> float | None:
-    """Return the most significant period of values, s, up to a `share` of the length of the data; None for noise."""
+    """Return the period of the highest peak of a Lomb-Scargle periodogram in seconds, or None if it is noise.
+
+    The values may be residuals of the data; `share` is the longest period over the length of the data.
+    """
     from astropy.timeseries import LombScargle
 
     # Visits over years have few frames and many frequencies.

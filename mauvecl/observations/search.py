@@ -209,7 +209,10 @@ class ProcessSearch:
         return norm, share > IRREGULAR * diagonal * np.maximum(norm, IRREGULAR * unit), unit
 
     def _solve(self, row: Filter, chosen: Bool) -> None:
-        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved."""
+        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved.
+
+        Innovations of a template are neglected `MOST_MARGIN` frames after it.
+        """
         padded, size = np.pad(row.shape, 1), row.shape.size
         for covariance, norms, unsolved in zip(self.covariances, row.norms, row.unsolved, strict=True):
             onsets = np.flatnonzero(unsolved & chosen)
@@ -229,7 +232,10 @@ class ProcessSearch:
 
 @array_cache(maxsize=64)
 def _regular_solution(process: Process, variance: float, frame_s: float, shape: Float) -> Float:
-    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, (n, 2)."""
+    """Return C^-1 times a shape and a single frame in the middle, without gaps and with constant noise, shape (n, 2).
+
+    Searches of a light curve after each event ask for the same solutions.
+    """
     single = np.zeros(shape.size)
     single[shape.size // 2] = 1.0
     covariance = process.covariance(np.arange(float(shape.size)) * frame_s, np.full(shape.size, variance))

@@ -156,7 +156,10 @@ def survey_spectra(
 def _weighted_sums(
     cleaned: models.CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float]
 ) -> tuple[SpectralSeries, Templates, Float]:
-    """Return spectra less that of the star, weights for flares, and weighted sums, independent and of unit variance."""
+    """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
+
+    Sums have unit covariance from frame to frame, and change independently over longer times.
+    """
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[quiet].mean(axis=0)
     unknown, excess = model.unknowns(light), frames.flux - light

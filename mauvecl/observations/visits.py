@@ -215,7 +215,7 @@ def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None
     variance = float(np.sum(weights**2 * quiet.variance_dn2))
     if unknown:
         moved, free = unknown.spectra @ weights, np.isinf(unknown.sd)
-        if moved[free].any():
+        if np.any(np.abs(moved[free]) > 0):
             return float("inf")
         variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))
     return float(np.sqrt(variance))
@@ -240,7 +240,11 @@ class LineIndex:
 
 
 def _integral_of_line(x: Float, weight: Float, share: Float) -> Float:
-    """Return the factors of pixels in the integral over `share` of each of the line fitted to them, (..., n_pixel)."""
+    """Return the factors of pixels in the integral of the straight line fitted to them, shape (..., n_pixel).
+
+    It is a linear function of the pixels, by the weights of the least squares; `share` is the width of each pixel that
+    is integrated.
+    """
     design = np.stack([np.ones_like(x), x])
     normal = np.einsum("ap,...p,bp->...ab", design, weight, design)
     coefficients = np.linalg.solve(normal, (design @ share)[:, None])[..., 0]

@@ -79,7 +79,10 @@ SPELLED = {
 
 
 def with_unit(text: str, unit: str) -> float | None:
-    """Convert a number with a unit, such as "10 min"; return None for other text, raise ValueError for a wrong unit."""
+    """Read a number with its unit, such as "10 min" or "24%", and convert it; return None for any other text.
+
+    Raises ValueError if the unit is unknown or has no equivalent in `unit`.
+    """
     match = _MEASURE.fullmatch(text)
     if match is None:
         return None

@@ -156,7 +156,10 @@ class Section(Record):
         """Raise InputError if values contradict each other."""
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
-        """Return a copy with another value at a path of sections and a key, in each record of a list, such as stars."""
+        """Return a copy with another value at a path of sections and a key.
+
+        Each record of a list, such as stars, takes the value; a list of numbers is replaced by it.
+        """
         key, *inner = path
         old = getattr(self, key)
         if not inner:

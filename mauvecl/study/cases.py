@@ -140,7 +140,10 @@ def star_label(star: Star, x: Expectation) -> str:
 
 
 def place_columns(sweep: Sweep, *own: str) -> tuple[Column, ...]:
-    """Return the columns of the star and of swept quantities without a column of their `own`, for rows with `at`."""
+    """Return the columns of the star and of the swept quantities, for rows with the values `at` a cell of the sweep.
+
+    `own` names quantities for which a table has separate columns.
+    """
     return (star_column("label"), *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own))
 
 
@@ -305,7 +308,10 @@ class Case:
         return [expect(source, self.instrument, **options) for source in sources]
 
     def unknowns(self, quiet: Expectation | None = None) -> Nuisances | None:
-        """Return the nuisance parameters that statistics are marginalised over, with spectra of `quiet`, or None."""
+        """Return the nuisance parameters that statistics are marginalised over, or None.
+
+        Their spectra are those of `quiet`, by default the star without a flare.
+        """
         return self.study.nuisances.marginalised(self.quiet if quiet is None else quiet)
 
     def unknowns_of_fits(self, quiet: Expectation | None = None, stare: Stare | None = None) -> Nuisances | None:

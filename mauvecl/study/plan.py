@@ -346,7 +346,11 @@ def _check_band(rows: Rows, column: str | None, row: int) -> None:
 
 
 def _coordinates(rows: Rows, columns: dict[str, str | None], row: int, target: dict[str, Any]) -> str | None:
-    """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there."""
+    """Return the coordinates of a target in degrees from the columns ra and dec, or None if it has none there.
+
+    Raises InputError if only one of the two is given, if sexagesimal ones differ, and if a star without any is not in
+    the embedded list.
+    """
     from mauvecl.host.stars.library import by_key, name_key
 
     ra, dec = columns["ra"], columns["dec"]

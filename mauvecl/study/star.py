@@ -443,7 +443,10 @@ class Flare(Section):
     def energy_scale(
         self, star: Star, source: Source, kind: Kind, temperature_k: float | None = None
     ) -> EnergyScale | None:
-        """Return the energy of flares per second of equivalent duration; None if the star's size is unknown."""
+        """Return the energy of flares per second of equivalent duration, by default at the study's temperature.
+
+        It follows from the star's distance or else from its radius and temperature; None if neither is known.
+        """
         from mauvecl.flares.energies import EnergyScale
 
         flare: dict[str, Any] = {

@@ -98,7 +98,10 @@ def tables_in(data: Any) -> Iterator[dict[str, Any]]:
 
 
 def locate_files(data: dict[str, Any], table: Path) -> None:
-    """Locate the files that the study of an answer's table gives by name and digest, in place."""
+    """Locate the files that the study of an answer's table gives by name and digest, in place.
+
+    Search the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
+    """
     study = table.parent / "study.toml"
     for section in tables_in(data):
         for key in [key for key, name in section.items() if f"{key}_sha256" in section and isinstance(name, str)]:
@@ -505,7 +508,10 @@ StudyOf = TypeVar("StudyOf", bound=Study)
 def with_keywords(
     study: StudyOf, values: Mapping[str, Any], keywords: Mapping[str, Keyword], where: str, *, is_default: bool
 ) -> StudyOf:
-    """Return a study changed by the values of keywords; one that `is_default` has no star to describe."""
+    """Return a study changed by the values of keywords, as `values_of` returns them.
+
+    If the study `is_default`, keywords that describe a star must come with one that names it.
+    """
     if values.get("paper"):
         study = study.paper()
     changes: dict[str, dict[str, Any]] = {}
