@@ -105,11 +105,14 @@ def date_text(value: Any) -> Any:
         value = value.astimezone(datetime.UTC).replace(tzinfo=None)
     if isinstance(value, datetime.date):
         return value.isoformat()
-    if getattr(value, "ndim", 0):
+    if getattr(value, "ndim", 0) or not is_date(value):
         return value
-    if getattr(getattr(value, "dtype", None), "kind", "") == "M":
-        return str(value)
-    return str(value.utc.isot) if hasattr(value, "utc") and hasattr(value, "isot") else value
+    return str(value.utc.isot if hasattr(value, "isot") else value)
+
+
+def is_date(value: Any) -> bool:
+    """Return whether a value holds times of astropy or dates of NumPy, one or many."""
+    return hasattr(value, "isot") or getattr(getattr(value, "dtype", None), "kind", "") == "M"
 
 
 def is_table(value: Any) -> bool:

@@ -131,9 +131,8 @@ def plain(value: Any) -> Any:
     Quantities remain, since the type of a number converts them to its unit.
     """
     value = fields.date_text(value)
-    is_date = hasattr(value, "isot") or getattr(getattr(value, "dtype", None), "kind", "") == "M"
     is_array = bool(getattr(value, "ndim", 0))
-    if isinstance(value, list | tuple) or (is_array and (is_date or hasattr(value, "icrs"))):
+    if isinstance(value, list | tuple) or (is_array and (fields.is_date(value) or hasattr(value, "icrs"))):
         return (tuple if isinstance(value, tuple) else list)(map(plain, value))
     if fields.is_quantity(value):
         return list(map(plain, fields.as_quantity(value))) if is_array else value
