@@ -135,7 +135,7 @@ def test_skipped_snippets_exist_on_pages() -> None:
 NAMED = re.compile(
     r"`((?:(?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)|(?:\w+/[\w/]+\.py))(?::\s*(\w+))?[^`]*`"
 )
-ALL_PAGES = [*PAGES, ROOT / "CONTRIBUTING.md"]
+ALL_PAGES = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "RELEASING.md"]
 #: What defines a name, by a file's ending.
 DEFINITIONS = {".py": r"^\s*(?:def|class) {0}\b|^{0}\b.* = |^    {0}: ", ".mako": r"^(?:INLINE )?\w+ {0}\("}
 

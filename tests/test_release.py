@@ -140,7 +140,8 @@ def test_workflow_tests_every_python_and_pins_what_it_runs() -> None:
 FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "paper", "recipe", "tests", "tools")
 FILES = (
     ".dockerignore", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md",
-    "Dockerfile", "LICENSE", "Makefile", "README.md", "SECURITY.md", "SUPPORT.md", "environment.yml", "pyproject.toml",
+    "Dockerfile", "LICENSE", "Makefile", "README.md", "RELEASING.md", "SECURITY.md", "SUPPORT.md", "environment.yml",
+    "pyproject.toml",
 )  # fmt: skip
 MADE = ("__pycache__", "_build", "_generated", "commands", "jupyter_execute", ".ipynb_checkpoints", "*_cache",
         ".hypothesis", "node_modules")  # fmt: skip
