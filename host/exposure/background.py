@@ -37,7 +37,10 @@ YEARS = (1990, 2100)
 
 
 def parse_time(time: Time | str, name: str = "time") -> Time:
-    """Return a finite time between 1990 and 2100, `name` in errors; text is ISO 8601, UTC. Call inside `offline`."""
+    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC.
+
+    Messages call the argument by `name`. The function must be called inside `offline`.
+    """
     from astropy.time import Time
 
     moment = time if isinstance(time, Time) else date_text(time)

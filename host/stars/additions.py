@@ -109,7 +109,7 @@ class Collection:
     title: str
     citation: str
     base: str  # address of the files, from the archive's pages; not verified by the tests
-    # Path of a star's file below the base, from its name as in names of files and a function that lists the files.
+    # Path of a star's file below the base, from the star's name in names of files and a function that lists the files.
     file_of: Callable[[str, Callable[[], list[str]]], str]
 
 
@@ -157,9 +157,9 @@ def fetch(
 ) -> OwnStar:
     """Download a star from a public collection and keep it, as `add` does.
 
-    A name such as ``"HD 37202"`` is searched for in all collections, ``"ngsl:HD 37202"`` in one, of whose files `base`
-    may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end. Raises
-    InputError if the network fails, the star is unknown, or its file contains no usable spectrum.
+    A name such as ``"HD 37202"`` is searched for in all collections, and ``"ngsl:HD 37202"`` in a single one, for which
+    `base` may be the address of a mirror of its files. `extend` is a library spectrum that continues the star's beyond
+    its end. Raises InputError if the network fails, the star is unknown, or its file contains no usable spectrum.
     """
     word, colon, star = map(str.strip, name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
@@ -173,7 +173,7 @@ def fetch(
         raise InputError(f"star {name!r} has an empty name; give a name such as ngsl:HD 37202", key="name")
     for collection in chosen:
         try:
-            address = _folder(base or collection.base)
+            address = _folder_address(base or collection.base)
             url = urljoin(address, collection.file_of(plain, partial(_listing, address)))
             content = _download(url, limit_bytes("MAUVECL_LARGEST_FILE_MIB"), show_progress)
         except FileNotFoundError:
@@ -193,7 +193,7 @@ def fetch(
     raise InputError(f"{fault}; {remedy}", key="name")
 
 
-def _folder(address: str) -> str:
+def _folder_address(address: str) -> str:
     """Return an address that ends in a slash; raises InputError unless it is a URL of a supported scheme."""
     is_address = False
     with contextlib.suppress(ValueError):

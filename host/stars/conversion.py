@@ -109,6 +109,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> Spectr
 
 
 def _spectrum_of(table: SpectrumTable, words: Sequence[str]) -> SpectrumTable:
+    """Return a table with the spectrum, and its segments, in the columns and the row that the user's words select."""
     roles = table.roles
     names = [role.name for role in roles]
     columns = {key_of(name) for name in names} | {key_of(f"column {i + 1}") for i in range(len(names))}

@@ -39,7 +39,7 @@ GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
 def table_of_text(
     text: str, name: str, origin: str, words: Sequence[str], wavelength: bool, flux: bool
 ) -> SpectrumTable:
-    """Read the table of a text file, and the units of wavelength and flux in its header if requested."""
+    """Read the table of a text file; `wavelength` and `flux` say whether its header is searched for their units."""
     lines = text_tables.NumberLines(text, "wavelength and flux")
     if any(cell[:1] in ("(", "[") for cell in lines.cells[0]):
         return _table_of_arrays(MemoryTable(text_tables.text_table(text, "it", commas=True), "it"), name, origin)
@@ -229,7 +229,7 @@ class _Reader:
         self, number: int, columns: Sequence[Values], label: str = "", remarks: str = "",
         notes: tuple[str, ...] = (), row_names: Sequence[str] = (), group: str | None = None,
     ) -> SpectrumTable:  # fmt: skip
-        """Return the table of an extension, which users select by its number if they do so, else by its name."""
+        """Return the table of an extension, whose label is its number if the user selects it so, or else its name."""
         header, primary = self.hdus[number].header, self.primary
         headers = [primary] if primary is header else [primary, header]
         comments = [text_at(source, key) for source in headers for key in _REMARKS]

@@ -93,7 +93,7 @@ def limit_bytes(variable: str) -> int:
 
 
 def check_content(n_bytes: int, sentence: str) -> None:
-    """Raise InputError if content is larger than MAUVECL_LARGEST_CONTENT_MIB; the limit completes its sentence."""
+    """Raise InputError if content is larger than MAUVECL_LARGEST_CONTENT_MIB, which the end of its sentence states."""
     limit = "MAUVECL_LARGEST_CONTENT_MIB"
     if n_bytes > (most := limit_bytes(limit)):
         raise InputError(f"{sentence} {most >> 20} MiB; {limit} sets the limit", key=limit)
@@ -337,8 +337,8 @@ _QUOTED, _OPEN = re.compile(r'(?:^|(?<=[,;|\t ]))"(?:[^"]|"")*"(?=[,;|\t ]|$)'),
 
 
 def read_ecsv(path: str | Path, kind: str, remedy: str = "give an ECSV table") -> Table:
-    """Read an ECSV file; errors of its form end with the remedy."""
-    return parse_ecsv(*text_and_name(path, kind), remedy)
+    """Read an ECSV file; the message on one that cannot be parsed ends with the remedy."""
+    return parse_ecsv(*text_and_label(path, kind), remedy)
 
 
 def parse_ecsv(text: str, label: str, remedy: str = "give an ECSV table") -> Table:
@@ -369,8 +369,8 @@ class Numbers:
         return self.columns[name]
 
 
-def text_and_name(path: str | Path, kind: str) -> tuple[str, str]:
-    """Read the text of a file, and return it with the file's name for messages."""
+def text_and_label(path: str | Path, kind: str) -> tuple[str, str]:
+    """Read the text of a file, which may be compressed, and return it with the file's label for messages."""
     label = f"{kind} {shortened(str(path))}"
     return as_text(unpacked(read_bytes(Path(path), kind), label), label), label
 
@@ -425,7 +425,10 @@ def check_header(lines: list[str], label: str) -> None:
 
 
 def check_cells(lines: list[str], label: str) -> None:
-    """Raise InputError for cells that extend over lines, and for a wide line of many, whose width all would take."""
+    """Raise InputError for cells that extend over lines, for long lines, and for more content than may be read.
+
+    Arrays of texts give each line the width of the longest, so one wide line of many takes a large memory.
+    """
     widest = max(map(len, lines), default=0)
     shape = f"{len(lines)} lines, of which the longest has {widest} characters"
     check_content(widest * len(lines), f"{label} has {shape}; if all were as long, they must have at most")

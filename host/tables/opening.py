@@ -39,7 +39,7 @@ class LargeTable(TableFile):
         # One row has the names and units.
         self.table, self.n_rows, self.file = MemoryTable(first.table[:1], label), 0, file
         super().__init__(label, first.header, first.names, first.remarks)
-        self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
+        self.row = np.dtype([(name, "f8" if _are_numbers(first.find(name)) else f"U{CELL}") for name in first.names])
         tables = itertools.chain([first], (MemoryTable(piece, label) for piece in pieces))
         del first
         for table in tables:
@@ -80,8 +80,8 @@ class LargeTable(TableFile):
                       first.unit, self.label, self.row.itemsize, keywords=first.keywords)  # fmt: skip
 
 
-def _numbers(values: Values) -> bool:
-    """Return whether values are numbers, also as texts."""
+def _are_numbers(values: Values) -> bool:
+    """Return whether values are numbers, or texts of numbers."""
     try:
         values.numbers()
     except InputError:
@@ -192,7 +192,7 @@ def open_table(
             with open_fits(content, label, check=check) as hdus:
                 with files.reading(label, WHOLE):
                     table = of_fits(hdus, label)
-                yield _check_rows(table)
+                yield _not_empty(table)
         elif form == "HDF5" and of_hdf5 is not None:
             with of_hdf5(content, label) as stored:
                 yield stored
@@ -202,9 +202,9 @@ def open_table(
         elif form == "VOTable":
             if (first := next(votables(content.read(), label), None)) is None:
                 raise InputError(f"{label} has no table, but needs one", key="file")
-            yield _check_rows(first)
+            yield _not_empty(first)
         else:
-            yield _check_rows(MemoryTable(text_table(text_in(form, content.read(), label), label, commas), label))
+            yield _not_empty(MemoryTable(text_table(text_in(form, content.read(), label), label, commas), label))
 
 
 #: Forms of files that are not read, by their first bytes.
@@ -280,11 +280,12 @@ def votables(content: bytes, label: str) -> Iterator[MemoryTable]:
 
 
 def _parameters(parameters: Iterable[Any]) -> dict[str, Any]:
+    """Return the values of a VOTable's parameters by name."""
     return {str(parameter.name or parameter.ID): parameter.value for parameter in parameters}
 
 
-def _check_rows(file: TableFile) -> TableFile:
-    """Return a file; raise InputError if it has no rows."""
+def _not_empty(file: TableFile) -> TableFile:
+    """Return a file; raise InputError if it has neither a column nor an image."""
     if not file.names:
         fault = f"{file.label} has no table and no image"
         raise InputError(f"{fault}; give a row for each frame, star or flare", key="file")

@@ -49,7 +49,7 @@ SAMPLE = 50
 
 
 def read_columns(kind: str, noun: str, path: Path, unit: str = "") -> Float:
-    """Read times and values from a file, shape (n, 2), see `columns`; `kind` and `noun` name both in messages."""
+    """Read times and values from a file, shape (n, 2); see `columns`. `kind` and `noun` name file and values."""
     return columns(f"{kind} {shortened(path.name)}", read_text(path, kind), f"times and {noun}", unit)
 
 
@@ -153,7 +153,7 @@ def _first_row(lines: Sequence[tuple[int, str]]) -> float:
     starting = []
     for place, (number, line) in enumerate(lines):
         first = re.split(r"[\s;|]+|,\s|,(?=[^\d])", line.strip().strip("|").strip())[0]
-        if not _is_numeric(first.strip("\"'(")):
+        if not _begins_with_number(first.strip("\"'(")):
             continue
         starting.append(number)
         cells = re.split(r"[\s;|]+", line.strip())
@@ -162,12 +162,13 @@ def _first_row(lines: Sequence[tuple[int, str]]) -> float:
             # The numbers of rows and of other columns, as in POLARBASE's spectra.
             continue
         # A line of a preamble, such as "2 columns" or "912 s", has no second number.
-        if sum(_is_numeric(cell) or is_missing(cell) for cell in cells) > 1:
+        if sum(_begins_with_number(cell) or is_missing(cell) for cell in cells) > 1:
             return number
     return starting[0] if starting else float("inf")
 
 
-def _is_numeric(cell: str) -> bool:
+def _begins_with_number(cell: str) -> bool:
+    """Return whether a cell is a number, which brackets or marks may follow."""
     return _NUMBER.match(cell) is not None or cell.lower() in ("nan", "inf", "-inf")
 
 
@@ -253,7 +254,7 @@ def _divided(
         cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
     n = len(cells[at])
     is_row = all(map(_is_cell_of_row, cells[at]))
-    is_headed = not is_row and not any(map(_is_finite, cells[at])) and not _are_dashes(cells[at])
+    is_headed = not is_row and not any(map(_is_number, cells[at])) and not _are_dashes(cells[at])
     names, units = ([], []) if is_headed else _names_above(n, [*above, *lines[:at]], mark)
     if is_row and not names:
         if at:
@@ -262,17 +263,8 @@ def _divided(
         names = [f"col{k + 1}" for k in range(n)]
     elif not names:
         names, at = cells[at], at + 1
-    first, second = [*cells[at : at + 2], [], []][:2]
-    if _are_dashes(second) and not any(map(_is_finite, first)):
-        # VizieR writes units and dashes below the names.
-        units, at = first, at + 2
-    elif _are_dashes(first):
-        at += 1
-    elif not any(_is_cell_of_row(cell) and not is_missing(cell) for cell in first) and any(
-        _is_unit(cell) for cell, number in zip(first, second, strict=False) if _is_finite(number)
-    ):
-        # Units of the numbers below them.
-        units, at = first, at + 1
+    units_below, n_lines = _units_below(cells[at:])
+    units, at = units_below or units, at + n_lines
     if not mark and all(name.endswith(",") for name in names[:-1]):
         # Commas divide the names and blanks the rows.
         names = [name.rstrip(",") for name in names]
@@ -283,6 +275,20 @@ def _divided(
     stated_units = tuple(unit if is_stated(unit) else "" for unit in plain)
     decimal = _has_decimal_commas(cells[at:], label)
     return Layout(mark, decimal, tuple(_distinct(names)), stated_units, trailing), cells[at:]
+
+
+def _units_below(rows: list[list[str]]) -> tuple[list[str], int]:
+    """Return the units in the first lines below the names, and the number of these lines that hold no values."""
+    first, second = [*rows[:2], [], []][:2]
+    if _are_dashes(second) and not any(map(_is_number, first)):
+        # VizieR writes units and dashes.
+        return first, 2
+    if _are_dashes(first):
+        return [], 1
+    if any(_is_cell_of_row(cell) and not is_missing(cell) for cell in first):
+        return [], 0
+    has_units = any(_is_unit(cell) for cell, number in zip(first, second, strict=False) if _is_number(number))
+    return (first, 1) if has_units else ([], 0)
 
 
 def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
@@ -332,7 +338,7 @@ def _mark(lines: Sequence[str], commas: bool) -> str:
         scores[mark] = counts.most_common(1)[0][1] if counts else 0
     best = max(MARKS, key=scores.__getitem__)
     words = [line.split() for line in sample[-5:]]
-    blanks = all(len(row) > 1 and all(map(_is_finite, row)) for row in words) and bool(words)
+    blanks = all(len(row) > 1 and all(map(_is_number, row)) for row in words) and bool(words)
     if commas and not (blanks and best == ","):
         return best if scores[best] else "," if not blanks else ""
     # Commas may stand in prose, and decimal commas between columns that blanks divide.
@@ -425,10 +431,10 @@ def _distinct(names: list[str]) -> list[str]:
 
 def _is_cell_of_row(cell: str) -> bool:
     """Return whether a cell is a number, a date or missing, and thus not a name."""
-    return is_dated(cell) or is_missing(cell) or _is_finite(cell)
+    return is_dated(cell) or is_missing(cell) or _is_number(cell)
 
 
-def _is_finite(cell: str) -> bool:
+def _is_number(cell: str) -> bool:
     """Return whether a cell is a number that is not missing."""
     try:
         return not np.isnan(number_in(cell))

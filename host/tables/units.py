@@ -114,6 +114,7 @@ def _scale_and_name(name: str) -> tuple[float, str]:
 
 
 def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
+    """Parse the name of a unit that is no logarithm; messages quote the `text` and what was `expected` instead."""
     import astropy.units as u
 
     unknown = InputError.of("unit", text.strip(), f"a known unit: {expected}")
