@@ -328,7 +328,7 @@ class Instrument(Section):
         last = min((curve.wavelength_nm[-1] for curve in curves), default=self.output_max_nm)
         return first, last
 
-    def _covered(self, wavelength_nm: ArrayLike, held: bool = False) -> Float:
+    def _in_range(self, wavelength_nm: ArrayLike, held: bool = False) -> Float:
         """Return wavelengths as an array; raise InputError outside the curves, or if `held` for impossible ones."""
         low, high = (0.0, np.inf) if held else self.curves_nm
         nm = np.asarray(wavelength_nm, np.float64)
@@ -343,7 +343,7 @@ class Instrument(Section):
         This is the paper's efficiency times (1 - pointing_loss), in the shape of the wavelengths, a Quantity or numbers
         in nm. Raises InputError outside the curves (`curves_nm`).
         """
-        return self._optics(self._covered(wavelength_nm))
+        return self._optics(self._in_range(wavelength_nm))
 
     def _optics(self, wavelength_nm: Float) -> Float:
         losses = (1 - self.coupling_loss) ** self.couplings * (1 - self.light_loss) * (1 - self.pointing_loss)
@@ -368,7 +368,7 @@ class Instrument(Section):
         This is the sensitivity in A/W times the photon's energy divided by the electron's charge. Parameters and errors
         as for `efficiency`.
         """
-        nm = self._covered(wavelength_nm)
+        nm = self._in_range(wavelength_nm)
         return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
 
     def throughput(self, wavelength_nm: Wavelengths) -> Float:
@@ -399,7 +399,7 @@ class Instrument(Section):
         Wavelengths and errors as for `efficiency`; if `held`, curves keep their end values beyond their ends (an
         assumption) instead of raising InputError.
         """
-        nm = self._covered(wavelength_nm, held)
+        nm = self._in_range(wavelength_nm, held)
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
         return self.collecting_area_cm2 * per_joule
 

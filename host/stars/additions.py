@@ -95,7 +95,7 @@ def _path_of(name: str, *, replace: bool) -> Path:
 TIMEOUT_S = 20.0
 #: Schemes of an address; a local file is added, not downloaded.
 SCHEMES = ("http", "https", "ftp")
-#: Longest duration of a download, s: the largest file of `size_limits.LIMITS` at 0.5 MB/s.
+#: Longest duration of a download, s: the largest file of `files.LIMITS` at 0.5 MB/s.
 MAX_DOWNLOAD_S = 600.0
 #: Largest size of a listing, bytes.
 MAX_LISTING_BYTES = 20 * 2**20

@@ -117,7 +117,7 @@ class NumberLines:
         self.cells = _split(rows, mark)
         self.n = len(self.cells[0])
         if _has_decimal_commas(self.cells, "it"):
-            self.cells = _with_points(self.cells)
+            self.cells = _replace_decimal_commas(self.cells)
             self.messages.append(DECIMAL_COMMAS)
         are_whole = all(len(row) > 1 and row[1].isdecimal() and "." not in "".join(row) for row in self.cells[:SAMPLE])
         if mark == "," and len(rows) > 1 and are_whole:
@@ -212,14 +212,14 @@ def rows_of_text(
     is_comment = [bool(_COMMENT.match(line)) and not marked.match(line.removeprefix("#")) for line in lines]
     data = [line for line, comment in zip(lines, is_comment, strict=True) if not comment]
     comments = [line for line, comment in zip(lines, is_comment, strict=True) if comment]
-    cells = _with_dates(_split(data, mark))
+    cells = _join_dates(_split(data, mark))
     if layout is None:
         n_above = next((k for k, comment in enumerate(is_comment) if not comment), len(lines))
-        layout, cells = _divided(cells, [_remark(line) for line in lines[:n_above]], data, mark, label)
+        layout, cells = _find_columns(cells, [_remark(line) for line in lines[:n_above]], data, mark, label)
     elif layout.trailing:
         cells = [row[:-1] for row in cells]
     if layout.decimal:
-        cells = _with_points(cells)
+        cells = _replace_decimal_commas(cells)
     n = len(layout.names)
     if odd := next(((number, len(row)) for number, row in enumerate(cells, first + 1) if len(row) != n), None):
         # The file may be cut short.
@@ -237,7 +237,7 @@ def rows_of_text(
     return table, layout
 
 
-def _divided(
+def _find_columns(
     cells: list[list[str]], above: list[str], lines: list[str], mark: str, label: str
 ) -> tuple[Layout, list[list[str]]]:
     """Find the names and units of columns, and return them with the rows."""
@@ -274,7 +274,7 @@ def _divided(
     plain = [in_brackets(unit.strip("\"'")) for unit in units]
     stated_units = tuple(unit if is_stated(unit) else "" for unit in plain)
     decimal = _has_decimal_commas(cells[at:], label)
-    return Layout(mark, decimal, tuple(_distinct(names)), stated_units, trailing), cells[at:]
+    return Layout(mark, decimal, tuple(_distinct_names(names)), stated_units, trailing), cells[at:]
 
 
 def _units_below(rows: list[list[str]]) -> tuple[list[str], int]:
@@ -293,11 +293,11 @@ def _units_below(rows: list[list[str]]) -> tuple[list[str], int]:
 
 def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
     """Return the names in the last line above the rows, and the units in it or below it; empty without names."""
-    numbered = numbered_names((line for line in above if line.lower().startswith("col")), n)
+    numbered = names_by_number((line for line in above if line.lower().startswith("col")), n)
     if len(numbered) > 1:
         return [numbered.get(k, f"col{k + 1}") for k in range(n)], []
     last = ["", "", *above][-2:]
-    names, units = ([] if keywords_of([f"#{line}"]) else divided_names(line, n, mark) for line in last)
+    names, units = ([] if keywords_of([f"#{line}"]) else divide_names(line, n, mark) for line in last)
     if names and units and all(_is_unit(cell) for cell in units if is_stated(cell)):
         return names, units
     return units, []
@@ -370,7 +370,7 @@ def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
         return [list(map(plain, row)) for row in rows]
 
 
-def _with_dates(cells: list[list[str]]) -> list[list[str]]:
+def _join_dates(cells: list[list[str]]) -> list[list[str]]:
     """Join dates with the times of day next to them, under the names of the dates."""
     last = cells[-1] if cells else []
     for at in range(len(last) - 1):
@@ -394,19 +394,19 @@ def _has_decimal_commas(rows: list[list[str]], label: str) -> bool:
     return True
 
 
-def _with_points(rows: list[list[str]]) -> list[list[str]]:
+def _replace_decimal_commas(rows: list[list[str]]) -> list[list[str]]:
     """Return cells with points for decimal commas."""
     return [[cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in row] for row in rows]
 
 
-def divided_names(line: str, n: int, mark: str = "") -> list[str]:
+def divide_names(line: str, n: int, mark: str = "") -> list[str]:
     """Divide a line of a header into a name for each of `n` columns; return an empty list if it has another number."""
     if n < 2 or PROSE.search(line):
         return []
     line = re.sub(r"^\s*(?:units?(?:\s*[:=]|\s)|(?:columns?|names?)\s*[:=])\s*", "", line, flags=re.IGNORECASE)
     divisions = [line.strip("|").split(divider) for divider in ((mark,) if mark else ",;|\t") if divider in line]
     if not mark:
-        divisions += [bracketed(line), line.split(), re.split(r"\s{2,}", line.strip())]
+        divisions += [divide_outside_brackets(line), line.split(), re.split(r"\s{2,}", line.strip())]
     for division in divisions:
         cells = [cell.strip().strip("\"'").strip() for cell in division]
         if len(cells) == n and any(cells):
@@ -415,13 +415,13 @@ def divided_names(line: str, n: int, mark: str = "") -> list[str]:
     return []
 
 
-def bracketed(line: str) -> list[str]:
+def divide_outside_brackets(line: str) -> list[str]:
     """Divide at blanks and commas, but keep a unit in brackets with the preceding name."""
     brackets = r"[\[(](?:[^\[\]()]|\([^()]*\))*[\])]"
     return re.findall(rf"[^\s\[(,]+(?:\s+in\s+[^\s,]+|(?:\s*{brackets})+[^\s,]*)?|{brackets}", line)
 
 
-def _distinct(names: list[str]) -> list[str]:
+def _distinct_names(names: list[str]) -> list[str]:
     """Name columns that have no name, and number names that occur twice."""
     names = [name or f"col{k + 1}" for k, name in enumerate(names)]
     while twice := [name for name, count in Counter(names).items() if count > 1]:
@@ -456,7 +456,7 @@ def _is_unit(text: str) -> bool:
 _NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-]?\s+(.+)", re.IGNORECASE)
 
 
-def numbered_names(lines: Iterable[str], n: int) -> dict[int, str]:
+def names_by_number(lines: Iterable[str], n: int) -> dict[int, str]:
     """Return the names that lines such as "column 2: flux" give to some of `n` columns, by place."""
     names: dict[int, str] = {}
     for line in lines:
