@@ -173,7 +173,7 @@ STEP_DEG = 15.0
 
 @lru_cache(maxsize=1)
 def zodiacal_table() -> Float:
-    """Return the table of the MauveSim paper, V mag arcsec^-2; NaN in the solar avoidance zone.
+    """Return the table of the MauveSim paper, V mag arcsec^-2, shape (13, 7); NaN in the solar avoidance zone.
 
     Rows are longitudes from 0 to 180 deg, columns are latitudes from 0 to 90 deg.
     """
@@ -325,7 +325,7 @@ class Neighbours:
         return [f"{text}; {beyond}." if outside else f"{text}.", *same, *chosen, *self.notes]
 
 
-#: Cached since flares and sweep values of a star have the same neighbours.
+# Cached, since the flares and sweep values of a star have the same neighbours.
 @lru_cache(maxsize=4096)
 def rate_of(neighbour: Neighbour, instrument: Instrument, order: Order) -> Float:
     """Return the mean electrons per second of a neighbour if all of its light enters, shape (n_pixel,)."""

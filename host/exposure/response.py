@@ -83,7 +83,7 @@ def electrons_per_second(
         fault = f"flux needs one value per wavelength, but has {flux.size} values for {nodes.size} wavelengths"
         raise InputError(fault, key="flux")
     if nodes.size <= MATRIX_NODES:
-        return cast(Float, response_matrix(instrument, nodes, order) @ flux)
+        return cast(Float, _response(instrument, nodes.tobytes(), order) @ flux)
     # Efficiencies act at the wavelength of the light, or else at that of the pixel.
     by_light = instrument if order == "physical" else None
     landing, terms = _factors(LineSpread.of(instrument), nodes, by_light)

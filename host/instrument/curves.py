@@ -300,7 +300,7 @@ class ThroughputErrors(ContentEquality):
         return f"ThroughputErrors({self.digest})"
 
     def at(self, wavelength_nm: ArrayLike) -> Float:
-        """Return the modes at wavelengths in nm, one row per mode."""
+        """Return the modes at wavelengths in nm, shape (n_mode, ...) with that of `wavelength_nm`."""
         nm = np.asarray(wavelength_nm, np.float64)
         return np.array([np.interp(nm, self.wavelength_nm, mode) for mode in self.modes]).reshape(-1, *nm.shape)
 

@@ -34,11 +34,12 @@ def add(
     flux_unit: str | None = None,
     extend: str | None = None,
 ) -> OwnStar:
-    """Keep a spectrum from a file, as `Source.read` reads it, under a name: by default that in its header or its own.
+    """Keep the spectrum of a file among the user's own stars, which are found by name like those of the library.
 
-    Reports state its `origin`, by default the file name. With `replace`, a kept star of the same name is replaced.
-    Raises InputError if the file contains no usable spectrum, the name is taken or invalid, or the folder cannot be
-    written.
+    `Source.read` reads the file, to which the units and `extend` are passed on. The name is by default that in the
+    file's header, or else that of the file; reports state the `origin`, by default the name of the file. With
+    `replace`, a kept star of the same name is replaced. Raises InputError if the file contains no usable spectrum, the
+    name is taken or invalid, or the folder cannot be written.
     """
     from astropy.table import Table
 
@@ -159,7 +160,8 @@ def fetch(
 
     A name such as ``"HD 37202"`` is searched for in all collections, and ``"ngsl:HD 37202"`` in a single one, for which
     `base` may be the address of a mirror of its files. `extend` is a library spectrum that continues the star's beyond
-    its end. Raises InputError if the network fails, the star is unknown, or its file contains no usable spectrum.
+    its end. The terminal shows the progress unless `show_progress` is false. Raises InputError if the network fails,
+    the star is unknown, or its file contains no usable spectrum.
     """
     word, colon, star = map(str.strip, name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)

@@ -294,6 +294,7 @@ class FlareWithLines(FlareSpectrum):
 
     @property
     def continuum_flux(self) -> float:
+        """Flux of the continuum in 200-700 nm, erg s-1 cm-2, to which the fractions refer."""
         at = self.continuum.grid(np.linspace(*NEEDED_NM, RANGE_POINTS))
         return 10.0 * float(np.trapezoid(self.continuum.flux(at), at))
 
@@ -314,6 +315,7 @@ class FlareWithLines(FlareSpectrum):
 
 
 def _sum_of_lines(fluxes: Mapping[str, float], wavelength_nm: Float) -> Float:
+    """Return the spectrum of lines that have these fluxes by name, per Angstrom, shape (n,)."""
     lines = (value * EmissionLine.named(name).profile(wavelength_nm) for name, value in fluxes.items())
     return sum(lines, np.zeros(np.shape(wavelength_nm)))
 

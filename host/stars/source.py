@@ -182,7 +182,7 @@ class Source(Drawable, ContentEquality):
         )  # fmt: skip
 
     def binned(self, width_nm: BinWidth) -> Self:
-        """Return the spectrum averaged over bins, 0.01 to 50 nm wide from its first wavelength on, with less noise."""
+        """Return the spectrum averaged over bins of 0.01 to 50 nm from its first wavelength, which reduces noise."""
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
         edges = np.append(np.arange(first, last - width_nm / 2, width_nm), last)
         flux = points.mean_fluxes(self.wavelength_nm, self.flux_flam, edges)

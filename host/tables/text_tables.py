@@ -90,19 +90,25 @@ def _in_unit(values: Float, header: str, unit: str) -> Float:
 
 
 class NumberLines:
-    """Header and rows of a text that should hold the `expected` numbers; columns are parsed when they are read."""
+    """Header and rows of a text of numbers, which `expected` names in messages; columns are parsed when they are read.
+
+    Unlike `rows_of_text`, it takes every line above the first row of numbers for a header, which may be prose, and
+    columns that nobody reads may hold anything.
+    """
 
     def __init__(self, text: str, expected: str) -> None:
         self.expected = expected
-        #: Lines above the rows without their marks, and all comments, and whether each is one.
+        #: Lines above the rows, and all comments without their marks; whether each is a comment.
         self.header: list[tuple[str, bool]] = []
-        #: Number and text of the line of each row, and messages on how these are read.
+        #: Number and text of the line of each row.
         self.lines: list[tuple[int, str]] = []
+        #: Statements on how the rows are read.
         self.messages: list[str] = []
         numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if not _RULE.fullmatch(line)]
         comments = {number for number, line in numbered if _COMMENT.match(line) and not _BARRED.match(line)}
         start = _first_row([(number, line) for number, line in numbered if number not in comments])
         for number, line in numbered:
+            # A heading between marks, as of IPAC, stands above the rows.
             if number in comments and not (line.lstrip()[0] == "|" and self.lines):
                 self.header.append((_remark(line), True))
             elif number < start:
