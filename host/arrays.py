@@ -142,7 +142,7 @@ Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
 #: Largest number of threads that work at the same time; each may hold large arrays.
-MOST_THREADS = 4
+MAX_THREADS = 4
 
 
 def map_in_threads(
@@ -153,10 +153,10 @@ def map_in_threads(
 ) -> Generator[Answer]:
     """Apply a function to items in several threads and yield the results in order; one per thread may wait in memory.
 
-    The number of threads is by default that of the cores, up to `MOST_THREADS`; one works in the caller's thread.
+    The number of threads is by default that of the cores, up to `MAX_THREADS`; one works in the caller's thread.
     `stop` ends work in progress if it fails or no more results are needed; without it, that work is awaited.
     """
-    number = number or min(os.cpu_count() or 1, MOST_THREADS)
+    number = number or min(os.cpu_count() or 1, MAX_THREADS)
     if number == 1:
         yield from map(work, items)
         return

@@ -37,7 +37,10 @@ YEARS = (1990, 2100)
 
 
 def parse_time(time: Time | str, name: str = "time") -> Time:
-    """Return a finite time between 1990 and 2100, `name` in errors; text is ISO 8601, UTC. Call inside `offline`."""
+    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC.
+
+    Messages call the argument by `name`. The function must be called inside `offline`.
+    """
     from astropy.time import Time
 
     moment = time if isinstance(time, Time) else date_text(time)
@@ -170,7 +173,7 @@ STEP_DEG = 15.0
 
 @lru_cache(maxsize=1)
 def zodiacal_table() -> Float:
-    """Return the table of the MauveSim paper, V mag arcsec^-2; NaN in the solar avoidance zone.
+    """Return the table of the MauveSim paper, V mag arcsec^-2, shape (13, 7); NaN in the solar avoidance zone.
 
     Rows are longitudes from 0 to 180 deg, columns are latitudes from 0 to 90 deg.
     """
@@ -207,7 +210,7 @@ def zodiacal_brightness(
 #: Distance up to which a message warns that a row of a table may be the target itself, arcsec.
 SAME_STAR_ARCSEC = 2.0
 #: Largest number of neighbours that a message names.
-MOST_NAMED = 4
+MAX_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,14 +308,14 @@ class Neighbours:
         beyond = "1 star beyond does not enter" if outside == 1 else f"{outside} stars beyond do not enter"
         if not inside:
             return [f"NEIGHBOURS of {target}: none within {radius:g} arcsec; {beyond}.", *self.notes]
-        named = ", ".join(f"{star.name} at {star.separation_arcsec:.3g} arcsec" for star in inside[:MOST_NAMED])
-        named += f" and {len(inside) - MOST_NAMED} more" if len(inside) > MOST_NAMED else ""
+        named = ", ".join(f"{star.name} at {star.separation_arcsec:.3g} arcsec" for star in inside[:MAX_NAMED])
+        named += f" and {len(inside) - MAX_NAMED} more" if len(inside) > MAX_NAMED else ""
         stars = "1 star" if len(inside) == 1 else f"{len(inside)} stars"
         text = f"NEIGHBOURS of {target}: the light of {stars} within {radius:g} arcsec is in the fibre ({named})"
         text += f"; assumption: {100 * self.share:g} % of it enters"
         chosen = [f"Light of {star.name}, {star.spectrum[1]}." for star in inside if star.spectrum[1]]
-        if len(chosen) > MOST_NAMED:
-            chosen = [*chosen[:MOST_NAMED], f"Spectra of {len(chosen) - MOST_NAMED} more neighbours are chosen alike."]
+        if len(chosen) > MAX_NAMED:
+            chosen = [*chosen[:MAX_NAMED], f"Spectra of {len(chosen) - MAX_NAMED} more neighbours are chosen alike."]
         same = [
             f"{star.name} is {star.separation_arcsec:.2g} arcsec from {target} and counts as a neighbour: if it is the "
             "star itself, name its row in star.neighbours_of."
@@ -322,7 +325,7 @@ class Neighbours:
         return [f"{text}; {beyond}." if outside else f"{text}.", *same, *chosen, *self.notes]
 
 
-#: Cached since flares and sweep values of a star have the same neighbours.
+# Cached, since the flares and sweep values of a star have the same neighbours.
 @lru_cache(maxsize=4096)
 def rate_of(neighbour: Neighbour, instrument: Instrument, order: Order) -> Float:
     """Return the mean electrons per second of a neighbour if all of its light enters, shape (n_pixel,)."""
@@ -359,7 +362,7 @@ NEIGHBOUR_COLUMNS = (
 )  # fmt: skip
 _KEYS = {names.key_of(name) for name in (*NEIGHBOUR_COLUMNS, "target_separation")}
 #: Largest number of rows; a fibre holds far fewer stars.
-MOST_ROWS = 100_000
+MAX_ROWS = 100_000
 
 
 def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[Neighbour, ...], tuple[str, ...]]:
@@ -379,8 +382,8 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     path = Path(path)
     named = f"table of neighbours {shortened(path.name)}"
     table = Rows(read_table(path, "table of neighbours"), named, "neighbours")
-    if not 1 <= table.n <= MOST_ROWS:
-        raise InputError(f"{named} must contain 1 to {MOST_ROWS} stars, not {table.n}", key="neighbours")
+    if not 1 <= table.n <= MAX_ROWS:
+        raise InputError(f"{named} must contain 1 to {MAX_ROWS} stars, not {table.n}", key="neighbours")
     name = table.first(names.STARS)
     titles = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
     target_row = None if target is None or target.strip() not in titles else titles.index(target.strip())

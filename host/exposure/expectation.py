@@ -21,7 +21,7 @@ from mauvecl.host.exposure.response import Order, electrons_per_second, negative
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT
 from mauvecl.host.instrument.instrument import Instrument, LineSpread
 from mauvecl.host.stars.source import Source, check_covers, listed_star
-from mauvecl.host.stars.spectrum import continued
+from mauvecl.host.stars.spectrum import continue_ends
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, Drawable, number, table_of
 from mauvecl.schema.errors import InputError, Message, counted, missing_package
@@ -431,9 +431,9 @@ def expect(
     provenance |= {} if neighbours is None else neighbours.provenance(instrument)
     x = Expectation(
         **_detector(instrument),
-        source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
+        source_electrons=_check_brightness(np.maximum(electrons, 0.0), source.name),
         sky_electrons=nothing if zodiacal is None else _electrons_per_frame(zodiacal, instrument, order).clip(0.0),
-        neighbour_electrons=_faint_enough(near, "a neighbour"),
+        neighbour_electrons=_check_brightness(near, "a neighbour"),
         n_frames=n_frames, signal=signal, name=source.name, provenance=provenance,
     )  # fmt: skip
     drawn = np.sqrt(x.variance_dn2) / (n_frames * x.gain_dn_per_electron)
@@ -513,7 +513,7 @@ def _remarks(x: Expectation, exposure: float, source: Source, instrument: Instru
 def continued_to_reach(source: Source, instrument: Instrument) -> Source:
     """Continue the dark ends of a source as far as the instrument's line spread function reaches."""
     range_nm, line = (instrument.output_min_nm, instrument.output_max_nm), LineSpread.of(instrument)
-    nm, flux, messages = continued(source.name, source.wavelength_nm, source.flux_flam, range_nm, line)
+    nm, flux, messages = continue_ends(source.name, source.wavelength_nm, source.flux_flam, range_nm, line)
     if not messages:
         return source
     return replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
@@ -522,7 +522,7 @@ def continued_to_reach(source: Source, instrument: Instrument) -> Source:
 #: Fraction of exposures with a saturated frame, and of frames below zero, from which a message reports it.
 REPORTED_CLIPPING = 1e-4
 #: Largest number of runs of saturated pixels that a message names one by one.
-MOST_RUNS = 3
+MAX_RUNS = 3
 
 
 def entirely_saturated(x: Expectation, key: str) -> InputError:
@@ -552,14 +552,14 @@ def _saturation(x: Expectation) -> list[str]:
     # First and last wavelength of each run of saturated pixels.
     runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in true_runs(x.saturated)]
     where = ", ".join(runs)
-    if len(runs) > MOST_RUNS:
+    if len(runs) > MAX_RUNS:
         where = f"{len(runs)} intervals between {runs[0].partition('-')[0]} and {runs[-1].partition('-')[2]}"
     pixels = f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels of {name} at {where} nm reach"
     reached = f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame; the longest safe frame is {safe_s:g} s"
     return [Message(f"{pixels} {reached}.", "saturated")]
 
 
-def _faint_enough(electrons: Float, name: str) -> Float:
+def _check_brightness(electrons: Float, name: str) -> Float:
     """Return the mean electrons of a frame; raise InputError if a star is too bright for any pixel."""
     if (electrons > MAX_PER_FRAME).any():
         remark = " (at 1 au it has V = -26.76, Willmer 2018)" if name == "Sun" else ""

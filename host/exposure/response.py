@@ -83,18 +83,17 @@ def electrons_per_second(
         fault = f"flux needs one value per wavelength, but has {flux.size} values for {nodes.size} wavelengths"
         raise InputError(fault, key="flux")
     if nodes.size <= MATRIX_NODES:
-        return cast(Float, response_matrix(instrument, nodes, order) @ flux)
+        return cast(Float, _response(instrument, nodes.tobytes(), order) @ flux)
     # Efficiencies act at the wavelength of the light, or else at that of the pixel.
     by_light = instrument if order == "physical" else None
-    line = LineSpread.of(instrument)
-    gathered = np.sum([term @ flux for term in _gathering(line, nodes, by_light)], axis=0)
-    rate = _line_landing(line, _knots(by_light)) @ gathered
+    landing, terms = _factors(LineSpread.of(instrument), nodes, by_light)
+    rate = landing @ np.sum([term @ flux for term in terms], axis=0)
     return np.asarray(rate if by_light else rate * _efficiencies(instrument))
 
 
 @lru_cache(maxsize=8)
 def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
-    """Return the cached matrix of an instrument for nodes, which are bytes."""
+    """Return the response matrix for nodes, given as bytes so that the matrix can be cached."""
     by_light = instrument if order == "physical" else None
     matrix = _product(LineSpread.of(instrument), nodes, by_light)
     if by_light:
@@ -109,9 +108,15 @@ def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
 @lru_cache(maxsize=8)
 def _product(line: LineSpread, nodes: bytes, by_light: Instrument | None) -> csr_array:
     """Return the product of both factors; in the paper's order, without the efficiencies."""
-    first, *terms = _gathering(line, np.frombuffer(nodes, np.float64), by_light)
-    gathering = sum(terms, first)
-    return _read_only(csr_array(_line_landing(line, _knots(by_light)) @ gathering))
+    landing, (first, *terms) = _factors(line, np.frombuffer(nodes, np.float64), by_light)
+    return _read_only(csr_array(landing @ sum(terms, first)))
+
+
+def _factors(line: LineSpread, nodes: Float, by_light: Instrument | None) -> tuple[csr_array, Iterator[csr_array]]:
+    """Return the first factor of the matrix, and the terms whose sum is the second."""
+    # The integrand's slope jumps at the knots of the efficiency curves, which must not lie within a panel.
+    knots = by_light.knots_nm if by_light else ()
+    return _line_landing(line, knots), _gathering(line.panel_edges(np.array(knots)), nodes, by_light)
 
 
 def _efficiencies(instrument: Instrument) -> Float:
@@ -137,13 +142,13 @@ def _line_landing(line: LineSpread, knots: tuple[float, ...]) -> csr_array:
     return _read_only(csr_array((values, columns, indptr), shape=(centres.size, nodes.size)))
 
 
-def _gathering(line: LineSpread, wavelength: Float, by_light: Instrument | None) -> Iterator[csr_array]:
+def _gathering(panels: Float, wavelength: Float, by_light: Instrument | None) -> Iterator[csr_array]:
     """Yield the terms of the second factor of the matrix, each of shape (n_panel_node, n_wavelength).
 
     An entry is the integral (nm) over a panel of one of its Lagrange polynomials times the hat function of a node, and
     times the efficiency in the physical order. A term has many cells, each within one panel and between two nodes.
+    `panels` are the edges of the panels, shape (n_panel + 1,), and `wavelength` the nodes, nm.
     """
-    panels = line.panel_edges(np.array(_knots(by_light)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])
     shape = ((panels.size - 1) * PANEL_NODES, wavelength.size)
     if not low < high:
@@ -181,12 +186,8 @@ def _read_only(matrix: csr_array) -> csr_array:
     return matrix
 
 
-def _knots(by_light: Instrument | None) -> tuple[float, ...]:
-    """Return the wavelengths at which the instrument's curves make the integrand's slope jump."""
-    return by_light.knots_nm if by_light else ()
-
-
 def _nodes(wavelength_nm: ArrayLike) -> Float:
+    """Return the nodes of a flux as an array; raise InputError unless they are finite and strictly increasing."""
     nodes = np.ascontiguousarray(wavelength_nm, np.float64)
     if nodes.ndim != 1 or nodes.size < 2 or not np.isfinite(nodes).all() or not (np.diff(nodes) > 0).all():
         fault = "a spectrum must have at least two finite, strictly increasing wavelengths, in nm"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mauvecl.host.arrays import ContentEquality, Float, set_read_only
-from mauvecl.host.tables.files import Numbers, parse_numbers, text_and_name
+from mauvecl.host.tables.files import Numbers, parse_numbers, text_and_label
 from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -27,7 +27,7 @@ def _opened(path: str | Path, title: str) -> Iterator[tuple[Numbers, str]]:
 
     Errors that are raised in the block begin with the name of the file.
     """
-    table = parse_numbers(*text_and_name(path, title))
+    table = parse_numbers(*text_and_label(path, title))
     source = table.meta.get("source", f"assumed, no source in {Path(path).name}")
     try:
         yield table, f"{table.meta.get('tag', 'A')}: {source}"
@@ -300,7 +300,7 @@ class ThroughputErrors(ContentEquality):
         return f"ThroughputErrors({self.digest})"
 
     def at(self, wavelength_nm: ArrayLike) -> Float:
-        """Return the modes at wavelengths in nm, one row per mode."""
+        """Return the modes at wavelengths in nm, shape (n_mode, ...) with that of `wavelength_nm`."""
         nm = np.asarray(wavelength_nm, np.float64)
         return np.array([np.interp(nm, self.wavelength_nm, mode) for mode in self.modes]).reshape(-1, *nm.shape)
 

@@ -39,7 +39,10 @@ MAX_EXTENDED = 16
 
 
 def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
-    """Return value and source of an entry: a value, a table of value, tag and source, or a path, whose file has it."""
+    """Return value and source of an entry, which is a value or a table of value, tag and source.
+
+    The source of a path is empty, since the file states it.
+    """
     source = f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
@@ -325,8 +328,9 @@ class Instrument(Section):
         last = min((curve.wavelength_nm[-1] for curve in curves), default=self.output_max_nm)
         return first, last
 
-    def _within(self, wavelength_nm: ArrayLike, low: float, high: float) -> Float:
-        """Return wavelengths; raises InputError outside a range."""
+    def _in_range(self, wavelength_nm: ArrayLike, held: bool = False) -> Float:
+        """Return wavelengths as an array; raise InputError outside the curves, or if `held` for impossible ones."""
+        low, high = (0.0, np.inf) if held else self.curves_nm
         nm = np.asarray(wavelength_nm, np.float64)
         outside = ~((nm >= low) & (nm <= high) & np.isfinite(nm))
         if outside.any():
@@ -339,7 +343,7 @@ class Instrument(Section):
         This is the paper's efficiency times (1 - pointing_loss), in the shape of the wavelengths, a Quantity or numbers
         in nm. Raises InputError outside the curves (`curves_nm`).
         """
-        return self._optics(self._within(wavelength_nm, *self.curves_nm))
+        return self._optics(self._in_range(wavelength_nm))
 
     def _optics(self, wavelength_nm: Float) -> Float:
         losses = (1 - self.coupling_loss) ** self.couplings * (1 - self.light_loss) * (1 - self.pointing_loss)
@@ -364,7 +368,7 @@ class Instrument(Section):
         This is the sensitivity in A/W times the photon's energy divided by the electron's charge. Parameters and errors
         as for `efficiency`.
         """
-        nm = self._within(wavelength_nm, *self.curves_nm)
+        nm = self._in_range(wavelength_nm)
         return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
 
     def throughput(self, wavelength_nm: Wavelengths) -> Float:
@@ -395,7 +399,7 @@ class Instrument(Section):
         Wavelengths and errors as for `efficiency`; if `held`, curves keep their end values beyond their ends (an
         assumption) instead of raising InputError.
         """
-        nm = self._within(wavelength_nm, *((0.0, np.inf) if held else self.curves_nm))
+        nm = self._in_range(wavelength_nm, held)
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
         return self.collecting_area_cm2 * per_joule
 

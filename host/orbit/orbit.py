@@ -139,19 +139,18 @@ class Bodies:
             from astropy.coordinates import GeocentricTrueEcliptic, SkyCoord, get_body, get_sun
             from astropy.time import Time
 
-            def at(days: Float) -> Time:
+            def time(days: Float) -> Time:
                 return Time(np.full(days.shape, midnight), days, format="jd", scale="utc")
 
-            def between(step_d: float, body: str) -> Vectors:
+            def position_km(body: str, step_d: float) -> Vectors:
                 low = days[0] - step_d
                 # One more node at either end, where a cubic spline is least accurate.
                 nodes = low + step_d * np.arange(int(np.ceil((days[-1] - low) / step_d)) + 3)
-                times = at(nodes)
-                body_there = get_sun(times) if body == "sun" else get_body(body, times)
-                return np.asarray(CubicSpline(nodes, body_there.cartesian.xyz.to_value("km").T)(days))
+                at_nodes = get_sun(time(nodes)) if body == "sun" else get_body(body, time(nodes))
+                return np.asarray(CubicSpline(nodes, at_nodes.cartesian.xyz.to_value("km").T)(days))
 
-            sun, moon = between(SUN_STEP_D, "sun"), between(MOON_STEP_D, "moon")
-            middle = at(days[[days.size // 2]])[0]
+            sun, moon = position_km("sun", SUN_STEP_D), position_km("moon", MOON_STEP_D)
+            middle = time(days[[days.size // 2]])[0]
             pole = SkyCoord(lon=0, lat=90, unit="deg", frame=GeocentricTrueEcliptic(equinox=middle, obstime=middle))
             north = unit(pole.gcrs.cartesian.xyz.value)
         return cls(unit(sun), np.linalg.norm(sun, axis=1), moon, north)

@@ -34,11 +34,12 @@ def add(
     flux_unit: str | None = None,
     extend: str | None = None,
 ) -> OwnStar:
-    """Keep a spectrum from a file, as `Source.read` reads it, under a name: by default that in its header or its own.
+    """Keep the spectrum of a file among the user's own stars, which are found by name like those of the library.
 
-    Reports state its `origin`, by default the file name. With `replace`, a kept star of the same name is replaced.
-    Raises InputError if the file contains no usable spectrum, the name is taken or invalid, or the folder cannot be
-    written.
+    `Source.read` reads the file, to which the units and `extend` are passed on. The name is by default that in the
+    file's header, or else that of the file; reports state the `origin`, by default the name of the file. With
+    `replace`, a kept star of the same name is replaced. Raises InputError if the file contains no usable spectrum, the
+    name is taken or invalid, or the folder cannot be written.
     """
     from astropy.table import Table
 
@@ -95,7 +96,7 @@ def _path_of(name: str, *, replace: bool) -> Path:
 TIMEOUT_S = 20.0
 #: Schemes of an address; a local file is added, not downloaded.
 SCHEMES = ("http", "https", "ftp")
-#: Longest duration of a download, s: the largest file of `size_limits.LIMITS` at 0.5 MB/s.
+#: Longest duration of a download, s: the largest file of `files.LIMITS` at 0.5 MB/s.
 MAX_DOWNLOAD_S = 600.0
 #: Largest size of a listing, bytes.
 MAX_LISTING_BYTES = 20 * 2**20
@@ -109,7 +110,7 @@ class Collection:
     title: str
     citation: str
     base: str  # address of the files, from the archive's pages; not verified by the tests
-    # Path of a star's file below the base, from its name as in names of files and a function that lists the files.
+    # Path of a star's file below the base, from the star's name in names of files and a function that lists the files.
     file_of: Callable[[str, Callable[[], list[str]]], str]
 
 
@@ -157,9 +158,10 @@ def fetch(
 ) -> OwnStar:
     """Download a star from a public collection and keep it, as `add` does.
 
-    A name such as ``"HD 37202"`` is searched for in all collections, ``"ngsl:HD 37202"`` in one, of whose files `base`
-    may be the address of a mirror. `extend` is a library spectrum that continues the star's beyond its end. Raises
-    InputError if the network fails, the star is unknown, or its file contains no usable spectrum.
+    A name such as ``"HD 37202"`` is searched for in all collections, and ``"ngsl:HD 37202"`` in a single one, for which
+    `base` may be the address of a mirror of its files. `extend` is a library spectrum that continues the star's beyond
+    its end. The terminal shows the progress unless `show_progress` is false. Raises InputError if the network fails,
+    the star is unknown, or its file contains no usable spectrum.
     """
     word, colon, star = map(str.strip, name.partition(":"))
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
@@ -173,7 +175,7 @@ def fetch(
         raise InputError(f"star {name!r} has an empty name; give a name such as ngsl:HD 37202", key="name")
     for collection in chosen:
         try:
-            address = _folder(base or collection.base)
+            address = _folder_address(base or collection.base)
             url = urljoin(address, collection.file_of(plain, partial(_listing, address)))
             content = _download(url, limit_bytes("MAUVECL_LARGEST_FILE_MIB"), show_progress)
         except FileNotFoundError:
@@ -193,7 +195,7 @@ def fetch(
     raise InputError(f"{fault}; {remedy}", key="name")
 
 
-def _folder(address: str) -> str:
+def _folder_address(address: str) -> str:
     """Return an address that ends in a slash; raises InputError unless it is a URL of a supported scheme."""
     is_address = False
     with contextlib.suppress(ValueError):

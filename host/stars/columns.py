@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 from mauvecl.host.tables.names import by_word, key_of
-from mauvecl.host.tables.units import NO_FLUX, SCALE, balanced, is_stated, unit_of
+from mauvecl.host.tables.units import NO_FLUX, SCALE, balance_brackets, is_stated, unit_of
 from mauvecl.schema.errors import InputError, shortened
 
 #: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
@@ -105,7 +105,7 @@ class Role:
 @lru_cache(maxsize=1024)
 def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     """Infer the role of a column."""
-    base, unit_in_name = divided(name)
+    base, unit_in_name = divide_name(name)
     words = words_of(base)
     kind, score = _kind_of(words)
     if kind == "magnitude" and (system := set(words) & {"ab", "abmag", "st", "stmag"}):
@@ -213,7 +213,7 @@ def flux_kind(unit: Any) -> FluxKind:
     return "surface brightness" if (unit * u.sr).is_equivalent(densities + per_area) else "other"
 
 
-def divided(name: str) -> tuple[str, str | None]:
+def divide_name(name: str) -> tuple[str, str | None]:
     """Divide a column's name into the quantity and its unit, if any."""
     name = " ".join(name.strip().strip("\"'").split())
     if is_unit(name, alone=True):
@@ -233,7 +233,7 @@ def divided(name: str) -> tuple[str, str | None]:
     elif (match := SCALE.search(name)) and match.start() > 0:
         # A factor without a unit, as in "flux/10^-15", is not a unit.
         base, unit = re.sub(r"\s*[/*]\s*$|\s+x\s*$", "", name[: match.start()]), name[match.start() :]
-    return base, unit if unit is None else balanced(unit)
+    return base, unit if unit is None else balance_brackets(unit)
 
 
 def _after_underscore(parts: Sequence[str]) -> tuple[str, str] | None:
@@ -347,7 +347,7 @@ def stated_units(header: str, *, wavelength: bool, flux: bool, is_named: bool) -
     If the columns have no names (`is_named` is false), counts or magnitudes in a header mean that there is no flux.
     """
     text = header[:20_000]
-    distinct = _distinct([_spelt(match[0].strip()) for match in _FLUX.finditer(text)]) if flux else []
+    distinct = _distinct_units([_spelt(match[0].strip()) for match in _FLUX.finditer(text)]) if flux else []
     next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
     if len(distinct) > 1 and next_to is not None:
         distinct = [_spelt(next_to[1].strip())]
@@ -364,8 +364,8 @@ def stated_units(header: str, *, wavelength: bool, flux: bool, is_named: bool) -
 
 def _lengths(text: str) -> list[str]:
     """Return the distinct units of wavelength in a text, without those within units of flux."""
-    listed = [match[1] for line in text.splitlines() if (match := _LIST.match(line.strip().lstrip("#!%;").strip()))]
-    if lengths := _distinct([match[1] for match in _NEXT_TO.finditer(text)]) or _distinct(listed):
+    in_lists = [match[1] for line in text.splitlines() if (match := _LIST.match(line.strip().lstrip("#!%;").strip()))]
+    if lengths := _distinct_units([match[1] for match in _NEXT_TO.finditer(text)]) or _distinct_units(in_lists):
         return lengths
     for match in _STATED.finditer(text):
         if not _QUALIFIERS.match(match[1]) and match[1] != "FLUXUNIT":
@@ -376,16 +376,16 @@ def _lengths(text: str) -> list[str]:
             if not is_spectral(unit):
                 raise InputError.of("wavelength_unit", unit, "a length or a frequency", where="its header")
             return [match[1]]
-    return _distinct(_ANYWHERE.findall(text))
+    return _distinct_units(_ANYWHERE.findall(text))
 
 
 def _spelt(name: str) -> str:
     """Convert a unit in the name of a column to the form of a unit: erg_s_cm2_A is erg/s/cm2/A."""
-    name = balanced(name)
+    name = balance_brackets(name)
     return name.replace("_", "/") if "_" in name and not re.search(r"[/\-−]|per", name) else name.replace("_", " ")
 
 
-def _distinct(names: list[str]) -> list[str]:
+def _distinct_units(names: list[str]) -> list[str]:
     """Return distinct units regardless of spelling; "W s" in prose is an energy and dropped."""
     units: dict[object, str] = {}
     for name in names:
@@ -402,7 +402,7 @@ TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
 AXES = ("wavelength", "lower edge", "upper edge")
 
 
-def numbered(kind: str, word: str, n: int) -> int | None:
+def index_of(kind: str, word: str, n: int) -> int | None:
     """Return the index in a word such as ``row 3``, or None; raise InputError if there are fewer than that, `n`."""
     match = re.fullmatch(rf"{kind}\s+(\d{{1,9}})", word.strip(), re.IGNORECASE)
     if match is None or int(match[1]) == 0:
@@ -412,13 +412,13 @@ def numbered(kind: str, word: str, n: int) -> int | None:
     return int(match[1]) - 1
 
 
-def listed(names: Sequence[str]) -> str:
+def join(names: Sequence[str]) -> str:
     """Join names for a message; a long list ends with the number of omitted names."""
     shown = [name.strip()[:40] for name in names]
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
 
 
-def choice(name: str, kind: str, index: int, names: Sequence[str]) -> str:
+def selector(name: str, kind: str, index: int, names: Sequence[str]) -> str:
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
     typed = TYPED.fullmatch(word) is not None and word.isprintable()
@@ -446,12 +446,12 @@ def choose(roles: Sequence[Role], words: Sequence[str]) -> tuple[tuple[int, ...]
 def _named(name: str, names: Sequence[str]) -> int:
     """Return the place of the column that a user names; raises InputError unless it is one."""
     indices = [i for i, column in enumerate(names) if column.strip() == name]
-    if not indices and (index := numbered("column", name, len(names))) is not None:
+    if not indices and (index := index_of("column", name, len(names))) is not None:
         return index
     indices = indices or [i for i, column in enumerate(names) if key_of(column) == key_of(name)]
     if len(indices) != 1:
         fault = f"{'several columns are' if indices else 'no column is'} named {shortened(name)}"
-        raise InputError(f"{fault}; give one of {listed(names)}", key="columns")
+        raise InputError(f"{fault}; give one of {join(names)}", key="columns")
     return indices[0]
 
 
@@ -465,8 +465,8 @@ def _flux(roles: Sequence[Role], names: Sequence[str], wavelength: tuple[int, ..
         return unknown[0]
     shown = (unknown or candidates or [0])[0]
     descriptions = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in candidates]
-    fault = f"no column is recognised as a star's flux, only {listed(descriptions) or 'the wavelength'}"
-    raise InputError(f"{fault}; give the column as in {choice(names[shown], 'column', shown, names)}", key="columns")
+    fault = f"no column is recognised as a star's flux, only {join(descriptions) or 'the wavelength'}"
+    raise InputError(f"{fault}; give the column as in {selector(names[shown], 'column', shown, names)}", key="columns")
 
 
 def _best(kind: str, roles: Sequence[Role], without: Sequence[int] = ()) -> list[int]:
@@ -481,8 +481,8 @@ def _only(quantity: str, names: Sequence[str], indices: Sequence[int]) -> int:
     if len(indices) == 1:
         return indices[0]
     if not indices:
-        fault = f"no column is recognised as the {quantity} among {listed(names) or 'none'}"
+        fault = f"no column is recognised as the {quantity} among {join(names) or 'none'}"
         raise InputError(f"{fault}; give two columns as in FILE[wavelength,flux]", key="columns")
     several = [names[i].strip() for i in indices]
-    fault = f"{len(several)} columns may be the {quantity}: {listed(several)}"
-    raise InputError(f"{fault}; give one as in {choice(several[-1], 'column', indices[-1], names)}", key="columns")
+    fault = f"{len(several)} columns may be the {quantity}: {join(several)}"
+    raise InputError(f"{fault}; give one as in {selector(several[-1], 'column', indices[-1], names)}", key="columns")

@@ -17,7 +17,7 @@ import astropy.units as u
 import numpy as np
 
 from mauvecl.host.arrays import Float
-from mauvecl.host.stars.columns import Role, choice, choose, flux_kind, is_spectral, linear, listed, numbered, role_of
+from mauvecl.host.stars.columns import Role, choose, flux_kind, index_of, is_spectral, join, linear, role_of, selector
 from mauvecl.host.stars.spectrum import FLUX_UNIT, check_assumed_unit
 from mauvecl.host.tables.names import divided_unit, key_of
 from mauvecl.host.tables.table import Values, ends_of, marks_in, without_indefinite
@@ -36,7 +36,7 @@ class SpectrumTable:
     origin: str
     label: str = ""  # name by which users select it among the tables of a file
     #: Units of wavelength and flux that the format implies if none is stated.
-    implied_units: tuple[str, str] | None = None
+    implied_units: tuple[str | None, str | None] = (None, None)
     remarks: str = ""  # text of the header that may mention air, the star's surface or its dust
     headers: Sequence[Mapping[str, Any]] = ()  # whose keywords may state the medium of the wavelengths
     notes: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ LENGTHS = ("npoints", "n_points", "nelem", "npts")
 WEIGHTS = ("dq_wgt",)
 
 
-def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> SpectrumTable:
+def select_spectrum(tables: Sequence[SpectrumTable], words: Sequence[str]) -> SpectrumTable:
     """Return the table with the spectrum of a file, or with the one of several that the user's words select."""
     if not tables:
         raise InputError("it has no table and no image, but needs one with a wavelength and a flux", key="table")
@@ -74,7 +74,7 @@ def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> Spectr
     selected: list[int] = []
     of_columns_and_rows: list[str] = []
     for word in words:
-        index = numbered("table", word, len(tables))
+        index = index_of("table", word, len(tables))
         matches = [i for i, label in enumerate(labels) if label == word.lower()] if index is None else [index]
         selected += matches
         of_columns_and_rows += [] if matches else [word]
@@ -102,13 +102,14 @@ def spectrum_in(tables: Sequence[SpectrumTable], words: Sequence[str]) -> Spectr
     titles = [spectrum.label for spectrum in spectra]
     if first.group is not None and len({spectrum.group for spectrum in spectra}) == 1:
         segments = [segment for spectrum in spectra for segment in spectrum.segments]
-        message = f"its parts {listed(titles)} are joined"
+        message = f"its parts {join(titles)} are joined"
         return replace(first, segments=segments, messages=(*first.messages, message))
-    example = choice(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
-    raise InputError(f"{len(titles)} tables have a spectrum: {listed(titles)}; give one as in {example}", key="table")
+    example = selector(titles[0], "table", labels.index(titles[0].strip().lower()), labels)
+    raise InputError(f"{len(titles)} tables have a spectrum: {join(titles)}; give one as in {example}", key="table")
 
 
 def _spectrum_of(table: SpectrumTable, words: Sequence[str]) -> SpectrumTable:
+    """Return a table with the spectrum, and its segments, in the columns and the row that the user's words select."""
     roles = table.roles
     names = [role.name for role in roles]
     columns = {key_of(name) for name in names} | {key_of(f"column {i + 1}") for i in range(len(names))}
@@ -153,7 +154,7 @@ def _numbers(cells: Any, name: str) -> Float:
 
 def _no_such(word: str, names: Sequence[str]) -> InputError:
     """Return the error for a word that does not name anything in the file."""
-    return InputError.of("columns", word, f"one of {listed(names)}")
+    return InputError.of("columns", word, f"one of {join(names)}")
 
 
 def _selected_rows(
@@ -173,7 +174,7 @@ def _selected_rows(
         # The segments of a detector, or echelle orders.
         rows = list(range(n))
         labels = [(identifiers[row] or [str(row + 1)])[0] for row in rows]
-        messages.append(f"its {n} segments ({listed(labels)}) are joined")
+        messages.append(f"its {n} segments ({join(labels)}) are joined")
     else:
         rows = [_selected_row(identifiers, words, [*columns])]
         identifier = (identifiers[rows[0]] or [""])[0]
@@ -225,7 +226,7 @@ def _selected_row(identifiers: Sequence[Sequence[str]], words: Sequence[str], na
     """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
     fitting = list(range(len(identifiers)))
     for word in words:
-        index = numbered("row", word, len(identifiers))
+        index = index_of("row", word, len(identifiers))
         fitting = [row for row in fitting if (word.strip() in identifiers[row] if index is None else row == index)]
         if not fitting:
             raise _no_such(word, names)
@@ -234,8 +235,8 @@ def _selected_row(identifiers: Sequence[Sequence[str]], words: Sequence[str], na
     numbers = [f"row {row + 1}" for row in fitting]
     labels = [(identifiers[row] or [""])[0] or number for row, number in zip(fitting, numbers, strict=True)]
     labels = labels if len(set(labels)) == len(labels) else numbers
-    fault = f"it contains {len(fitting)} spectra, one in each row ({listed(labels)})"
-    raise InputError(f"{fault}; give one as in {choice(labels[0], 'row', fitting[0], labels)}", key="rows")
+    fault = f"it contains {len(fitting)} spectra, one in each row ({join(labels)})"
+    raise InputError(f"{fault}; give one as in {selector(labels[0], 'row', fitting[0], labels)}", key="rows")
 
 
 #: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.
@@ -263,16 +264,16 @@ class ReadSpectrum:
     axis_unit: str = ""
 
 
-def converted(table: SpectrumTable, wavelength_unit: Any, flux_unit: Any) -> ReadSpectrum:
+def convert_spectrum(table: SpectrumTable, wavelength_unit: Any, flux_unit: Any) -> ReadSpectrum:
     """Convert the spectrum of a table; given units override its own; one of wavelength may end in "air" or "vacuum"."""
     messages = list(table.messages)
     medium: Medium | None = None
     if isinstance(wavelength_unit, str):
         wavelength_unit, medium = unit_and_medium(wavelength_unit)
     axis_unit, in_unit = unit_and_medium(table.axis.unit or "")
-    implied = table.implied_units or (None, None)
-    axis, is_assumed = _scale("wavelength", replace(table.axis, unit=axis_unit), wavelength_unit, implied[0], messages)
-    light, is_assumed_flux = _scale("flux", table.light, flux_unit, implied[1], messages)
+    implied, implied_flux = table.implied_units
+    axis, is_assumed = _scale("wavelength", replace(table.axis, unit=axis_unit), wavelength_unit, implied, messages)
+    light, is_assumed_flux = _scale("flux", table.light, flux_unit, implied_flux, messages)
     waves, fluxes = (np.concatenate(arrays) for arrays in zip(*table.segments, strict=True))
     wavelengths = axis(waves)
     if is_assumed:
@@ -293,11 +294,11 @@ def converted(table: SpectrumTable, wavelength_unit: Any, flux_unit: Any) -> Rea
         order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
         flam = np.asarray(light(unmarked).to_value(FLUX_UNIT, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
         segments.append((nm[order], flam[order]))
-    nm, flam = _joined(segments, messages)
+    nm, flam = _join_segments(segments, messages)
     if is_assumed_flux:
         _check_assumed_flux(flam, f"{table.remarks}\n{table.origin}")
     messages += added
-    nm, flam = _merged(nm, flam, messages)
+    nm, flam = _merge_points(nm, flam, messages)
     unscaled, notes = table.unscaled, table.notes
     if re.search(r"surface\s+flux", table.remarks, re.I):
         unscaled = unscaled or "its header states that it is the flux at the star's surface"
@@ -391,7 +392,7 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
         raise InputError(fault, key="flux_unit")
 
 
-def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:
+def _join_segments(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:
     """Join segments in order of wavelength; overlaps are cut in the middle."""
     segments = sorted((s for s in segments if s[0].size), key=lambda segment: (segment[0][0], segment[0][-1]))
     nm, flux = segments[0]
@@ -425,7 +426,7 @@ def _check_assumed_flux(flux: Float, remarks: str) -> None:
     raise InputError(f"{fault}: `flux_unit` names its unit", key="flux_unit")
 
 
-def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:
+def _merge_points(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:
     """Merge points of equal wavelength into one with their mean flux."""
     if nm.size < 2 or (np.diff(nm) > 0).all() or (np.diff(nm) < 0).any():
         return nm, flux

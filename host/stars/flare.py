@@ -18,7 +18,7 @@ from astropy.constants import c, h, k_B
 from numpy.typing import ArrayLike
 
 from mauvecl.host.arrays import ContentEquality, Float, array_cache, set_read_only
-from mauvecl.host.stars.spectrum import ANGSTROM, FLUX_UNIT, NEEDED_NM, attached, check_points, photons, supplemented
+from mauvecl.host.stars.spectrum import ANGSTROM, FLUX_UNIT, NEEDED_NM, attach, check_points, photons, supplement
 from mauvecl.host.tables.files import LARGEST, SMALLEST
 from mauvecl.schema import fields
 from mauvecl.schema.calls import checked, validated
@@ -114,7 +114,7 @@ class FlareSpectrum:
     def grid(self, wavelength_nm: Float) -> Float:
         """Return wavelengths supplemented by the nodes of the spectrum, nm."""
         # A node next to a wavelength would only add rounding errors.
-        return supplemented(wavelength_nm, self.nodes_nm, SAME_NM)
+        return supplement(wavelength_nm, self.nodes_nm, SAME_NM)
 
     def describe(self) -> str:
         """Return the spectrum in a few words."""
@@ -294,6 +294,7 @@ class FlareWithLines(FlareSpectrum):
 
     @property
     def continuum_flux(self) -> float:
+        """Flux of the continuum in 200-700 nm, erg s-1 cm-2, to which the fractions refer."""
         at = self.continuum.grid(np.linspace(*NEEDED_NM, RANGE_POINTS))
         return 10.0 * float(np.trapezoid(self.continuum.flux(at), at))
 
@@ -314,6 +315,7 @@ class FlareWithLines(FlareSpectrum):
 
 
 def _sum_of_lines(fluxes: Mapping[str, float], wavelength_nm: Float) -> Float:
+    """Return the spectrum of lines that have these fluxes by name, per Angstrom, shape (n,)."""
     lines = (value * EmissionLine.named(name).profile(wavelength_nm) for name, value in fluxes.items())
     return sum(lines, np.zeros(np.shape(wavelength_nm)))
 
@@ -369,7 +371,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             noun = "gap" if len(gaps) == 1 else "gaps"
             messages += (f"The flare spectrum {name} is interpolated in its {noun} at {', '.join(gaps)} nm",)
         if continue_at_k is not None:
-            nm, flux = _continued(name, nm, flux, continue_at_k)
+            nm, flux = _continue(name, nm, flux, continue_at_k)
             covered = f"The flare spectrum {name} covers {measured[0]:g}-{measured[1]:g} nm"
             messages += (f"{covered}; a blackbody of {continue_at_k:g} K continues it",)
         return cls(nm, flux, name, measured, messages)
@@ -427,7 +429,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         return f"the spectrum {self.name}"
 
 
-def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float, Float]:
+def _continue(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float, Float]:
     """Continue a spectrum at both ends by a blackbody that has the mean flux of the last 20 nm there."""
     low, high = CONTINUED_NM
     steps = np.log(CONTINUED_RATIO)
@@ -447,7 +449,7 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
         added = np.exp(np.arange(np.log(low), np.log(end), steps))
         if not blue:
             added = np.append(np.exp(np.arange(np.log(end) + steps, np.log(high), steps)), high)
-        nm, flux = attached(nm, added, blue), attached(flux, scale * blackbody(added, kelvin), blue)
+        nm, flux = attach(nm, added, blue), attach(flux, scale * blackbody(added, kelvin), blue)
     return nm, flux
 
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.host.stars.columns import AXES, Role, divided, is_unit, listed, role_of, stated_units, words_of
-from mauvecl.host.stars.conversion import ReadSpectrum, SpectrumTable, converted, spectrum_in
+from mauvecl.host.stars.columns import AXES, Role, divide_name, is_unit, join, role_of, stated_units, words_of
+from mauvecl.host.stars.conversion import ReadSpectrum, SpectrumTable, convert_spectrum, select_spectrum
 from mauvecl.host.tables import text_tables
 from mauvecl.host.tables.files import check_size, parsing, reading, without_columns
 from mauvecl.host.tables.fits_tables import FLUX_UNITS, WAVE_UNITS, WHOLE, FitsTables, open_fits, unit_at
@@ -39,7 +39,7 @@ GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
 def table_of_text(
     text: str, name: str, origin: str, words: Sequence[str], wavelength: bool, flux: bool
 ) -> SpectrumTable:
-    """Read the table of a text file, and the units of wavelength and flux in its header if requested."""
+    """Read the table of a text file; `wavelength` and `flux` say whether its header is searched for their units."""
     lines = text_tables.NumberLines(text, "wavelength and flux")
     if any(cell[:1] in ("(", "[") for cell in lines.cells[0]):
         return _table_of_arrays(MemoryTable(text_tables.text_table(text, "it", commas=True), "it"), name, origin)
@@ -103,11 +103,11 @@ def _table_of_arrays(file: MemoryTable, name: str, origin: str) -> SpectrumTable
 def _names(lines: text_tables.NumberLines) -> tuple[list[str], list[str]]:
     """Return the names of columns and the units below them; empty if there are none."""
     # Lines such as "column 2: flux"; columns without such a line are named by number.
-    by_number = text_tables.numbered_names((line for line, _ in lines.header), lines.n)
+    by_number = text_tables.names_by_number((line for line, _ in lines.header), lines.n)
     numbered = [by_number.get(k, str(k + 1)) for k in range(lines.n)]
     if len(by_number) > 1 and _recognised(numbered):
         return numbered, []
-    rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := text_tables.divided_names(line, lines.n))}
+    rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := text_tables.divide_names(line, lines.n))}
     # The last of the lines that name most columns.
     score, k = max(((_recognised(cells), k) for k, cells in rows.items()), default=(0, 0))
     if score > 0:
@@ -148,7 +148,7 @@ def _recognised(cells: Sequence[str]) -> int:
 def _units(lines: text_tables.NumberLines, names_at: int) -> list[str]:
     """Return the cells of the line of units below the names, if any; IPAC tables have types in between."""
     for k, (line, _) in enumerate(lines.header[names_at + 1 : names_at + 3]):
-        cells = text_tables.divided_names(line, lines.n)
+        cells = text_tables.divide_names(line, lines.n)
         is_all = any(is_unit(cell) for cell in cells) and all(is_unit(c) or not is_stated(c) for c in cells)
         # "A star" is not a unit, and "nm banana" contains an unknown unit.
         is_some = any(len(cell) > 1 and is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
@@ -161,20 +161,20 @@ def _of_another_length(lines: text_tables.NumberLines) -> list[str]:
     """Return the names of a comment with fewer cells than the rows; raise InputError for another number of names."""
     for line, is_comment in reversed(lines.header):
         cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
-        cells = cells if len(cells) > 1 else text_tables.bracketed(line)
+        cells = cells if len(cells) > 1 else text_tables.divide_outside_brackets(line)
         if not all(cells) or text_tables.PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
             continue
-        kinds = [role_of(cell).kind if words_of(divided(cell)[0]) else "unknown" for cell in cells]
+        kinds = [role_of(cell).kind if words_of(divide_name(cell)[0]) else "unknown" for cell in cells]
         if "flux" not in kinds or not any(kind in AXES for kind in kinds):
             continue
         is_plain = set(kinds) <= {"wavelength", "flux", "unknown"} and not any(role_of(c).logarithm for c in cells)
         in_order = is_plain and kinds.index("flux") > kinds.index("wavelength")
         if is_comment and len(cells) < lines.n:
-            message = f"its {len(cells)} names ({listed(cells)}) are those of the first of {lines.n} columns"
+            message = f"its {len(cells)} names ({join(cells)}) are those of the first of {lines.n} columns"
             lines.messages.append(message)
             return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
         if not is_comment or not in_order:
-            fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
+            fault = f"its line of names has {len(cells)} ({join(cells)}) for {lines.n} columns"
             raise InputError(f"{fault}, but needs one for each", key="columns")
     return []
 
@@ -229,7 +229,7 @@ class _Reader:
         self, number: int, columns: Sequence[Values], label: str = "", remarks: str = "",
         notes: tuple[str, ...] = (), row_names: Sequence[str] = (), group: str | None = None,
     ) -> SpectrumTable:  # fmt: skip
-        """Return the table of an extension, which users select by its number if they do so, else by its name."""
+        """Return the table of an extension, whose label is its number if the user selects it so, or else its name."""
         header, primary = self.hdus[number].header, self.primary
         headers = [primary] if primary is header else [primary, header]
         comments = [text_at(source, key) for source in headers for key in _REMARKS]
@@ -423,7 +423,7 @@ def read_spectrum(
                 else:
                     no_units = wavelength_unit is None, flux_unit is None
                     tables = [table_of_text(text, name, f"text {origin}", words, *no_units)]
-            return converted(spectrum_in(tables, words), wavelength_unit, flux_unit)
+            return convert_spectrum(select_spectrum(tables, words), wavelength_unit, flux_unit)
     except InputError as error:
         raise error.within(title) from error
 

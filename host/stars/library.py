@@ -83,6 +83,7 @@ def find(name: str) -> OwnStar | None:
 
 
 def _described(path: Path) -> OwnStar | None:
+    """Return the star in a file of the folder, or None for another table; raise InputError for a damaged file."""
     table = read_ecsv(path, "kept star", "use `mauvecl library remove` to take it away")
     meta = table.meta
     if not {"name", "origin", "spectrum_sha256"} <= set(meta):
@@ -96,18 +97,21 @@ def _described(path: Path) -> OwnStar | None:
 def remove(name: str) -> None:
     """Delete a kept star; raises InputError for an unknown name."""
     key = name.strip().casefold()
-    # A damaged file has no name but that of the file; undamaged ones have precedence.
-    stem, matches = re.sub(r"[^a-z0-9.+-]", "_", key), []
-    for path in folder().glob("*.ecsv"):
+    named: list[Path] = []
+    damaged: list[Path] = []
+    for path in sorted(folder().glob("*.ecsv")):
         star = None
         with contextlib.suppress(InputError):
             star = _described(path)
-        if (path.stem.casefold() == stem) if star is None else (star.name.casefold() == key):
-            matches.append((star is None, path))
-    if not matches:
+        if star is not None:
+            named += [path] if star.name.casefold() == key else []
+        elif path.stem.casefold() == re.sub(r"[^a-z0-9.+-]", "_", key):
+            # A damaged file has no name but that of the file.
+            damaged.append(path)
+    if not (named or damaged):
         names = ", ".join(star.name for star in user_stars())
         raise InputError.of("name", name, f"one of: {names or 'no star is kept'}")
-    min(matches)[1].unlink()
+    (named or damaged)[0].unlink()
 
 
 #: Abbreviations of Greek letters in catalogues.
@@ -142,6 +146,7 @@ def library_text(*path: str) -> str:
     return _LIBRARY.joinpath(*path).read_text(encoding="utf-8")
 
 
+@cache
 def _rows(file: str) -> list[dict[str, str]]:
     """Read a table of the library without astropy, which keeps the error for a misspelt name fast."""
     lines = [line for line in library_text(file).splitlines() if not line.startswith("#")]
@@ -175,25 +180,20 @@ def name_key(name: str) -> str:
 
 
 @cache
-def _index() -> dict[str, dict[str, str]]:
-    return {entry["name"].casefold(): entry for entry in _rows("index.ecsv")}
-
-
-@cache
-def _keys() -> dict[str, str]:
-    """Return the key of the index entry for every normalised name and alias."""
-    keys: dict[str, str] = {}
-    for key, entry in _index().items():
-        keys[name_key(key)] = key
+def _entries() -> dict[str, dict[str, str]]:
+    """Return the entry of the library's index for every normalised name and alias."""
+    entries: dict[str, dict[str, str]] = {}
+    for entry in _rows("index.ecsv"):
+        entries[name_key(entry["name"])] = entry
         for alias in (entry["alias"], entry["star"]):
-            keys.setdefault(name_key(alias), key)
-    keys.pop("", None)
-    return keys
+            entries.setdefault(name_key(alias), entry)
+    entries.pop("", None)
+    return entries
 
 
 def library_names() -> list[str]:
     """Return the distinct names of all embedded spectra: types, aliases and stars."""
-    names = [entry[column] for entry in _index().values() for column in ("name", "alias", "star")]
+    names = [entry[column] for entry in _rows("index.ecsv") for column in ("name", "alias", "star")]
     # The name of the collection before a type adds no information.
     return [name for name in dict.fromkeys(names) if name and not name.startswith("Pickles ")]
 
@@ -244,8 +244,7 @@ def library_table() -> Table:
 def embedded(name: str) -> dict[str, str] | None:
     """Return the index entry of a spectrum by name (of a type also as "M3" for M3V), alias or star, or None."""
     key = name_key(name)
-    entry = _keys().get(key) or _keys().get(f"{key}v")
-    return None if entry is None else _index()[entry]
+    return _entries().get(key) or _entries().get(f"{key}v")
 
 
 @lru_cache(8)
@@ -270,7 +269,7 @@ def subtype(spectral_type: str) -> float:
 def nearest_spectrum(spectral_type: str) -> str:
     """Return the name of the embedded spectrum of the nearest type; the first in the library if there are several."""
     number = subtype(spectral_type)
-    typed = [entry for entry in _index().values() if _TYPE.match(entry["spectral_type"])]
+    typed = [entry for entry in _rows("index.ecsv") if _TYPE.match(entry["spectral_type"])]
     return min(typed, key=lambda entry: abs(subtype(entry["spectral_type"]) - number))["name"]
 
 

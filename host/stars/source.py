@@ -161,7 +161,7 @@ class Source(Drawable, ContentEquality):
         name, wavelength, flux, messages = read.name, read.wavelength_nm, read.flux_flam, read.messages
         points.check_points(name, wavelength, flux)
         points.check_measured(name, wavelength, read.axis_unit or "nm")
-        wavelength, flux, cut = points.without_undefined_ends(name, wavelength, flux)
+        wavelength, flux, cut = points.cut_undefined_ends(name, wavelength, flux)
         if read.axis_unit or extend is not None:
             covered = points.measured_part(wavelength)
             share = "" if covered > 1 - 1e-9 else f", {covered:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
@@ -171,21 +171,21 @@ class Source(Drawable, ContentEquality):
             longer = cls.from_library(extend) if isinstance(extend, str) else extend
             ultraviolet = longer.messages if isinstance(extend, str) else ()
             extension = longer.name, longer.wavelength_nm, longer.flux_flam
-            wavelength, flux, added = points.extended(name, wavelength, flux, extension, ultraviolet)
+            wavelength, flux, added = points.extend(name, wavelength, flux, extension, ultraviolet)
             messages += added
         points.check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
-        wavelength, flux, added = points.continued(name, wavelength, flux, dark_only=True)
+        wavelength, flux, added = points.continue_ends(name, wavelength, flux, dark_only=True)
         return cls(
             wavelength, flux, name, read.origin, (*read.notes, *cut), messages=(*messages, *added),
             measured_nm=measured if added else None, unscaled=read.unscaled,
         )  # fmt: skip
 
     def binned(self, width_nm: BinWidth) -> Self:
-        """Return the spectrum averaged over bins, 0.01 to 50 nm wide from its first wavelength on, with less noise."""
+        """Return the spectrum averaged over bins of 0.01 to 50 nm from its first wavelength, which reduces noise."""
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
         edges = np.append(np.arange(first, last - width_nm / 2, width_nm), last)
-        flux = points.means(self.wavelength_nm, self.flux_flam, edges)
+        flux = points.mean_fluxes(self.wavelength_nm, self.flux_flam, edges)
         nm = np.concatenate([[first], (edges[1:] + edges[:-1]) / 2, [last]])
         flux = np.concatenate([flux[:1], flux, flux[-1:]])
         return replace(self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, f"binned to {width_nm:g} nm"))
@@ -232,7 +232,7 @@ class Source(Drawable, ContentEquality):
         if waveset is None:
             raise InputError(f"{name} defines no wavelengths; use a spectrum with a waveset", key="spectrum")
         # A point of the grid within 1e-3 nm of one of the spectrum's own adds no information.
-        grid = points.supplemented(np.unique(waveset.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
+        grid = points.supplement(np.unique(waveset.to_value(u.nm)), np.arange(160.0, 1150.0, 0.5), 1e-3)
         flux = spectrum(grid * u.nm, flux_unit=FLAM).value
         return cls.from_arrays(grid, flux, name=name, origin=f"synphot {type(spectrum).__name__}")
 
@@ -306,7 +306,7 @@ class Source(Drawable, ContentEquality):
         """
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         history = (*self.history, f"scaled to {library.known_band(band)} = {magnitude:g}")
-        flux, scale = self.flux_flam * factor, points.scale(band, system)
+        flux, scale = self.flux_flam * factor, points.magnitude_scale(band, system)
         return replace(self, flux_flam=flux, history=history, scale=scale, unscaled="")
 
     def flaring(

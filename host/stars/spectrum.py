@@ -49,7 +49,7 @@ def band(name: str) -> Numbers:
     return spectrum_table(f"{known_band(name).lower().replace(' ', '_')}.ecsv", "bands")
 
 
-def scale(name: str, system: System = "catalogue") -> str:
+def magnitude_scale(name: str, system: System = "catalogue") -> str:
     """Return a sentence that explains the magnitudes of a system in a band."""
     meta = band(name).meta
     meaning = "AB" if meta["system"] == "AB" else f"Vega has {meta['vega']:g}"
@@ -237,7 +237,7 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     raise InputError(f"{fault}, but needs at least a third, which `extend` can continue{meant}", key="extend")
 
 
-def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
+def cut_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
     """Cut ends outside 200-700 nm at their innermost undefined point, and return a note."""
     bad = ~np.isfinite(flux)
     if not bad.any():
@@ -300,7 +300,7 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
     return tuple(messages)
 
 
-def continued(
+def continue_ends(
     name: str,
     wavelength: Float,
     flux: Float,
@@ -324,7 +324,7 @@ def continued(
         line = LineSpread.of(Instrument.load("mauve"))
     messages = []
     edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
-    brightest = max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
+    brightest = max(float(mean_fluxes(wavelength, flux, edges).max()), np.finfo(float).tiny)
     for side, sign, word in ((0, 1, "starts"), (-1, -1, "ends")):
         end, goal = wavelength[side], span[side]
         if sign * (end - goal) <= 0:
@@ -344,16 +344,16 @@ def continued(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
             f"{100 * share:.2g} % of the brightest pixel's light"
         )
-        wavelength, flux = attached(wavelength, goal, side == 0), attached(flux, level, side == 0)
+        wavelength, flux = attach(wavelength, goal, side == 0), attach(flux, level, side == 0)
     return wavelength, flux, tuple(messages)
 
 
-def attached(values: Float, more: Float | float, before: bool) -> Float:
+def attach(values: Float, more: Float | float, before: bool) -> Float:
     """Return values with more of them before or after."""
     return np.append(more, values) if before else np.append(values, more)
 
 
-def supplemented(nm: Float, more_nm: Float, apart_nm: float) -> Float:
+def supplement(nm: Float, more_nm: Float, apart_nm: float) -> Float:
     """Return wavelengths supplemented by more within their range that are not next to one of them."""
     inside = more_nm[(more_nm > nm[0]) & (more_nm < nm[-1])]
     after = np.searchsorted(nm, inside)
@@ -361,7 +361,7 @@ def supplemented(nm: Float, more_nm: Float, apart_nm: float) -> Float:
     return np.union1d(nm, inside[is_new]) if is_new.any() else nm
 
 
-def means(wavelength: Float, flux: Float, edges: Float) -> Float:
+def mean_fluxes(wavelength: Float, flux: Float, edges: Float) -> Float:
     """Return the mean fluxes between edges of a piecewise linear flux, shape (n_edge - 1,)."""
     grid = np.union1d(wavelength, edges)
     values = np.interp(grid, wavelength, flux)
@@ -370,7 +370,7 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
     return mean
 
 
-def extended(
+def extend(
     name: str, wavelength: Float, flux: Float, extension: tuple[str, Float, Float], ultraviolet: tuple[str, ...]
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one (name, wavelengths, fluxes), scaled at the join, and return messages.
@@ -397,7 +397,7 @@ def extended(
         )
         if blue:
             messages += [f"in {longer}, {message}" for message in ultraviolet]
-        wavelength, flux = attached(wavelength, nm[more], blue), attached(flux, level[more] * scale, blue)
+        wavelength, flux = attach(wavelength, nm[more], blue), attach(flux, level[more] * scale, blue)
     return wavelength, flux, tuple(messages) or (f"its extension {longer} reaches no farther and is not used",)
 
 
@@ -410,7 +410,7 @@ def _join(title: str, first: tuple[Float, Float], second: tuple[Float, Float], b
     noise = point_noise(first[1])
     for width in JOIN_NM * 2.0 ** np.arange(6):
         join = np.clip([low, low + width] if blue else [high - width, high], low, high)
-        level, longer = (float(means(nm, light, join)[0]) for nm, light in (first, second))
+        level, longer = (float(mean_fluxes(nm, light, join)[0]) for nm, light in (first, second))
         near = (first[0] >= join[0]) & (first[0] <= join[1])
         error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
         if level > MIN_JOIN_SNR * error and longer > 0.0 and np.isfinite(level / longer):

@@ -93,14 +93,14 @@ def limit_bytes(variable: str) -> int:
 
 
 def check_content(n_bytes: int, sentence: str) -> None:
-    """Raise InputError if content is larger than MAUVECL_LARGEST_CONTENT_MIB; the limit completes its sentence."""
+    """Raise InputError if content is larger than MAUVECL_LARGEST_CONTENT_MIB, which the end of its sentence states."""
     limit = "MAUVECL_LARGEST_CONTENT_MIB"
     if n_bytes > (most := limit_bytes(limit)):
         raise InputError(f"{sentence} {most >> 20} MiB; {limit} sets the limit", key=limit)
 
 
-#: Largest number of characters of a line of text, and of bytes of a store's JSON.
-LONGEST_LINE, MOST_JSON = 2**17, 16 << 20
+#: Largest numbers of characters of a line of text and of bytes of a store's JSON.
+MAX_LINE, MAX_JSON_BYTES = 2**17, 16 << 20
 
 
 def open_regular(path: Path, kind: str) -> io.BufferedReader:
@@ -154,19 +154,19 @@ def _check_n_bytes(n_bytes: int, path: Path, kind: str, most: int | None = None)
 
 
 def check_folder(path: Path, kind: str) -> None:
-    """Raise InputError for files that another library should not read: devices, large ones, JSON above `MOST_JSON`."""
+    """Raise InputError for files that another library should not read: devices, and too large ones."""
     for folder, _, names in os.walk(path):
         for name in names:
             file = Path(folder) / name
-            check_size(file, kind, MOST_JSON if name.endswith(".json") else None)
+            check_size(file, kind, MAX_JSON_BYTES if name.endswith(".json") else None)
 
 
 def lines_in(file: IO[str], label: str) -> Iterator[str]:
-    """Yield the lines of a text in UTF-8, with their ends; reading stops at a line longer than `LONGEST_LINE`."""
+    """Yield the lines of a text in UTF-8, with their ends; reading stops at a line longer than `MAX_LINE`."""
     try:
-        for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 2), ""), 1):
-            if len(line.rstrip("\r\n")) > LONGEST_LINE:
-                raise InputError(f"{label} must have at most {LONGEST_LINE} characters in line {number}", key="file")
+        for number, line in enumerate(iter(lambda: file.readline(MAX_LINE + 2), ""), 1):
+            if len(line.rstrip("\r\n")) > MAX_LINE:
+                raise InputError(f"{label} must have at most {MAX_LINE} characters in line {number}", key="file")
             yield line
     except UnicodeDecodeError as error:
         raise InputError(f"{label} must be text in UTF-8", key="file") from error
@@ -201,13 +201,13 @@ ERG, LARGEST_ERG = "_erg", 1e45
 #: Other keys of energies.
 ENERGIES = ("injections.low", "injections.high")
 #: Range of integers of 64 bits, signed or unsigned.
-WHOLE = (-(2**63), 2**64 - 1)
+INTEGERS = (-(2**63), 2**64 - 1)
 #: Longest text and deepest nesting of a study or an instrument.
-LONGEST, DEEPEST = 4096, 32
+MAX_TEXT, MAX_DEPTH = 4096, 32
 #: Place in a file, in messages of parsers.
 PLACE = re.compile(r"\b(?:line|row|column) \d{1,9}(?:,? (?:line|row|column) \d{1,9})*")
 #: Largest number of parts of a dotted TOML key.
-MOST_PARTS = 512
+MAX_PARTS = 512
 
 
 @contextlib.contextmanager
@@ -275,17 +275,17 @@ def toml(text: str, label: str) -> dict[str, Any]:
 def check_keys(text: str, label: str) -> None:
     """Raise InputError for TOML with a key of too many parts."""
     parts = 1 + max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
-    if parts > MOST_PARTS:
+    if parts > MAX_PARTS:
         # The memory of Python's parser grows with the square of this number.
-        raise InputError(f"{label} has a key of {parts} parts, but may have at most {MOST_PARTS}", key="file")
+        raise InputError(f"{label} has a key of {parts} parts, but may have at most {MAX_PARTS}", key="file")
 
 
 def possible(data: Any, label: str, key: str = "", depth: int = 0) -> None:
     """Raise InputError for values that are impossible in any study or instrument; `key` is that of nested data."""
     is_energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
     fault = _fault(data, LARGEST_ERG if is_energy else LARGEST)
-    if depth > DEEPEST:
-        fault = f"must be nested at most {DEEPEST} deep"
+    if depth > MAX_DEPTH:
+        fault = f"must be nested at most {MAX_DEPTH} deep"
     if fault:
         named = printable(key, 80)
         raise InputError(f"{label}: {named or 'the value'} {fault}", key=named or None)
@@ -304,7 +304,7 @@ def _fault(value: Any, largest: float = LARGEST) -> str | None:
     if isinstance(value, bool):
         return None
     if isinstance(value, int):
-        if not WHOLE[0] <= value <= WHOLE[1]:
+        if not INTEGERS[0] <= value <= INTEGERS[1]:
             return f"is a whole number of {value.bit_length()} bits, but may have at most 64"
     elif isinstance(value, float):
         # NaN and infinity are checked where the meaning of the value is known.
@@ -312,8 +312,8 @@ def _fault(value: Any, largest: float = LARGEST) -> str | None:
             return f"must be 0 or a size from {SMALLEST:g} to {largest:g}, not {value!r}"
     elif isinstance(value, str | Path):
         text = str(value)
-        if len(text) > LONGEST:
-            return f"is a text of {len(text)} characters, but may have at most {LONGEST}"
+        if len(text) > MAX_TEXT:
+            return f"is a text of {len(text)} characters, but may have at most {MAX_TEXT}"
         if not text.isprintable() and (bad := next((c for c in text if c == "\0" or "\ud800" <= c <= "\udfff"), None)):
             return f"= {shortened(text)} must not hold the character {bad!r}"
     return None
@@ -329,16 +329,16 @@ def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
 
 
 #: Largest number of values of a header with expanded aliases; a few KiB of aliases can expand to 1e9 values.
-MOST_VALUES = 100_000
+MAX_VALUES = 100_000
 #: Largest number of characters of a header; YAML in pure Python takes half a minute for a megabyte.
-MOST_HEADER = 256 * 2**10
+MAX_HEADER = 256 * 2**10
 #: A cell in quotes, and a quote that begins one; others are units, as in ``-3°00'00"``.
 _QUOTED, _OPEN = re.compile(r'(?:^|(?<=[,;|\t ]))"(?:[^"]|"")*"(?=[,;|\t ]|$)'), re.compile(r'(?:^|[,;|\t ])"')
 
 
 def read_ecsv(path: str | Path, kind: str, remedy: str = "give an ECSV table") -> Table:
-    """Read an ECSV file; errors of its form end with the remedy."""
-    return parse_ecsv(*text_and_name(path, kind), remedy)
+    """Read an ECSV file; the message on one that cannot be parsed ends with the remedy."""
+    return parse_ecsv(*text_and_label(path, kind), remedy)
 
 
 def parse_ecsv(text: str, label: str, remedy: str = "give an ECSV table") -> Table:
@@ -369,8 +369,8 @@ class Numbers:
         return self.columns[name]
 
 
-def text_and_name(path: str | Path, kind: str) -> tuple[str, str]:
-    """Read the text of a file, and return it with the file's name for messages."""
+def text_and_label(path: str | Path, kind: str) -> tuple[str, str]:
+    """Read the text of a file, which may be compressed, and return it with the file's label for messages."""
     label = f"{kind} {shortened(str(path))}"
     return as_text(unpacked(read_bytes(Path(path), kind), label), label), label
 
@@ -402,13 +402,13 @@ def parse_numbers(text: str, label: str) -> Numbers:
 
 
 def check_header(lines: list[str], label: str) -> None:
-    """Raise InputError if a header is longer than `MOST_HEADER` or its aliases expand to more than `MOST_VALUES`."""
+    """Raise InputError if a header is longer than `MAX_HEADER` or its aliases expand to more than `MAX_VALUES`."""
     import yaml  # comes with astropy
 
     header = [line[2:] for line in lines if line.startswith("# ")]
     size = sum(map(len, header))
-    if size > MOST_HEADER:
-        raise InputError(f"{label} must have a header of at most {MOST_HEADER} characters, not {size}", key="file")
+    if size > MAX_HEADER:
+        raise InputError(f"{label} must have a header of at most {MAX_HEADER} characters, not {size}", key="file")
     if not any("*" in line for line in header):
         return
     with parsing(label, "give an ECSV table"):
@@ -420,17 +420,20 @@ def check_header(lines: list[str], label: str) -> None:
         for item in inner if isinstance(inner, list) else ():
             waiting += item if isinstance(item, tuple) else (item,)
         count += 1
-        if count + len(waiting) >= MOST_VALUES:
-            raise InputError(f"{label} must have a header that expands to fewer than {MOST_VALUES} values", key="file")
+        if count + len(waiting) >= MAX_VALUES:
+            raise InputError(f"{label} must have a header that expands to fewer than {MAX_VALUES} values", key="file")
 
 
 def check_cells(lines: list[str], label: str) -> None:
-    """Raise InputError for cells that extend over lines, and for a wide line of many, whose width all would take."""
+    """Raise InputError for cells that extend over lines, for long lines, and for more content than may be read.
+
+    Arrays of texts give each line the width of the longest, so one wide line of many takes a large memory.
+    """
     widest = max(map(len, lines), default=0)
     shape = f"{len(lines)} lines, of which the longest has {widest} characters"
     check_content(widest * len(lines), f"{label} has {shape}; if all were as long, they must have at most")
-    if widest > LONGEST_LINE:
-        raise InputError(f"{label} has a line of {widest} characters, but may have at most {LONGEST_LINE}", key="file")
+    if widest > MAX_LINE:
+        raise InputError(f"{label} has a line of {widest} characters, but may have at most {MAX_LINE}", key="file")
     odd = next((n for n, line in enumerate(lines, 1) if '"' in line and _OPEN.search(_QUOTED.sub("", line))), None)
     if odd is not None:
         raise InputError(f"{label} must have one line per row, but a cell extends beyond row {odd}", key="file")

@@ -145,8 +145,8 @@ def _bytes_at(file: IO[bytes], start: int, stop: int) -> bytes:
 def check_sums(hdus: Any, file: IO[bytes]) -> None:
     """Raise InputError if DATASUM or CHECKSUM (FITS standard 4.0, section 4.4.2.7) contradict the bytes.
 
-    The sum of all words of a header and its data is zero, as is the complement of zero, with or without DATASUM.
-    astropy's check leaves the data out where there is no DATASUM.
+    In the standard's arithmetic the words of a header with CHECKSUM and of its data add up to zero, with or without
+    DATASUM. astropy's check leaves the data out if there is no DATASUM.
     """
     for number, hdu in enumerate(hdus):
         keywords = {key: text_at(hdu.header, key) for key in ("DATASUM", "CHECKSUM")}
@@ -157,7 +157,7 @@ def check_sums(hdus: Any, file: IO[bytes]) -> None:
         data_sum, key = _sum(file, data, data + place["datSpan"]), ""
         if keywords["DATASUM"].isdigit() and (int(keywords["DATASUM"]) - data_sum) % 0xFFFFFFFF:
             key = "DATASUM"
-        # A blank value is that of a sum which is not defined; one of zeros is that before the sum was computed.
+        # A blank value means that the sum is not defined, and zeros that it has not been computed yet.
         elif len(keywords["CHECKSUM"]) == 16 and set(keywords["CHECKSUM"]) != {"0"}:
             key = "CHECKSUM" if (data_sum + _sum(file, header, data)) % 0xFFFFFFFF else ""
         if key:
@@ -167,7 +167,7 @@ def check_sums(hdus: Any, file: IO[bytes]) -> None:
 
 
 def _sum(file: IO[bytes], start: int, stop: int) -> int:
-    """Return the sum of the 32-bit words of a part of a file, whose carries appendix J of the standard adds to it."""
+    """Return the sum of the 32-bit words of a part of a file, without the carries that appendix J adds back to it."""
     total = 0
     for place in range(start, stop, PIECE):
         words = _bytes_at(file, place, min(place + PIECE, stop))
@@ -218,7 +218,7 @@ _AXIS_NAMES = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}
 
 
 def _number_at(headers: Sequence[Any], *keys: str) -> float | None:
-    """Return the number that the first of some headers with one of some keys has under the first of these."""
+    """Return the first number under one of the keys, of which each header is searched in turn; None without one."""
     for header in headers:
         for key in keys:
             value = header.get(key)
@@ -308,7 +308,7 @@ def _iraf_unit(header: Any) -> str:
 
 
 def _times(header: Any, number: int) -> tuple[bool, dict[str, Any]]:
-    """Return whether a column has two parts of a Julian date, as astropy writes times, and its keywords of times."""
+    """Return whether a column has Julian dates in two parts, as astropy writes times, and its keywords of times."""
     # The scale and the place of a column (standard 4.0, section 9.2).
     scale, place = (text_at(header, f"{key}{number}") for key in ("TCTYP", "TRPOS"))
     if scale.lower() not in SCALES.values():

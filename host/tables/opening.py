@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 #: Size of a text from which it is read in pieces, and of a piece, bytes.
 LARGE, PIECE = 16 * 2**20, 2**20
 #: Longest text of a cell, such as a date.
-CELL = 40
+MAX_CELL = 40
 
 
 class LargeTable(TableFile):
@@ -39,7 +39,8 @@ class LargeTable(TableFile):
         # One row has the names and units.
         self.table, self.n_rows, self.file = MemoryTable(first.table[:1], label), 0, file
         super().__init__(label, first.header, first.names, first.remarks)
-        self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
+        numeric = {name: _are_numbers(first.find(name)) for name in first.names}
+        self.row = np.dtype([(name, "f8" if is_numeric else f"U{MAX_CELL}") for name, is_numeric in numeric.items()])
         tables = itertools.chain([first], (MemoryTable(piece, label) for piece in pieces))
         del first
         for table in tables:
@@ -57,9 +58,9 @@ class LargeTable(TableFile):
             shifted = replace(column, read=lambda _: column.cells)
             return shifted.rows(slice(self.n_rows, self.n_rows + column.n_rows))
         texts = column.texts() or [str(number) for number in column.numbers().tolist()]
-        if any(len(text) > CELL for text in texts):
+        if any(len(text) > MAX_CELL for text in texts):
             fault = f"{self.label}: {column.name!r} must hold numbers or dates"
-            raise InputError(f"{fault}, but a cell has more than {CELL} characters", key=column.name)
+            raise InputError(f"{fault}, but a cell has more than {MAX_CELL} characters", key=column.name)
         return texts
 
     def _rows(self, piece: slice) -> Any:
@@ -80,8 +81,8 @@ class LargeTable(TableFile):
                       first.unit, self.label, self.row.itemsize, keywords=first.keywords)  # fmt: skip
 
 
-def _numbers(values: Values) -> bool:
-    """Return whether values are numbers, also as texts."""
+def _are_numbers(values: Values) -> bool:
+    """Return whether values are numbers, or texts of numbers."""
     try:
         values.numbers()
     except InputError:
@@ -126,9 +127,9 @@ def _pieces(text: IO[str], label: str, commas: bool) -> Iterator[Any]:
 
 
 def _check_head(size: int, label: str) -> None:
-    """Raise InputError for more than `MOST_HEADER` characters above the rows."""
-    if size > files.MOST_HEADER:
-        fault = f"{label} must have at most {files.MOST_HEADER} characters of comments and empty lines before its rows"
+    """Raise InputError for more than `MAX_HEADER` characters above the rows."""
+    if size > files.MAX_HEADER:
+        fault = f"{label} must have at most {files.MAX_HEADER} characters of comments and empty lines before its rows"
         raise InputError(fault, key="file")
 
 
@@ -192,7 +193,7 @@ def open_table(
             with open_fits(content, label, check=check) as hdus:
                 with files.reading(label, WHOLE):
                     table = of_fits(hdus, label)
-                yield _check_rows(table)
+                yield _not_empty(table)
         elif form == "HDF5" and of_hdf5 is not None:
             with of_hdf5(content, label) as stored:
                 yield stored
@@ -202,9 +203,9 @@ def open_table(
         elif form == "VOTable":
             if (first := next(votables(content.read(), label), None)) is None:
                 raise InputError(f"{label} has no table, but needs one", key="file")
-            yield _check_rows(first)
+            yield _not_empty(first)
         else:
-            yield _check_rows(MemoryTable(text_table(text_in(form, content.read(), label), label, commas), label))
+            yield _not_empty(MemoryTable(text_table(text_in(form, content.read(), label), label, commas), label))
 
 
 #: Forms of files that are not read, by their first bytes.
@@ -280,11 +281,12 @@ def votables(content: bytes, label: str) -> Iterator[MemoryTable]:
 
 
 def _parameters(parameters: Iterable[Any]) -> dict[str, Any]:
+    """Return the values of a VOTable's parameters by name."""
     return {str(parameter.name or parameter.ID): parameter.value for parameter in parameters}
 
 
-def _check_rows(file: TableFile) -> TableFile:
-    """Return a file; raise InputError if it has no rows."""
+def _not_empty(file: TableFile) -> TableFile:
+    """Return a file; raise InputError if it has neither a column nor an image."""
     if not file.names:
         fault = f"{file.label} has no table and no image"
         raise InputError(f"{fault}; give a row for each frame, star or flare", key="file")

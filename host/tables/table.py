@@ -50,7 +50,7 @@ def number_in(cell: str) -> float:
     return float(re.sub(r"([\d.])[dD](?=[+-]?\d)|^([+-]?\d*\.\d*)(?=[+-]\d{3}$)", r"\1\2e", cell))
 
 
-#: Values of at least the first, and those equal to the second, are missing: IRAF's INDEF, NetCDF's 9.97e36.
+#: Values are missing if they are at least INDEFINITE, as IRAF's INDEF and NetCDF's 9.97e36, or equal to MISSING.
 INDEFINITE, MISSING = 9e36, 1e30
 
 
@@ -63,7 +63,7 @@ def without_indefinite(values: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """Values with a row for each frame, or one for each pixel."""
+    """Column or image of a file, which is read when it is used: a row for each frame, or a value for each pixel."""
 
     name: str
     shape: tuple[int, ...]
@@ -178,6 +178,7 @@ def as_one_array(cells: Any) -> Any:
 
 
 def _plain(text: Any) -> str:
+    """Return a text or bytes of UTF-8 without blanks at its ends."""
     return (text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)).strip()
 
 
@@ -225,8 +226,8 @@ def ends_of(values: Float) -> tuple[float, float]:
     return float(np.min(values, initial=0.0, where=finite)), float(np.max(values, initial=0.0, where=finite))
 
 
-def marks_in(light: Values, ends: tuple[float, float], one: str, several: str) -> tuple[list[float], list[str]]:
-    """Return values that mark missing ones, such as -99 and 9999, and remarks on `one` or `several` of them.
+def marks_in(light: Values, ends: tuple[float, float], singular: str, plural: str) -> tuple[list[float], list[str]]:
+    """Return values that mark missing ones, such as -99 and 9999, and remarks that call the values by a noun.
 
     A mark consists of nines. Either it occurs once and is a thousand times larger than all other values, or it occurs
     more often and is three times larger, or three times as far below zero. Light, whose ends `ends_of` returns,
@@ -246,12 +247,12 @@ def marks_in(light: Values, ends: tuple[float, float], one: str, several: str) -
         if n_unmarked and abs(mark) > (3 if n > 1 else 1000) * beyond:
             marks += [mark, -mark]
             words = "marks a missing value and is" if n == 1 else "mark missing values and are"
-            remarks.append(f"{n} {one if n == 1 else several} of {mark:.7g} {words} left undefined")
+            remarks.append(f"{n} {singular if n == 1 else plural} of {mark:.7g} {words} left undefined")
     return marks, remarks
 
 
 class TableFile(ABC):
-    """A file with frames: its named values, and the keywords of its header."""
+    """Open file: its columns and images by name, and the keywords of its header."""
 
     def __init__(
         self,
@@ -285,6 +286,7 @@ class TableFile(ABC):
         return [name for name in self.names if fnmatch.fnmatch(name.lower(), pattern.lower())]
 
     def _side_by_side(self, pattern: str) -> Values | None:
+        """Return the columns that a pattern fits as one image; None if it fits none."""
         columns = [self.find(name) for name in self.matching(pattern)]
         if not columns:
             return None

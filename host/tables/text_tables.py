@@ -49,7 +49,7 @@ SAMPLE = 50
 
 
 def read_columns(kind: str, noun: str, path: Path, unit: str = "") -> Float:
-    """Read times and values from a file, shape (n, 2), see `columns`; `kind` and `noun` name both in messages."""
+    """Read times and values from a file, shape (n, 2); see `columns`. `kind` and `noun` name file and values."""
     return columns(f"{kind} {shortened(path.name)}", read_text(path, kind), f"times and {noun}", unit)
 
 
@@ -90,19 +90,25 @@ def _in_unit(values: Float, header: str, unit: str) -> Float:
 
 
 class NumberLines:
-    """Header and rows of a text that should hold the `expected` numbers; columns are parsed when they are read."""
+    """Header and rows of a text of numbers, which `expected` names in messages; columns are parsed when they are read.
+
+    Unlike `rows_of_text`, it takes every line above the first row of numbers for a header, which may be prose, and
+    columns that nobody reads may hold anything.
+    """
 
     def __init__(self, text: str, expected: str) -> None:
         self.expected = expected
-        #: Lines above the rows without their marks, and all comments, and whether each is one.
+        #: Lines above the rows, and all comments without their marks; whether each is a comment.
         self.header: list[tuple[str, bool]] = []
-        #: Number and text of the line of each row, and messages on how these are read.
+        #: Number and text of the line of each row.
         self.lines: list[tuple[int, str]] = []
+        #: Statements on how the rows are read.
         self.messages: list[str] = []
         numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if not _RULE.fullmatch(line)]
         comments = {number for number, line in numbered if _COMMENT.match(line) and not _BARRED.match(line)}
         start = _first_row([(number, line) for number, line in numbered if number not in comments])
         for number, line in numbered:
+            # A heading between marks, as of IPAC, stands above the rows.
             if number in comments and not (line.lstrip()[0] == "|" and self.lines):
                 self.header.append((_remark(line), True))
             elif number < start:
@@ -117,7 +123,7 @@ class NumberLines:
         self.cells = _split(rows, mark)
         self.n = len(self.cells[0])
         if _has_decimal_commas(self.cells, "it"):
-            self.cells = _with_points(self.cells)
+            self.cells = _replace_decimal_commas(self.cells)
             self.messages.append(DECIMAL_COMMAS)
         are_whole = all(len(row) > 1 and row[1].isdecimal() and "." not in "".join(row) for row in self.cells[:SAMPLE])
         if mark == "," and len(rows) > 1 and are_whole:
@@ -153,7 +159,7 @@ def _first_row(lines: Sequence[tuple[int, str]]) -> float:
     starting = []
     for place, (number, line) in enumerate(lines):
         first = re.split(r"[\s;|]+|,\s|,(?=[^\d])", line.strip().strip("|").strip())[0]
-        if not _is_numeric(first.strip("\"'(")):
+        if not _begins_with_number(first.strip("\"'(")):
             continue
         starting.append(number)
         cells = re.split(r"[\s;|]+", line.strip())
@@ -162,12 +168,13 @@ def _first_row(lines: Sequence[tuple[int, str]]) -> float:
             # The numbers of rows and of other columns, as in POLARBASE's spectra.
             continue
         # A line of a preamble, such as "2 columns" or "912 s", has no second number.
-        if sum(_is_numeric(cell) or is_missing(cell) for cell in cells) > 1:
+        if sum(_begins_with_number(cell) or is_missing(cell) for cell in cells) > 1:
             return number
     return starting[0] if starting else float("inf")
 
 
-def _is_numeric(cell: str) -> bool:
+def _begins_with_number(cell: str) -> bool:
+    """Return whether a cell is a number, which brackets or marks may follow."""
     return _NUMBER.match(cell) is not None or cell.lower() in ("nan", "inf", "-inf")
 
 
@@ -211,14 +218,14 @@ def rows_of_text(
     is_comment = [bool(_COMMENT.match(line)) and not marked.match(line.removeprefix("#")) for line in lines]
     data = [line for line, comment in zip(lines, is_comment, strict=True) if not comment]
     comments = [line for line, comment in zip(lines, is_comment, strict=True) if comment]
-    cells = _with_dates(_split(data, mark))
+    cells = _join_dates(_split(data, mark))
     if layout is None:
         n_above = next((k for k, comment in enumerate(is_comment) if not comment), len(lines))
-        layout, cells = _divided(cells, [_remark(line) for line in lines[:n_above]], data, mark, label)
+        layout, cells = _find_columns(cells, [_remark(line) for line in lines[:n_above]], data, mark, label)
     elif layout.trailing:
         cells = [row[:-1] for row in cells]
     if layout.decimal:
-        cells = _with_points(cells)
+        cells = _replace_decimal_commas(cells)
     n = len(layout.names)
     if odd := next(((number, len(row)) for number, row in enumerate(cells, first + 1) if len(row) != n), None):
         # The file may be cut short.
@@ -236,7 +243,7 @@ def rows_of_text(
     return table, layout
 
 
-def _divided(
+def _find_columns(
     cells: list[list[str]], above: list[str], lines: list[str], mark: str, label: str
 ) -> tuple[Layout, list[list[str]]]:
     """Find the names and units of columns, and return them with the rows."""
@@ -253,7 +260,7 @@ def _divided(
         cells = [*cells[:at], head if head[-1] else head[:-1], *(row[:-1] for row in rows)]
     n = len(cells[at])
     is_row = all(map(_is_cell_of_row, cells[at]))
-    is_headed = not is_row and not any(map(_is_finite, cells[at])) and not _are_dashes(cells[at])
+    is_headed = not is_row and not any(map(_is_number, cells[at])) and not _are_dashes(cells[at])
     names, units = ([], []) if is_headed else _names_above(n, [*above, *lines[:at]], mark)
     if is_row and not names:
         if at:
@@ -262,17 +269,8 @@ def _divided(
         names = [f"col{k + 1}" for k in range(n)]
     elif not names:
         names, at = cells[at], at + 1
-    first, second = [*cells[at : at + 2], [], []][:2]
-    if _are_dashes(second) and not any(map(_is_finite, first)):
-        # VizieR writes units and dashes below the names.
-        units, at = first, at + 2
-    elif _are_dashes(first):
-        at += 1
-    elif not any(_is_cell_of_row(cell) and not is_missing(cell) for cell in first) and any(
-        _is_unit(cell) for cell, number in zip(first, second, strict=False) if _is_finite(number)
-    ):
-        # Units of the numbers below them.
-        units, at = first, at + 1
+    units_below, n_lines = _units_below(cells[at:])
+    units, at = units_below or units, at + n_lines
     if not mark and all(name.endswith(",") for name in names[:-1]):
         # Commas divide the names and blanks the rows.
         names = [name.rstrip(",") for name in names]
@@ -282,16 +280,30 @@ def _divided(
     plain = [in_brackets(unit.strip("\"'")) for unit in units]
     stated_units = tuple(unit if is_stated(unit) else "" for unit in plain)
     decimal = _has_decimal_commas(cells[at:], label)
-    return Layout(mark, decimal, tuple(_distinct(names)), stated_units, trailing), cells[at:]
+    return Layout(mark, decimal, tuple(_distinct_names(names)), stated_units, trailing), cells[at:]
+
+
+def _units_below(rows: list[list[str]]) -> tuple[list[str], int]:
+    """Return the units in the first lines below the names, and the number of these lines that hold no values."""
+    first, second = [*rows[:2], [], []][:2]
+    if _are_dashes(second) and not any(map(_is_number, first)):
+        # VizieR writes units and dashes.
+        return first, 2
+    if _are_dashes(first):
+        return [], 1
+    if any(_is_cell_of_row(cell) and not is_missing(cell) for cell in first):
+        return [], 0
+    has_units = any(_is_unit(cell) for cell, number in zip(first, second, strict=False) if _is_number(number))
+    return (first, 1) if has_units else ([], 0)
 
 
 def _names_above(n: int, above: list[str], mark: str) -> tuple[list[str], list[str]]:
     """Return the names in the last line above the rows, and the units in it or below it; empty without names."""
-    numbered = numbered_names((line for line in above if line.lower().startswith("col")), n)
+    numbered = names_by_number((line for line in above if line.lower().startswith("col")), n)
     if len(numbered) > 1:
         return [numbered.get(k, f"col{k + 1}") for k in range(n)], []
     last = ["", "", *above][-2:]
-    names, units = ([] if keywords_of([f"#{line}"]) else divided_names(line, n, mark) for line in last)
+    names, units = ([] if keywords_of([f"#{line}"]) else divide_names(line, n, mark) for line in last)
     if names and units and all(_is_unit(cell) for cell in units if is_stated(cell)):
         return names, units
     return units, []
@@ -332,7 +344,7 @@ def _mark(lines: Sequence[str], commas: bool) -> str:
         scores[mark] = counts.most_common(1)[0][1] if counts else 0
     best = max(MARKS, key=scores.__getitem__)
     words = [line.split() for line in sample[-5:]]
-    blanks = all(len(row) > 1 and all(map(_is_finite, row)) for row in words) and bool(words)
+    blanks = all(len(row) > 1 and all(map(_is_number, row)) for row in words) and bool(words)
     if commas and not (blanks and best == ","):
         return best if scores[best] else "," if not blanks else ""
     # Commas may stand in prose, and decimal commas between columns that blanks divide.
@@ -364,7 +376,7 @@ def _split(lines: Sequence[str], mark: str) -> list[list[str]]:
         return [list(map(plain, row)) for row in rows]
 
 
-def _with_dates(cells: list[list[str]]) -> list[list[str]]:
+def _join_dates(cells: list[list[str]]) -> list[list[str]]:
     """Join dates with the times of day next to them, under the names of the dates."""
     last = cells[-1] if cells else []
     for at in range(len(last) - 1):
@@ -388,19 +400,19 @@ def _has_decimal_commas(rows: list[list[str]], label: str) -> bool:
     return True
 
 
-def _with_points(rows: list[list[str]]) -> list[list[str]]:
+def _replace_decimal_commas(rows: list[list[str]]) -> list[list[str]]:
     """Return cells with points for decimal commas."""
     return [[cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in row] for row in rows]
 
 
-def divided_names(line: str, n: int, mark: str = "") -> list[str]:
+def divide_names(line: str, n: int, mark: str = "") -> list[str]:
     """Divide a line of a header into a name for each of `n` columns; return an empty list if it has another number."""
     if n < 2 or PROSE.search(line):
         return []
     line = re.sub(r"^\s*(?:units?(?:\s*[:=]|\s)|(?:columns?|names?)\s*[:=])\s*", "", line, flags=re.IGNORECASE)
     divisions = [line.strip("|").split(divider) for divider in ((mark,) if mark else ",;|\t") if divider in line]
     if not mark:
-        divisions += [bracketed(line), line.split(), re.split(r"\s{2,}", line.strip())]
+        divisions += [divide_outside_brackets(line), line.split(), re.split(r"\s{2,}", line.strip())]
     for division in divisions:
         cells = [cell.strip().strip("\"'").strip() for cell in division]
         if len(cells) == n and any(cells):
@@ -409,13 +421,13 @@ def divided_names(line: str, n: int, mark: str = "") -> list[str]:
     return []
 
 
-def bracketed(line: str) -> list[str]:
+def divide_outside_brackets(line: str) -> list[str]:
     """Divide at blanks and commas, but keep a unit in brackets with the preceding name."""
     brackets = r"[\[(](?:[^\[\]()]|\([^()]*\))*[\])]"
     return re.findall(rf"[^\s\[(,]+(?:\s+in\s+[^\s,]+|(?:\s*{brackets})+[^\s,]*)?|{brackets}", line)
 
 
-def _distinct(names: list[str]) -> list[str]:
+def _distinct_names(names: list[str]) -> list[str]:
     """Name columns that have no name, and number names that occur twice."""
     names = [name or f"col{k + 1}" for k, name in enumerate(names)]
     while twice := [name for name, count in Counter(names).items() if count > 1]:
@@ -425,10 +437,10 @@ def _distinct(names: list[str]) -> list[str]:
 
 def _is_cell_of_row(cell: str) -> bool:
     """Return whether a cell is a number, a date or missing, and thus not a name."""
-    return is_dated(cell) or is_missing(cell) or _is_finite(cell)
+    return is_dated(cell) or is_missing(cell) or _is_number(cell)
 
 
-def _is_finite(cell: str) -> bool:
+def _is_number(cell: str) -> bool:
     """Return whether a cell is a number that is not missing."""
     try:
         return not np.isnan(number_in(cell))
@@ -450,7 +462,7 @@ def _is_unit(text: str) -> bool:
 _NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-]?\s+(.+)", re.IGNORECASE)
 
 
-def numbered_names(lines: Iterable[str], n: int) -> dict[int, str]:
+def names_by_number(lines: Iterable[str], n: int) -> dict[int, str]:
     """Return the names that lines such as "column 2: flux" give to some of `n` columns, by place."""
     names: dict[int, str] = {}
     for line in lines:

@@ -81,7 +81,7 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
         return u.CompositeUnit(1e-9, [u.AB], [1])
     expected = "a unit such as Angstrom, nm or erg / (s cm2 Angstrom)"
     if match := _LOGARITHM.fullmatch(name):
-        return u.dex(_linear_unit(balanced(match[1]), text, expected)) if match[1] else u.dex
+        return u.dex(_linear_unit(balance_brackets(match[1]), text, expected)) if match[1] else u.dex
     if NO_FLUX.search(name):
         raise InputError.of("unit", text.strip(), f"a flux density, not a magnitude or count: {expected}")
     return _linear_unit(name, text, expected)
@@ -114,6 +114,7 @@ def _scale_and_name(name: str) -> tuple[float, str]:
 
 
 def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
+    """Parse the name of a unit that is no logarithm; messages quote the `text` and what was `expected` instead."""
     import astropy.units as u
 
     unknown = InputError.of("unit", text.strip(), f"a known unit: {expected}")
@@ -127,7 +128,7 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
         usual = f"a unit such as '1e{-abs(power)} erg / (s cm2 Angstrom)': `flux_unit` names it"
         raise InputError(f"{fault}; give {usual}", key="unit")
     scale, name = _scale_and_name(name)
-    name = balanced(name.rstrip(". "))
+    name = balance_brackets(name.rstrip(". "))
     if name not in ("MJy", "MJY"):
         name = _DENSITIES.get(name.lower(), name)
     per_wavenumber = _PER_WAVENUMBER.search(name) is not None
@@ -155,7 +156,7 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     raise unknown
 
 
-def balanced(name: str) -> str:
+def balance_brackets(name: str) -> str:
     """Remove brackets that enclose the whole name or have no partner."""
     while name[:1] == "(" and (name.count("(") > name.count(")") or re.fullmatch(r"\([^()]*\)", name)):
         name = name[1:]
