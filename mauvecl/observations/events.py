@@ -360,9 +360,9 @@ class ObservedEvent:
 def measure_events(
     survey: SeriesSurvey, in_events: Bool, detected: Sequence[DetectedEvent], causes: Sequence[Kind], steps: Steps
 ) -> list[ObservedEvent]:
-    """Measure detected events in order of time; their frames are `in_events`, and `causes` follow from their spectra.
+    """Measure detected events in order of time; `causes` are those of their spectra, or else flares.
 
-    Weaker events next to a step or a dip belong to it. `steps` reports each event.
+    A weaker event next to a step or a dip belongs to it, and has its kind. `steps` reports each event.
     """
     level = survey.flux_level(~in_events)
     pairs = list(zip(detected, causes, strict=True))

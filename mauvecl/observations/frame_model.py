@@ -248,34 +248,33 @@ class CleanedSpectra:
 def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     """Replace single bad values of spectra, as of particles, by a fit to the other pixels of their frame.
 
-    Flares, and changes of the star, the dark current and the sky, change many pixels. Pixels that are not finite in a
-    frame without a fault are left out of all frames.
+    Flares, and changes of the star, the dark current and the sky, change many pixels. Resolution elements whose pixels
+    all saturate are left out.
     """
     usable = frames.faults == 0
-    fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
-    if not fine.any() or not usable.any():
-        raise InputError(f"{frames.name}: at least one pixel must be finite in every frame, but none is", key="flux")
-    model = replace(model, bins=model.bins[fine], per_dn=model.per_dn[fine])
+    recorded = model.bins.sum(axis=1) > 0
+    model = replace(model, bins=model.bins[recorded], per_dn=model.per_dn[recorded])
     assert frames.wavelength_nm is not None
-    flux = frames.flux[:, fine]
+    flux = frames.flux[:, recorded]
     # Sums of pixels do not saturate.
     single = model.raw & (model.bins.sum(axis=1) == 1)
     ceiling = np.where(single, model.quiet.n_frames * model.quiet.ceiling_dn, np.inf)
     saturated = usable & (flux >= ceiling).any(axis=1)
     flux = flux - model.offset
     good = usable & ~saturated
-    if not good.any():
-        raise InputError(f"{frames.name}: at least one frame must be below saturation, but none is", key="flux")
+    if not good.any() or not recorded.any():
+        fault = "at least one frame must be without a fault and below saturation, but none is"
+        raise InputError(f"{frames.name}: {fault}", key="frames")
     light = np.median(flux[good], axis=0)
     if frames.error is None:
         noise = np.sqrt(model.variance(light))
         error = np.broadcast_to(noise, flux.shape)
     else:
-        error = frames.error[:, fine]
+        error = frames.error[:, recorded]
         noise = np.median(error[good], axis=0)
     rays = np.zeros(frames.n_frames, np.int64)
     rays[good] = _replace_rays(flux, np.flatnonzero(good), light, noise, model, frames.numbers)
-    cleaned = replace(frames, flux=flux, error=error, wavelength_nm=frames.wavelength_nm[fine])
+    cleaned = replace(frames, flux=flux, error=error, wavelength_nm=frames.wavelength_nm[recorded])
     return CleanedSpectra(cleaned, model, rays, noise, frames.error is not None, saturated)
 
 

@@ -57,7 +57,7 @@ class Filter:
     peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
     norms: Float  # shape (n_sum, n_onset)
     unsolved: Bool  # shape (n_sum, n_onset); whether a norm must be solved exactly before it is used
-    lost: Float  # shape (n_sum, n_onset); what the unknown level takes from the norms
+    lost: Float  # shape (n_sum, n_onset); part of the norms that is lost because the level is fitted
     weights: Float  # shape (n_direction, n_sum); squared directions of the bank
     without_gaps: Float  # shape (n_direction, 1); squared denominator without gaps and with constant noise
 
@@ -323,9 +323,10 @@ class SeriesSurvey:
         cls, frames: Frames, flux: Float, variance: Float, used: Bool, level: float, photon: float, shape: Shape,
         counts: float = 0.0, weighted: tuple[Templates, Float] | None = None,
     ) -> SeriesSurvey:  # fmt: skip
-        """Prepare the frames that can be searched, `used`, without a process; see the attributes.
+        """Prepare the search of the `used` frames, without a process yet.
 
-        The flux is searched, or sums of spectra, which are given by `weighted` with their templates.
+        Flux and its variance have the shape (n_frame,), of all frames; for the others see the attributes. The flux
+        itself is searched, or else the sums of spectra in `weighted`, shape (n_frame, n_sum), with their templates.
         """
         stare, scale, typical = stare_of(frames, used), float(np.sqrt(np.median(variance[used]))), abs(level)
         net, relative_variance = flux[used] / scale, variance[used] / scale**2
@@ -392,7 +393,7 @@ def stare_of(frames: Frames, used: Bool) -> Stare:
 
 
 def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
-    """Return the template bank for a stare."""
+    """Return the template bank for a stare, with half-widths from its cadence to a share of its longest part."""
     low = NARROWEST * stare.frame_s
     gaps = np.flatnonzero(np.diff(stare.numbers) * stare.frame_s > DAY_S) + 1
     longest = int(np.diff(np.concatenate([[0], gaps, [stare.n_frames]])).max())
@@ -467,9 +468,9 @@ def simulated_rates(
 ) -> tuple[SimulatedRate, SimulatedRate]:
     """Return the false-alarm rates in light curves of the fitted process, and in those of measured residuals.
 
-    The noise of the first is normal, or Poisson noise for counts; that of the second are blocks of the residuals of
-    quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough are drawn for
-    `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
+    The noise of the first is normal, or Poisson noise for counts; that of the second consists of blocks of the
+    residuals of `quiet` frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough light curves
+    are drawn for `MIN_ALARMS` at the smallest rate of interest, per star-day, within limits. `steps` reports batches.
     """
     residual, beginning = innovations(survey, quiet), survey.frames(slice(MAX_LENGTH))
     n, n_sum = beginning.sums.shape
@@ -515,7 +516,7 @@ def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
 
 
 def block_length(residual: Float) -> int:
-    """Return the number of consecutive residuals to draw together: beyond the first insignificant correlation."""
+    """Return the number of consecutive residuals that are drawn together, beyond the lags at which they correlate."""
     n = residual.size
     centred = residual - residual.mean()
     power = float(centred @ centred)
