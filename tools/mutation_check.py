@@ -393,7 +393,7 @@ MUTATIONS: dict[str, Mutation] = {
     "statistics of a known level": (
         "test_statistics_have_unit_variance_over_gaps_and_changing_noise[process0-300-0.05-0.02-0-at-once]",
         (
-            "_correlate(on_grid, shape, first)[peaks] ** 2 / level.sum()",
+            "_correlate(on_grid, shape, first)[peaks] ** 2 / level_weights.sum()",
             "0.0 * _correlate(on_grid, shape, first)[peaks]",
         ),
     ),
@@ -518,7 +518,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "one star without errors of its spectrum": (
         "test_one_star_determines_throughput_alone",
-        ("apart * _linear_basis(nm)", "0.0 * _linear_basis(nm)"),
+        ("unfitted_error * _linear_basis(nm)", "0.0 * _linear_basis(nm)"),
     ),
     "a wider line that is narrower": (
         "test_fit_recovers_values_and_throughput",
@@ -530,7 +530,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "a colour relative to a known star": (
         "test_tables_of_default_questions_are_unchanged[analyse-spectra]",
-        ("/ count**2 + (error[quiet] ** 2).sum(axis=0) / base**2", "/ count**2"),
+        ("/ n_event**2 + (error[quiet] ** 2).sum(axis=0) / n_quiet**2", "/ n_event**2"),
     ),
     "light lost taken for light gained": (
         "test_loss_and_return_are_found_at_their_frames_with_their_size",

@@ -20,14 +20,14 @@ from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import NoiseComparison, QuiescentLevel, Scatter, binned_scatter, likeness
 from mauvecl.observations.light_curve import survey_light_curve
-from mauvecl.observations.process import UNREPORTED, Steps
+from mauvecl.observations.process import Steps
 from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey, SimulatedRate, innovations, simulated_rates
 from mauvecl.schema.fields import DAY_S
 from mauvecl.search.completeness import size_at
 
-#: Default numbers of half-widths, sizes and peak times.
+#: Numbers of half-widths, sizes and peak times of injected flares.
 WIDTHS, SIZES, TIMES = 4, 12, 40
-#: Injections that are searched together, and the largest number of consecutive frames into which they are made.
+#: Injections that are searched together, a divisor of `TIMES`, and the largest number of frames of an injection.
 BATCH, MAX_FRAMES = 10, 2**15
 #: Range of sizes, in equivalent durations whose S/N without a baseline equals these multiples of the threshold.
 RANGE = (0.5, 4.0)
@@ -54,34 +54,31 @@ class InjectionCompleteness:
 
 
 def inject(
-    survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int, temperature_k: float = NO_COLOUR_K,
-    steps: Steps = UNREPORTED,
-) -> InjectionCompleteness:  # fmt: skip
+    quiet: SeriesSurvey, threshold: float, seed: int, temperature_k: float, steps: Steps
+) -> InjectionCompleteness:
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
-    They are injected into `free` frames, which belong to no event; the others are left out. `steps` reports each width.
+    They are injected into `quiet` frames, which belong to no event. `steps` reports each half-width.
     """
-    free_frames = np.flatnonzero(free)
+    n_frames, frame_s, bank = quiet.stare.n_frames, quiet.stare.frame_s, quiet.bank
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
-    bank, frame_s = survey.bank, survey.stare.frame_s
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
-    kelvin = survey.templates.nearest(temperature_k)
-    direction = survey.templates.directions[kelvin]
-    photon_noise = np.linalg.cholesky(survey.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
-    size_of = float(np.linalg.norm(direction))
+    kelvin = quiet.templates.nearest(temperature_k)
+    direction = quiet.templates.directions[kelvin]
+    photon_noise = np.linalg.cholesky(quiet.templates.noise[kelvin] + 1e-300 * np.eye(direction.size))
+    unit_snr = float(np.linalg.norm(direction))
     durations, detected = np.zeros((WIDTHS, SIZES)), np.zeros((WIDTHS, SIZES), np.int64)
     for w, width in steps.track(enumerate(widths.tolist()), WIDTHS):
-        if w == 0 or free_frames.size > MAX_FRAMES:
+        if w == 0 or n_frames > MAX_FRAMES:
             # Part of a long light curve, another one for each half-width.
-            start = int(rng.integers(max(free_frames.size - MAX_FRAMES, 0) + 1))
-            segment = survey.frames(np.isin(np.arange(free.size), free_frames[start : start + MAX_FRAMES]))
+            start = int(rng.integers(max(n_frames - MAX_FRAMES, 0) + 1))
+            segment = quiet.frames(slice(start, start + MAX_FRAMES))
         starts = segment.stare.start_s
         edges = np.column_stack([starts, starts + frame_s])
-        amplitudes = threshold / (size_of * _typical_snr(segment, width)) * np.geomspace(*RANGE, SIZES)
+        amplitudes = threshold / (unit_snr * _typical_snr(segment, width)) * np.geomspace(*RANGE, SIZES)
         durations[w] = amplitudes * width * bank.shape.equivalent_duration
-        for first in range(0, TIMES, BATCH):
-            count = min(BATCH, TIMES - first)
-            peaks = starts[rng.integers(starts.size, size=count)] + frame_s * rng.random(count)
+        for _ in range(0, TIMES, BATCH):
+            peaks = starts[rng.integers(starts.size, size=BATCH)] + frame_s * rng.random(BATCH)
             shapes = np.array([bank.shape.mean_over(edges, peak, width) for peak in peaks])
             # The photon noise of the flare itself, here for unit amplitude, is added to that of the frames.
             noise = rng.standard_normal((*shapes.shape, direction.size)) @ photon_noise.T
@@ -99,7 +96,7 @@ def _largest_near(
     Flares and their noise have the shape (n_flare, n_frame, n_sum), for unit amplitude. Statistics are linear in the
     sums, so that one search serves all amplitudes.
     """
-    count, size = peaks.size, amplitudes[:, None, None]
+    count, amplitude = peaks.size, amplitudes[:, None, None]
     best = np.full((amplitudes.size, count), -np.inf)
     for row, rho in survey.search.values(np.concatenate([survey.sums[None], flares, noise])):
         times = survey.search.peaks_s(row)
@@ -109,7 +106,8 @@ def _largest_near(
             near = searched & (np.abs(times - peak) <= reach)
             if near.any():
                 quiet, flare, flare_noise = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
-                best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * flare_noise).max((1, 2)))
+                values = quiet + amplitude * flare + np.sqrt(amplitude) * flare_noise
+                best[:, k] = np.maximum(best[:, k], values.max(axis=(1, 2)))
     return best
 
 
@@ -313,20 +311,25 @@ def analyse_frames(
         frames = series.cleaned.frames
     rates, threshold, candidates, dip = _thresholds(survey, level.quiet[level.used], rate, seed, rate_steps)
     detected, in_events = detect_events(survey, candidates, search_steps)
-    spectra = [None if series is None else spectral.event_spectrum(survey, series, in_events, one) for one in detected]
+    spectra = [
+        None if series is None else spectral.event_spectrum(survey, series, in_events, event) for event in detected
+    ]
     causes: list[Kind] = ["flare" if spectrum is None else spectrum.cause for spectrum in spectra]
     events = measure_events(survey, in_events, detected, causes, event_steps)
-    measurements = [
-        spectral.measure_flare(survey, series, in_events, event) if series is not None and measured.kind == "flare"
-        else "no spectra of the instrument are given" if series is None else f"its kind is {measured.kind}"
-        for measured, event in zip(events, detected, strict=True)
-    ]  # fmt: skip
+    measurements = list[Measurement | str]()
+    for measured, event in zip(events, detected, strict=True):
+        if series is None:
+            measurements.append("no spectra of the instrument are given")
+        elif measured.kind != "flare":
+            measurements.append(f"its kind is {measured.kind}")
+        else:
+            measurements.append(spectral.measure_flare(survey, series, in_events, event))
     quiet = ~in_events
     residual, numbers = innovations(survey, quiet), survey.stare.numbers[quiet]
     return Analysis(
         frames, frames.white_light[0], level, survey, rate, *rates,
         threshold=threshold, candidates=candidates, dip=dip, events=events, measurements=measurements,
-        completeness=inject(survey, quiet, threshold, seed, temperature_k, injection_steps),
+        completeness=inject(survey.frames(quiet), threshold, seed, temperature_k, injection_steps),
         scatter=binned_scatter(numbers, residual @ survey.bank.directions[len(survey.bank.directions) // 2]),
         residual=residual, quiet=quiet, likeness=likeness(numbers, residual), spectra=series, event_spectra=spectra,
     )  # fmt: skip
@@ -361,7 +364,7 @@ def _spectral_messages(spectra: spectral.SpectralSeries) -> Iterator[str]:
             f"{count} single values in {np.count_nonzero(cleaned.rays)} frames stand out from their spectrum, as "
             "cosmic rays do; a fit to the other pixels replaces them, and the table of frames counts them."
         )
-    if cleaned.stated_by == "instrument":
+    if not cleaned.has_errors:
         yield "The frames state no errors: the noise of each pixel is that of the instrument's model."
     if many := int(noise.departs.sum()):
         ratio = noise.measured / noise.stated

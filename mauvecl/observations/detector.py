@@ -40,9 +40,10 @@ class CalibrationFrames:
         if nm is None or nm.shape != own_nm.shape:
             expected = f"spectra of the {own_nm.size} pixels that {nominal.name} reads"
             raise InputError.of("frames", frames.flux.shape, expected, where=name)
-        off, most = float(np.abs(nm - own_nm).max()), nominal.resolution_element_nm
-        if off > most:
-            fault = f"the wavelengths must be within {most:g} nm of those of {nominal.name}, but differ by {off:.3g} nm"
+        offset, limit = float(np.abs(nm - own_nm).max()), nominal.resolution_element_nm
+        if offset > limit:
+            ends = f"within {limit:g} nm of those of {nominal.name}, but differ by {offset:.3g} nm"
+            fault = f"the wavelengths must be {ends}"
             raise InputError(f"{name}: {fault}", key="wavelength")
         if frames.unit.strip().casefold() not in ("dn", "adu", "ct", "count"):
             raise InputError.of("unit", frames.unit or "none", "that of raw DN, with bias and dark", where=name)
@@ -295,7 +296,8 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     by `EXPOSURE_RATIO`, and one for all pixels if temperatures span `BIAS_RANGE_C`; otherwise it is the instrument's.
     Without frames all are the instrument's.
     """
-    bias, level = (nominal.per_pixel(*of) for of in (("bias_dn", nominal.bias_dn), ("dark", nominal.dark_dn_per_s)))
+    bias = nominal.per_pixel("bias_dn", nominal.bias_dn)
+    level = nominal.per_pixel("dark", nominal.dark_dn_per_s)
     if not dark:
         return _assumed_dark(nominal, level, bias)
     covariance, (change, error) = np.zeros((level.size, 2, 2)), np.full((2, level.size), np.nan)

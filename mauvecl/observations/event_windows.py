@@ -48,11 +48,9 @@ GENERAL_WEIGHT = 0.5
 
 @dataclass(frozen=True)
 class HalfProfile(TimeProfile):
-    """Rise of a flare that ends at the peak, or decay that begins there.
+    """Rise of a flare that ends at the peak, or decay that begins there."""
 
-    Integrals are those up to a time before the peak and from a time after it, which is all that callers need.
-    """
-
+    #: Integral of a rise up to a time before the peak, or of a decay from a time after it, which callers need alone.
     integral: Callable[[Float], Float]
     decays: bool = False
 
@@ -69,7 +67,7 @@ def _exponential(rate: float) -> HalfProfile:
 
 
 def _gaussian(tau: Float, width: float) -> Float:
-    """Return the integral of a Gaussian beyond tau; its half-width at half maximum is negative before the peak."""
+    """Return the integral of a Gaussian beyond tau; its half-width at half maximum is negative for a rise."""
     root = float(np.sqrt(np.log(2)))
     return np.asarray(np.sqrt(np.pi) / 2 * abs(width) / root * scipy.special.erfc(tau * root / width))
 
@@ -146,8 +144,8 @@ MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
 SHORT = 0.2
 #: First range of the peak, in half-widths of the template, and factor on the half-width.
 PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
-#: Number of frames on each side of an event that are fitted with it, and the same in lengths of the event: the level of
-#: further ones would lower the variance of its sum by 1 % at most in independent noise, and less in that of a process.
+#: Number of frames on each side of an event that are fitted with it, at least, and the same in lengths of the event.
+#: More would lower the variance of the event's sum, by a better level, by 1 % at most in independent noise.
 WINDOW_FRAMES, WINDOW_LENGTHS = 2**15, 100
 
 
@@ -170,7 +168,7 @@ class Window:
     edges: Float  # shape (n, 2); start and end of each bin
     values: Float  # shape (n,)
     noise: Float  # shape (n,); variance of the mean of each bin's frames
-    frames: NDArray[np.int64]  # shape (n,); number of frames of each bin
+    n_frames: NDArray[np.int64]  # shape (n,); of each bin
     inside: Bool  # shape (n,); bins of the event
     scale: float  # value of unit amplitude
     photon: float  # rise of the variance of a frame with the amplitude
@@ -218,7 +216,7 @@ class Window:
         return np.asarray(self.edges.mean(axis=1))
 
     @cached_property
-    def process(self) -> Float:
+    def level_covariance(self) -> Float:
         """Covariance of the level in the bins, shape (n, n)."""
         unit = self.survey.bank.directions[self.event.direction]
         lags = self.middle[:, None] - self.middle
@@ -258,7 +256,6 @@ class Window:
         first_s, last_s = survey.stare.start_s[event.first], survey.stare.start_s[event.last] + frame_s
         low, high = event.peak_s - PEAK_RANGE * event.half_width_s, event.peak_s + PEAK_RANGE * event.half_width_s
         before_s = float(survey.stare.start_s[event.first - 1]) + frame_s if event.first else -np.inf
-        # A gap before the event may hold the peak, at most as long before as the event lasts.
         low = min(low, max(first_s - max(4 * event.half_width_s, last_s - first_s), before_s))
         high = min(max(high, low + frame_s), last_s)
         widest = max(survey.bank.half_widths_s[-1], event.half_width_s) * 3
@@ -305,12 +302,12 @@ class Likelihood:
     def of(cls, window: Window, flares: Sequence[FittedFlare], shape: Profile, epsilon: float) -> Likelihood:
         """Compute the likelihood for the photon noise of some flares and departures from their shape."""
         n = window.values.size
-        covariance = window.process + np.diag(window.noise)
+        covariance = window.level_covariance + np.diag(window.noise)
         shared, variance = np.zeros(n), 0.0
         lengths = np.diff(window.edges)[:, 0]
         for flare in flares:
             light = flare.amplitude * window.model(shape, flare.peak_s, flare.half_width_s)[0]
-            covariance += np.diag(window.photon * light / window.scale / window.frames)
+            covariance += np.diag(window.photon * light / window.scale / window.n_frames)
             if epsilon:
                 light = light + _floor(window.middle, flare) * window.scale
                 unobserved, unobserved_light = _unobserved(window, flare, shape)
@@ -329,11 +326,11 @@ class Likelihood:
         level, level_variance = np.zeros(n), 0.0
         if len(window.survey.bank.directions) == 1:
             peak_bin = int(np.argmin(np.abs(window.middle - window.event.peak_s)))
-            of_process = window.process[peak_bin]
-            weights = inverse @ of_process
-            constant = 1.0 - float(of_process @ sums)
+            at_peak = window.level_covariance[peak_bin]
+            weights = inverse @ at_peak
+            constant = 1.0 - float(at_peak @ sums)
             level = (weights + constant * sums / total) / window.scale
-            level_variance = float(of_process[peak_bin] - of_process @ weights) + constant**2 / total
+            level_variance = float(at_peak[peak_bin] - at_peak @ weights) + constant**2 / total
             level_variance = max(level_variance, 0.0) / window.scale**2
         inverse = inverse - sums[:, None] * sums / total
         root = root - root.sum(axis=1)[:, None] * sums / total
@@ -343,10 +340,10 @@ class Likelihood:
         return cls(window, inverse, root, log_factor, departure, departure_variance, level, level_variance)
 
     def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
-        """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).
+        """Return the products of models and values, and of models with themselves, shape (n_shape, n_node) each.
 
-        Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). Products of models
-        that are as bright in all bins are zero but for rounding errors, and set to zero.
+        Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). A model that is as
+        bright in all bins is no more than a level: its product with the values, which would be a rounding error, is 0.
         """
         pairs = (weights[:, :, None] * weights[:, None]).reshape(len(weights), -1)
         # Long before the peak nothing is bright.
@@ -364,10 +361,10 @@ class Likelihood:
         return slope, np.maximum(information, least)
 
     def level_without(self, light: Float) -> Float:
-        """Return the level of the star at the peak less the light of flares, of which tails raise it.
+        """Return the level of the star at the peak without the light of flares, whose tails raise the fitted level.
 
-        It is that of frames without events where the values are not the star's light, or the fitted level is not
-        above zero.
+        Where the values are not the star's light, or the fitted level is not above zero, it is the level of the frames
+        without events.
         """
         fitted = (self.window.values - light) @ self.level
         return np.where(fitted > 0, fitted, self.window.quiet_level)

@@ -29,10 +29,10 @@ MAX_PASSES = 40
 MOST_EVENTS, MOST_PER_FRAME = 500, 1 / 500
 #: Smallest number of quiescent frames to which a process is fitted; with fewer, the longest events are shortened.
 MIN_QUIET = 20
-#: Share of a template's response to other events, of inexact shapes, that a further event must exceed.
+#: Share of its template's response to earlier events, whose shapes are inexact, that a further event must exceed.
 UNCERTAIN = 0.5
-#: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event: the smallest for which
-#: more than a few events leave most frames to the star (number and share assumed).
+#: Flux of a template, in standard deviations of a frame, at which the tail of an event ends. The next larger one is
+#: tried if more than a number of events take more than a share of the frames (both assumed).
 FAINT, FEW, MOST_IN_EVENTS = (0.05, 0.2, 0.8), 2, 0.3
 #: Length of a light curve above which events are an exception from the light of the star (assumed).
 LONG_S = 2 * DAY_S
@@ -50,18 +50,23 @@ STILL_BRIGHT, END_FRAMES = 1.0, 4
 def detect_events(
     survey: SeriesSurvey, threshold: float, steps: Steps = UNREPORTED
 ) -> tuple[list[DetectedEvent], Bool]:
-    """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
+    """Detect events above a threshold, the largest first.
+
+    Return them in order of time, and the frames that belong to events, shape (n_frame,).
+    """
     # Where the star is constant, or observed for a short time, events may contain any number of frames.
     varies_for_days = survey.stare.duration_s > LONG_S and any(process.terms for process in survey.processes)
     for faint in FAINT if varies_for_days else FAINT[:1]:
-        events, in_events = _detect_to(survey, threshold, faint, steps)
+        events, in_events = _detect_with_tails(survey, threshold, faint, steps)
         if len(events) <= FEW or in_events.mean() <= MOST_IN_EVENTS:
             break
     return events, in_events
 
 
-def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Steps) -> tuple[list[DetectedEvent], Bool]:
-    """Detect events whose tails end at a flux in standard deviations of a frame, as `detect_events`."""
+def _detect_with_tails(
+    survey: SeriesSurvey, threshold: float, faint: float, steps: Steps
+) -> tuple[list[DetectedEvent], Bool]:
+    """Detect events as `detect_events` does; their tails end where they are `faint`, in standard deviations."""
     n = survey.stare.n_frames
     in_events, events = np.zeros(n, np.bool_), list[DetectedEvent]()
     light = np.zeros_like(survey.sums)
@@ -74,20 +79,19 @@ def _detect_to(survey: SeriesSurvey, threshold: float, faint: float, steps: Step
         steps.step()
         if not largest:
             break
-        extents = []
+        located = []
         for event in largest:
             rows, flux = light_of_flare(survey, event.peak_s, event.half_width_s, event.amplitude)
             light[rows] += flux[:, None] * survey.bank.directions[event.direction]
             first, last = _find_extent(survey, in_events, faint * noise, event)
             # Some frames remain for the level; they are the faintest of the event.
-            short = MIN_QUIET - int(np.count_nonzero(~in_events)) + last - first + 1
-            last = max(last - max(short, 0), first)
-            extents.append((first, last))
+            lacking = MIN_QUIET - int(np.count_nonzero(~in_events)) + last - first + 1
+            last = max(last - max(lacking, 0), first)
+            located.append(replace(event, first=first, last=last))
             in_events[first : last + 1] = True
-        extents = _extend(survey, in_events, extents, largest, crowded=faint > FAINT[0])
-        for (first, last), event in zip(extents, largest, strict=True):
-            in_events[first : last + 1] = True
-            events.append(replace(event, first=first, last=last))
+        for event in _extend(survey, in_events, located, crowded=faint > FAINT[0]):
+            in_events[event.first : event.last + 1] = True
+            events.append(event)
     return _merge(events), in_events
 
 
@@ -121,7 +125,10 @@ def light_of_flare(survey: SeriesSurvey, peak_s: float, half_width_s: float, amp
 
 
 def _search_once(survey: SeriesSurvey, light: Float, threshold: float) -> list[DetectedEvent]:
-    """Return the largest events of a survey, at most one near another; `light` is that of the events before."""
+    """Return the largest events of a survey, at most one near another, without their frames.
+
+    `light` is that of the events of earlier searches, shape (n_frame, n_sum).
+    """
     sums = np.stack([survey.sums, UNCERTAIN * light]) if light.any() else survey.sums[None]
     # Local maxima above the threshold, of which there are many where the process does not describe the light.
     maxima = []
@@ -150,7 +157,10 @@ def _search_once(survey: SeriesSurvey, light: Float, threshold: float) -> list[D
 
 
 def _find_extent(survey: SeriesSurvey, in_events: Bool, faint: float, event: DetectedEvent) -> tuple[int, int]:
-    """Return the first and last frame in which the template of an event is brighter than a flux."""
+    """Return the first and last frame in which the template of an event is brighter than a flux.
+
+    The frames of other events around the peak end it.
+    """
     tau = np.linspace(0.0, LONGEST_TAIL, 1200)
     bright = tau[event.amplitude * survey.bank.shape.at(tau) > faint]
     tail = max(1.0, float(bright[-1]) if bright.size else 0.0)
@@ -169,17 +179,18 @@ def _find_extent(survey: SeriesSurvey, in_events: Bool, faint: float, event: Det
 
 
 def _extend(
-    survey: SeriesSurvey, in_events: Bool, extents: list[tuple[int, int]], events: list[DetectedEvent], *, crowded: bool
-) -> list[tuple[int, int]]:
+    survey: SeriesSurvey, in_events: Bool, events: list[DetectedEvent], *, crowded: bool
+) -> list[DetectedEvent]:
     """Extend events to frames that are brighter than the level; in crowded light curves, cut off those that are not."""
     quiet = ~in_events
     if quiet.sum() < MIN_QUIET:
-        return extents
+        return events
     steps = np.diff(survey.stare.numbers)
     sigmas = {direction: survey.along(direction, quiet) for direction in {event.direction for event in events}}
     extended, bright = [], STILL_BRIGHT
-    for (first, last), event in zip(extents, events, strict=True):
-        sigma, length = sigmas[event.direction], last - first + 1
+    for event in events:
+        sigma, first, last = sigmas[event.direction], event.first, event.last
+        length = last - first + 1
         if crowded:
             peak = first + int(sigma[first : last + 1].argmax())
             while last > peak + 1 and sigma[max(peak, last + 1 - END_FRAMES) : last + 1].mean() < bright:
@@ -193,7 +204,7 @@ def _extend(
         start = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0)
         while first > start and not in_events[first - 1] and sigma[max(0, first - END_FRAMES) : first].mean() > bright:
             first -= 1
-        extended.append((first, last))
+        extended.append(replace(event, first=first, last=last))
     return extended
 
 
@@ -220,10 +231,11 @@ UNSEEN = 0.05
 
 
 def _find_kind(fits: Sequence[Fit], summed: float, error: float) -> Kind:
-    """Return the kind of an event by its fits of published shapes, since the general family resembles all kinds.
+    """Return whether an event is a flare, a step or a dip, by its fits of published shapes.
 
-    The frames of a dip, with the light `summed` above the level, lack that of the best fit, as by an eclipse. The sum
-    over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
+    The general family would resemble all of these. In a dip, the light `summed` over the frames lacks much of that of
+    the best fit, as during an eclipse. Spectra show no dips: their sum over wavelength may fall during a flare, by a
+    loss of light that their weights leave out.
     """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
     level, window = float(best.plain.level_without(best.light)), best.window
@@ -348,9 +360,9 @@ class ObservedEvent:
 def measure_events(
     survey: SeriesSurvey, in_events: Bool, detected: Sequence[DetectedEvent], causes: Sequence[Kind], steps: Steps
 ) -> list[ObservedEvent]:
-    """Measure detected events in order of time; their frames are `in_events`, and `causes` follow from their spectra.
+    """Measure detected events in order of time; `causes` are those of their spectra, or else flares.
 
-    Weaker events next to a step or a dip belong to it. `steps` reports each event.
+    A weaker event next to a step or a dip belongs to it, and has its kind. `steps` reports each event.
     """
     level = survey.flux_level(~in_events)
     pairs = list(zip(detected, causes, strict=True))
@@ -425,7 +437,7 @@ def _posterior(in_events: Bool, fits: Sequence[Fit], poor: bool) -> NormalMixtur
     scores = []
     for direction in range(len(survey.bank.directions)):
         other = Window.of(survey, in_events, replace(event, direction=direction))
-        noise = np.diag(other.process) + other.noise
+        noise = np.diag(other.level_covariance) + other.noise
         model = other.model(survey.bank.shape, event.peak_s, event.half_width_s)[0]
         weight, outside = model / noise, ~other.inside
         level = float(np.average(other.values[outside], weights=1 / noise[outside])) if outside.any() else 0.0

@@ -68,10 +68,10 @@ def read_frames(
         Whether spectra of `mauvecl realise` keep bias and dark current, which are subtracted otherwise. Others are as
         their file has them.
     """
-    with _open_frames(path, mapping, check=not ignore_checksum, raw=raw) as (file, places, stem):
+    with _open_frames(path, mapping, check=not ignore_checksum, raw=raw) as (file, mapping, name):
         if quality_bits is not None:
-            places = places.model_copy(update={"quality_bits": quality_bits})
-        return _frames_in(file, _quantities(file, places), places, stem)
+            mapping = mapping.model_copy(update={"quality_bits": quality_bits})
+        return _frames_in(file, _quantities(file, mapping), mapping, name)
 
 
 def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any = None) -> Frames:
@@ -132,14 +132,14 @@ def reduce_frames(
         Weights of the pixels, in the order of the file; by default the sum over all pixels.
     mapping : FrameMapping or path, optional
     """
-    with _open_frames(path, mapping) as (file, places, stem):
-        quantities = _quantities(file, places)
-        _, flux, error, _ = _linear_light(quantities, places)
+    with _open_frames(path, mapping) as (file, mapping, name):
+        quantities = _quantities(file, mapping)
+        _, flux, error, _ = _linear_light(quantities, mapping)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.label)
-        bits = QualityBits.of(file.header, places.quality_bits, file.label)
+        bits = QualityBits.of(file.header, mapping.quality_bits, file.label)
         lights, pixels = stored.weighted_sums(flux, error, _excluding_bits(quantities.get("quality"), bits), weights)
-        return ReducedFrames(tuple(_frames_in(file, quantities, places, stem, light) for light in lights), pixels)
+        return ReducedFrames(tuple(_frames_in(file, quantities, mapping, name, light) for light in lights), pixels)
 
 
 @dataclass(frozen=True)
@@ -160,36 +160,43 @@ class ColumnNames:
 def _open_frames(
     path: str | Path, mapping: FrameMapping | str | Path | None, check: bool = True, raw: bool = False
 ) -> Iterator[tuple[TableFile, FrameMapping, str]]:
-    """Open a file, folder or store; yield it with the places of its quantities and its name without extension."""
+    """Open a file, folder or store; yield it with the mapping of its quantities and its name without extension.
+
+    Without a mapping, it is that of a store or of the names of columns. Spectra of a store include bias and dark
+    current if they are `raw`.
+    """
     with parsing(f"file {shortened(Path(path).name)}", FORMATS):
         place, words = without_columns(path)
-        places = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
-        name = words[0] if words else None if places is None or places.hdu is None else str(places.hdu)
+        mapping = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
+        name = words[0] if words else None if mapping is None or mapping.hdu is None else str(mapping.hdu)
         label = f"folder {place.name!r}"
         opened: AbstractContextManager[TableFile]
         if not place.is_dir():
-            opened = _open_file(place, name, places, check, large=True)
+            opened = _open_file(place, name, mapping, check, large=True)
         elif (place / "zarr.json").is_file():
             opened = stored.open_stored(place, label, name)
-        elif places is None:
+        elif mapping is None:
             fault = f"{label} is not a store of spectra; give a mapping that says where its quantities are"
             raise InputError(fault, key="mapping")
         else:
             open_file = partial(_open_file, name=name, check=check)
-            opened = nullcontext(stored.FolderFile(place, places, label, open_file))
+            opened = nullcontext(stored.FolderFile(place, mapping, label, open_file))
         with opened as file:
-            if places is None:
-                places = file.mapping(raw) if isinstance(file, stored.StoredFile) else recognised(file)
-            yield file, places, place.stem
+            if mapping is None:
+                mapping = file.mapping(raw) if isinstance(file, stored.StoredFile) else recognised(file)
+            yield file, mapping, place.stem
 
 
 def _open_file(
-    path: Path, name: str | None, places: FrameMapping | None = None, check: bool = True, large: bool = False
+    path: Path, name: str | None, mapping: FrameMapping | None = None, check: bool = True, large: bool = False
 ) -> AbstractContextManager[TableFile]:
-    """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
-    # The chosen table has a column of each group of names.
+    """Open the extension or array `name` of a file; only `large` files may exceed MAUVECL_LARGEST_FILE_MIB.
+
+    Without a name, it is the first table with the times of the mapping, or with usual names of times and fluxes.
+    """
+    # The table has a column of each group of names.
     usual = [COLUMN_NAMES["time"], COLUMN_NAMES["flux"]]
-    groups = usual if places is None else [(title,) for title in places.times]
+    groups = usual if mapping is None else [(title,) for title in mapping.times]
 
     def of_fits(hdus: Any, label: str) -> TableFile:
         return stored.stored_in_fits(FitsTables(hdus, label), name) or FitsTables(hdus, label, name, groups)
@@ -356,9 +363,12 @@ def _relative_to_level(light: Float, sd: Float | None, unit: str) -> tuple[Float
 
 
 def _frames_in(
-    file: TableFile, quantities: Quantities, mapping: FrameMapping, stem: str, reduced: stored.Light | None = None
+    file: TableFile, quantities: Quantities, mapping: FrameMapping, name: str, reduced: stored.Light | None = None
 ) -> Frames:
-    """Build frames from a file and its quantities; with `reduced` light, which is not read again."""
+    """Build frames from a file and its quantities; with `reduced` light, which is not read again.
+
+    They have the `name` unless the mapping or the header states one.
+    """
     label, header = file.label, file.header
     edges = tuple(quantities[key] for key in ("time", "end") if key in quantities)
     time, between_edges_s, system, remarks = times_of(edges, file, mapping)
@@ -377,9 +387,9 @@ def _frames_in(
     by_frame |= {"error": sd, "quality": quality}
     frames = Frames.of(
         time[has_time], light[has_time],
-        **{name: None if column is None else column[has_time] for name, column in by_frame.items()},
+        **{key: None if column is None else column[has_time] for key, column in by_frame.items()},
         quality_mask=bits.mask, mission=bits.mission, wavelength_nm=nm if light.ndim == 2 else None, unit=unit,
-        name=mapping.name or str(header.get("OBJECT", "") or header.get("star", "") or stem),
+        name=mapping.name or str(header.get("OBJECT", "") or header.get("star", "") or name),
         instrument=str(header.get("INSTRUME", "") or header.get("TELESCOP", "")).strip(),
         reference_mjd=system.epoch_mjd, scale=system.scale, position=system.position,
         direction_deg=system.direction_deg, net=isinstance(file, stored.StoredFile) and mapping.flux != "raw",
@@ -422,7 +432,7 @@ def _excluding_bits(quality: Values | None, bits: QualityBits) -> Values | None:
 
 
 def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
-    """Return the unit of the light, light and errors in it, and remarks."""
+    """Return the unit of the light, light and errors in it, and remarks; raise InputError if it is not linear."""
     flux, error, remarks = quantities["flux"], quantities.get("error"), tuple[str, ...]()
     file_unit = flux.stated_unit
     unit = mapping.flux_unit or file_unit

@@ -46,39 +46,28 @@ class FrameModel:
         `flux_per_dn` is the flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each of its pixels. Raises
         InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
-        # Counts with bias and dark current or without, and rates without, as of `stare`.
-        counts = counts_in(frames.unit)
         assert frames.wavelength_nm is not None
-        flux = None if counts is not None else _per_flam(frames.unit, frames.wavelength_nm)
-        if counts is None and flux is None:
+        counts, per_flam = counts_in(frames.unit), _per_flam(frames.unit, frames.wavelength_nm)
+        if counts is None and per_flam is None:
             raise InputError.of("unit", frames.unit, "one of adu, DN, adu / s, DN / s, or a flux density")
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
             ends = f"{frames.exposure_s.min():g} to {frames.exposure_s.max():g} s"
             fault = f"the exposure times of all frames must be the same, but range from {ends}"
             raise InputError(fault, key="exposure_s")
-        pixels = _matched(frames.wavelength_nm, quiet.wavelength_nm)
-        elements = _matched(frames.wavelength_nm, quiet.element_wavelength_nm)
-        if pixels is not None:
-            bins = np.eye(quiet.wavelength_nm.size)[pixels]
-        elif elements is not None:
-            bins = (~quiet.saturated * (quiet.element == elements[:, None])).astype(np.float64)
-        else:
-            expected = f"{quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements"
-            given = f"{frames.wavelength_nm.size} wavelengths from {frames.wavelength_nm[0]:.1f} nm"
-            fault = f"the spectra must have the {expected} of {quiet.instrument}, but have {given}"
-            raise InputError(fault, key="wavelength_nm")
-        if flux is not None:
+        bins = _bins(frames.wavelength_nm, quiet)
+        if per_flam is not None:
             # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
             per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
-            return cls(quiet, flare, bins, flux / (bins @ per_flux), False)
+            return cls(quiet, flare, bins, per_flam / (bins @ per_flux), False)
         assert counts is not None
+        # Rates have no bias and dark current, as those of `stare`; counts may have them.
         per_count, is_rate = counts
         per_dn = np.full(len(bins), per_count)
         if is_rate:
             return cls(quiet, flare, bins, per_dn / exposure, False)
         raw = cls(quiet, flare, bins, per_dn, True)
-        # Where a pixel has far less light than bias and dark current, these were subtracted.
+        # Where the values of a pixel are far below bias and dark current, these were subtracted.
         included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
         return raw if included.all() and not frames.net else replace(raw, raw=False)
 
@@ -98,10 +87,10 @@ class FrameModel:
         return np.asarray(self.flare.hot_spline(np.log(temperatures_k)) @ self.bins.T * self.per_dn)
 
     def unknowns(self, light: Float) -> dict[str, Float]:
-        """Return the spectra of unknown changes in frames without a flare, in their unit, shape (n_value,) each.
+        """Return the changes of frames by light, dark current and sky, in their unit, shape (n_value,) each.
 
-        `light` is that of the quiescent star, which pointing and throughput scale; the dark current is per deg C, and
-        the sky once the nominal one, if there is a sky.
+        They are those by all `light` of the quiescent star, which pointing and throughput scale, by 1 deg C of the
+        detector, and by the nominal light of the sky, if there is any.
         """
         spectra = {"light": light, "dark": self.bins @ spectrum_of("dark", self.quiet) * self.per_dn}
         sky = self.bins @ spectrum_of("sky", self.quiet) * self.per_dn
@@ -146,6 +135,21 @@ def _per_flam(text: str, wavelength_nm: Float) -> Float | None:
         return None
 
 
+def _bins(wavelengths: Float, quiet: Expectation) -> Float:
+    """Return the pixels of an instrument in each wavelength of frames, shape (n_value, n_pixel): 0 or 1.
+
+    The wavelengths are those of its pixels or of its resolution elements.
+    """
+    if (pixels := _matched(wavelengths, quiet.wavelength_nm)) is not None:
+        return np.eye(quiet.wavelength_nm.size)[pixels]
+    if (elements := _matched(wavelengths, quiet.element_wavelength_nm)) is not None:
+        return np.asarray(~quiet.saturated * (quiet.element == elements[:, None]), np.float64)
+    expected = f"{quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements"
+    given = f"{wavelengths.size} wavelengths from {wavelengths[0]:.1f} nm"
+    fault = f"the spectra must have the {expected} of {quiet.instrument}, but have {given}"
+    raise InputError(fault, key="wavelength_nm")
+
+
 def _matched(wavelengths: Float, instrument_nm: Float) -> NDArray[np.intp] | None:
     """Return the index of each wavelength among those of an instrument, or None if one is not there."""
     nearest = np.array([int(np.argmin(np.abs(instrument_nm - nm))) for nm in wavelengths])
@@ -176,8 +180,8 @@ class LightChange:
     error: float
 
 
-def chi2_of_one(spectrum: Float, variance: Float, rows: Float) -> Float:
-    """Return chi-squared of a spectrum with each of some spectra alone, whose amplitude is fitted, shape (n_row,)."""
+def chi2_of_each(spectrum: Float, variance: Float, rows: Float) -> Float:
+    """Return chi-squared of a spectrum less each of the rows alone, whose amplitude is fitted, shape (n_row,)."""
     along = rows @ (spectrum / variance)
     total = float((spectrum**2 / variance).sum())
     return np.asarray(total - along**2 / np.einsum("kp,kp->k", rows, rows / variance))
@@ -193,7 +197,7 @@ def light_changes(
     `excess` are all frames less the star's `light`, with their `numbers` on the regular grid and the noise `sd`.
     """
     weights = light / sd**2 / float(((light / sd) ** 2).sum())
-    amplitude, at = excess[frames] @ weights, numbers[frames]
+    amplitude, places = excess[frames] @ weights, numbers[frames]
     noise = PER_MAD * float(np.median(np.abs(np.diff(amplitude)))) / np.sqrt(2.0)
     widths = [width for width in WIDTHS if 4 * width <= amplitude.size]
     if not widths or not noise > 0:
@@ -203,7 +207,7 @@ def light_changes(
     sizes = np.zeros((len(widths), amplitude.size))
     for row, width in zip(sizes, widths, strict=True):
         k = np.arange(width, amplitude.size - width + 1)
-        gapless = at[k + width - 1] - at[k - width] <= 2 * width - 1 + MISSING
+        gapless = places[k + width - 1] - places[k - width] <= 2 * width - 1 + MISSING
         row[k[gapless]] = ((total[k + width] - 2 * total[k] + total[k - width]) / width)[gapless]
     errors = noise * np.sqrt(2.0 / np.array(widths))[:, None]
     significance = np.abs(sizes) / errors
@@ -213,7 +217,7 @@ def light_changes(
         width = widths[best]
         step = excess[frames[place : place + width]].mean(axis=0) - excess[frames[place - width : place]].mean(axis=0)
         variance = 2 * sd**2 / width
-        if chi2_of_one(step, variance, light[None])[0] < chi2_of_one(step, variance, alternatives).min() - CLEARLY:
+        if chi2_of_each(step, variance, light[None])[0] < chi2_of_each(step, variance, alternatives).min() - CLEARLY:
             changes.append(LightChange(int(frames[place]), width, float(sizes[best, place]), float(errors[best, 0])))
         # Windows that overlap this one see the same change.
         for values, wide in zip(significance, widths, strict=True):
@@ -237,41 +241,41 @@ class CleanedSpectra:
     model: FrameModel  # of these pixels
     rays: NDArray[np.int64]  # shape (n_frame,); number of values of each frame that are replaced
     stated: Float  # shape (n_pixel,); standard deviation of a quiescent frame
-    stated_by: str  # "file", or "instrument": by its noise model
+    has_errors: bool  # whether the file states errors; otherwise `stated` is that of the instrument's noise model
     saturated: Bool  # shape (n_frame,)
 
 
 def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     """Replace single bad values of spectra, as of particles, by a fit to the other pixels of their frame.
 
-    Flares, and changes of the star, the dark current and the sky, change many pixels. Pixels that are not finite in a
-    frame without a fault are left out of all frames.
+    Flares, and changes of the star, the dark current and the sky, change many pixels. Resolution elements whose pixels
+    all saturate are left out.
     """
     usable = frames.faults == 0
-    fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
-    if not fine.any() or not usable.any():
-        raise InputError(f"{frames.name}: at least one pixel must be finite in every frame, but none is", key="flux")
-    model = replace(model, bins=model.bins[fine], per_dn=model.per_dn[fine])
+    recorded = model.bins.sum(axis=1) > 0
+    model = replace(model, bins=model.bins[recorded], per_dn=model.per_dn[recorded])
     assert frames.wavelength_nm is not None
-    flux = frames.flux[:, fine]
+    flux = frames.flux[:, recorded]
     # Sums of pixels do not saturate.
     single = model.raw & (model.bins.sum(axis=1) == 1)
     ceiling = np.where(single, model.quiet.n_frames * model.quiet.ceiling_dn, np.inf)
     saturated = usable & (flux >= ceiling).any(axis=1)
     flux = flux - model.offset
     good = usable & ~saturated
-    if not good.any():
-        raise InputError(f"{frames.name}: at least one frame must be below saturation, but none is", key="flux")
+    if not good.any() or not recorded.any():
+        fault = "at least one frame must be without a fault and below saturation, but none is"
+        raise InputError(f"{frames.name}: {fault}", key="frames")
     light = np.median(flux[good], axis=0)
-    error = None if frames.error is None else frames.error[:, fine]
-    noise = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)
+    if frames.error is None:
+        noise = np.sqrt(model.variance(light))
+        error = np.broadcast_to(noise, flux.shape)
+    else:
+        error = frames.error[:, recorded]
+        noise = np.median(error[good], axis=0)
     rays = np.zeros(frames.n_frames, np.int64)
     rays[good] = _replace_rays(flux, np.flatnonzero(good), light, noise, model, frames.numbers)
-    cleaned = replace(
-        frames, flux=flux, error=np.broadcast_to(noise, flux.shape) if error is None else error,
-        wavelength_nm=frames.wavelength_nm[fine],
-    )  # fmt: skip
-    return CleanedSpectra(cleaned, model, rays, noise, "instrument" if error is None else "file", saturated)
+    cleaned = replace(frames, flux=flux, error=error, wavelength_nm=frames.wavelength_nm[recorded])
+    return CleanedSpectra(cleaned, model, rays, noise, frames.error is not None, saturated)
 
 
 def _replace_rays(

@@ -40,8 +40,8 @@ TESS = {
     16384: "BadCalibrationExclude", 32768: "InsufficientTargets",
 }  # fmt: skip
 NAMES: Mapping[str, Mapping[int, str]] = {"Kepler": KEPLER, "TESS": TESS}
-#: Bits that exclude a frame by default: the default masks of lightkurve 2.6; of that for TESS without ImpulsiveOutlier,
-#: which can mark flares and is noted.
+#: Bits that exclude a frame by default, as in lightkurve 2.6, and bits that are noted. ImpulsiveOutlier of TESS, which
+#: lightkurve excludes, is only noted, because it can mark flares.
 DEFAULTS, NOTED = {"Kepler": 1_130_799, "TESS": 17_087 & ~512}, {"TESS": 512}
 ALL_BITS = 2**62 - 1
 
@@ -74,7 +74,7 @@ class QualityBits:
         return cls(mask, mission)
 
     def excluded(self, quality: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which frames a chosen bit excludes."""
+        """Return whether a chosen bit excludes each frame, shape of `quality`."""
         return np.asarray((np.asarray(quality, np.int64) & self.mask) != 0)
 
     def words(self, value: int) -> str:

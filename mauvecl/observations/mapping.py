@@ -42,7 +42,7 @@ class FrameMapping(Record):
     flux: str
     flux_unit: str | None = None  #: unit of the light, if the file does not state it
     error: str | None = None  #: standard errors of the light
-    #: Flags; not searched are frames, or pixels if each has a flag, with a bit of `quality_bits`.
+    #: Flags of frames, or of each pixel; those with a bit of `quality_bits` are not searched.
     quality: str | None = None
     #: Bits of the quality that exclude a frame: their sum, "all", "none", or names and numbers such as "Desat, 128". By
     #: default lightkurve's default for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all for others.
@@ -181,7 +181,11 @@ def recognised(file: TableFile) -> FrameMapping:
 def times_of(
     time: tuple[Values, ...], file: TableFile, mapping: FrameMapping
 ) -> tuple[Float, Float | None, units.TimeSystem, tuple[str, ...]]:
-    """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
+    """Return the times of frames, s, exposure times if their edges are given, the system of the times, and remarks.
+
+    Between two edges, the time is the middle; another one refers to the part of the frame that the system states. Dated
+    times count from the first, which is the epoch of the system, others from the zero of the file.
+    """
     import astropy.units as u
 
     label, header = file.label, _stated_system(time, file)
@@ -208,17 +212,20 @@ def times_of(
         remarks.append(f"{time[0].name} of {label} is in TT, {dates}")
     exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
     middles = np.mean(edges, axis=0) + offset
-    first = float(np.min(middles, where=np.isfinite(middles), initial=np.inf))
-    first = first if np.isfinite(first) else 0.0
+    finite = middles[np.isfinite(middles)]
+    first = float(finite.min()) if finite.size else 0.0
     # Days since a date far in the past lose digits as seconds: subtract before the unit is changed.
     seconds, first_d = np.asarray(((middles - first) * unit).to_value(u.s)), float((first * unit).to_value(u.s)) / DAY_S
-    at = 0.5 if len(edges) == 2 else PLACES_IN_FRAME.get(mapping.time_at or "", header.at)
     if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
         span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))
         remarks.append(f"the times of {label} have no date, although their unit, name or header says so: {span}")
         epoch = None
-    seconds, epoch = (seconds + first_d * DAY_S, None) if epoch is None else (seconds, epoch + first_d)
-    return seconds, exposure, replace(header, epoch_mjd=epoch, scale=scale, position=position, at=at), tuple(remarks)
+    if epoch is None:
+        seconds = seconds + first_d * DAY_S
+    else:
+        epoch = epoch + first_d
+    place = 0.5 if len(edges) == 2 else PLACES_IN_FRAME.get(mapping.time_at or "", header.at)
+    return seconds, exposure, replace(header, epoch_mjd=epoch, scale=scale, position=position, at=place), tuple(remarks)
 
 
 def _stated_system(time: tuple[Values, ...], file: TableFile) -> units.TimeSystem:

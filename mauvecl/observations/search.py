@@ -57,7 +57,7 @@ class Filter:
     peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
     norms: Float  # shape (n_sum, n_onset)
     unsolved: Bool  # shape (n_sum, n_onset); whether a norm must be solved exactly before it is used
-    lost: Float  # shape (n_sum, n_onset); what the unknown level takes from the norms
+    lost: Float  # shape (n_sum, n_onset); part of the norms that is lost because the level is fitted
     weights: Float  # shape (n_direction, n_sum); squared directions of the bank
     without_gaps: Float  # shape (n_direction, 1); squared denominator without gaps and with constant noise
 
@@ -72,26 +72,32 @@ class Filter:
         return np.sqrt(np.where(searched, squared, 0.0))
 
 
+@dataclass(frozen=True, eq=False)
 class ProcessSearch:
-    """Search of light curves for flares; each frame has independent sums, with a process each.
+    """Search of light curves for flares; each frame has independent sums, with a process each."""
 
-    The variance is that of the noise of each frame's sums.
-    """
+    bank: Bank
+    stare: Stare
+    processes: tuple[Process, ...]  # of each sum
+    variance: Float  # shape (n_frame,); of the noise of each frame's sums
 
-    def __init__(self, bank: Bank, stare: Stare, processes: tuple[Process, ...], variance: Float) -> None:
-        self.bank, self.stare, self.processes, self.variance = bank, stare, processes, variance
-        numbers = stare.numbers
-        # Gaps are no longer than two templates, since none reaches over them and their frames only take memory.
-        longest = 2 * max(abs(template.first) + template.shapes.shape[1] for template in bank.templates)
-        steps = np.diff(numbers)
-        long = np.flatnonzero(steps > longest)
-        # Frames that all gaps before each part of the grid lack, and middles of the shortened gaps, shape (n_gap,).
-        self._lacking = np.concatenate([[0], np.cumsum(steps[long] - longest)])
-        self._middles = numbers[long] + longest // 2 - self._lacking[:-1]
-        after = np.searchsorted(self._middles + self._lacking[:-1], numbers, side="right")
-        self.frames = numbers - self._lacking[after]
-        self.at = self.frames - self.frames[0]
-        self.n_grid = int(self.at[-1]) + 1
+    @cached_property
+    def reach(self) -> int:
+        """Number of frames on each side of a peak beyond which no template reaches."""
+        return int(max(abs(template.first) + template.shapes.shape[1] for template in self.bank.templates))
+
+    @cached_property
+    def at(self) -> NDArray[np.int64]:
+        """Place of each frame on the grid of the search, from 0, shape (n_frame,).
+
+        Gaps of the grid are no longer than two templates: none reaches over a longer one, which would only take memory.
+        """
+        return np.concatenate([[0], np.cumsum(np.minimum(np.diff(self.stare.numbers), 2 * self.reach))])
+
+    @property
+    def n_grid(self) -> int:
+        """Number of places on the grid."""
+        return int(self.at[-1]) + 1
 
     @cached_property
     def covariances(self) -> tuple[Covariance, ...]:
@@ -100,14 +106,15 @@ class ProcessSearch:
         return tuple(process.covariance(start_s, variance * process.excess**2) for process in self.processes)
 
     @cached_property
-    def _levels(self) -> tuple[Float, ...]:
-        """C^-1 1 of each sum, shape (n_frame,)."""
+    def _level_weights(self) -> tuple[Float, ...]:
+        """Weights of the frames in the constant level of each sum, C^-1 1, not normalised, shape (n_frame,)."""
         return tuple(covariance.solve(np.ones(self.stare.n_frames)) for covariance in self.covariances)
 
     @cached_property
     def filters(self) -> list[Filter]:
         """Templates with the denominators that were solved by now."""
-        _ = self._levels
+        # All threads need the weights: they are computed once, before these start.
+        _ = self._level_weights
         pairs = [(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
         return list(map_in_threads(lambda pair: self._prepare_filter(*pair), pairs))
 
@@ -127,14 +134,14 @@ class ProcessSearch:
         filters = self.rows if above is None else self.filters
         # C^-1 (sums - level) on the grid of frames with gaps.
         scores = np.zeros((len(sums), sums.shape[2], self.n_grid))
-        for k, (covariance, level) in enumerate(zip(self.covariances, self._levels, strict=True)):
+        for k, (covariance, weights) in enumerate(zip(self.covariances, self._level_weights, strict=True)):
             values = np.asarray(sums[:, :, k], np.float64)
-            mean = (values @ level) / level.sum()
-            scores[:, k, self.at] = covariance.solve(values.T).T - mean[:, None] * level
+            level = (values @ weights) / weights.sum()
+            scores[:, k, self.at] = covariance.solve(values.T).T - level[:, None] * weights
         correlations = Correlations(scores, max(max(row.shape.size, abs(row.first)) for row in filters))
 
         def search_row(row: Filter) -> tuple[Filter, Float]:
-            correlated = correlations.of(row.shape, row.first)[..., row.peaks]
+            correlated = correlations.with_kernel(row.shape, row.first)[..., row.peaks]
             rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
             if above is not None:
                 # A template of which a smaller share lies in frames is not searched.
@@ -153,9 +160,9 @@ class ProcessSearch:
 
     def peaks_s(self, row: Filter) -> Float:
         """Return the times of the peaks of a row's templates, from the start of the stare, shape (n_onset,)."""
-        places = self.frames[0] + row.peaks
-        # A gap belongs to the frames next to each of its halves.
-        numbers = places + self._lacking[np.searchsorted(self._middles, places, side="right")]
+        # In a gap, each half belongs to the frames next to it.
+        frame = np.searchsorted(self.at, row.peaks - self.reach, side="right")
+        numbers = row.peaks + (self.stare.numbers - self.at)[frame]
         return np.asarray((numbers + row.template.phases[row.phase]) * self.bank.frame_s)
 
     def _prepare_filter(self, template: Template, phase: int) -> Filter:
@@ -164,11 +171,11 @@ class ProcessSearch:
         bright = np.flatnonzero(flux > NEGLECTED * flux.max())
         shape = flux[bright[0] : bright[-1] + 1]
         first = template.first + int(bright[0])
-        peaks = np.arange(-int(self.frames[0]) % template.stride, self.n_grid, template.stride)
+        peaks = np.arange(-int(self.stare.numbers[0]) % template.stride, self.n_grid, template.stride)
         norms, lost = np.zeros((2, len(self.processes), peaks.size))
         unsolved, units = np.zeros(norms.shape, np.bool_), np.zeros((len(self.processes), 1))
         on_grid = np.zeros(self.n_grid)
-        for k, (process, level) in enumerate(zip(self.processes, self._levels, strict=True)):
+        for k, (process, level_weights) in enumerate(zip(self.processes, self._level_weights, strict=True)):
             if process.terms:
                 norms[k], unsolved[k], units[k] = self._approximate_norms(process, shape, first, peaks)
             else:
@@ -176,8 +183,8 @@ class ProcessSearch:
                 on_grid[self.at] = 1.0 / variance
                 norms[k] = _correlate(on_grid, shape**2, first)[peaks]
                 units[k] = (shape**2).sum() / np.median(variance)
-            on_grid[self.at] = level
-            lost[k] = _correlate(on_grid, shape, first)[peaks] ** 2 / level.sum()
+            on_grid[self.at] = level_weights
+            lost[k] = _correlate(on_grid, shape, first)[peaks] ** 2 / level_weights.sum()
         weights = self.bank.directions**2
         return Filter(template, phase, shape, first, peaks, norms, unsolved, lost, weights, weights @ units)
 
@@ -253,7 +260,7 @@ class Correlations:
         self._size = next_fast_len(values.shape[-1] + 2 * reach, real=True)
         self._spectrum = rfft(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)]), self._size)
 
-    def of(self, kernel: Float, first: int) -> Float:
+    def with_kernel(self, kernel: Float, first: int) -> Float:
         """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis."""
         start = self._reach + first
         correlated = irfft(self._spectrum * rfft(kernel, self._size).conj(), self._size)
@@ -262,7 +269,7 @@ class Correlations:
 
 def _correlate(values: Float, kernel: Float, first: int) -> Float:
     """Return the correlation of values with a single kernel; see `Correlations`."""
-    return Correlations(values, max(abs(first), kernel.size)).of(kernel, first)
+    return Correlations(values, max(abs(first), kernel.size)).with_kernel(kernel, first)
 
 
 #: Step between half-widths of a bank: the same as that of `flares.HALF_WIDTHS_S`.
@@ -316,9 +323,10 @@ class SeriesSurvey:
         cls, frames: Frames, flux: Float, variance: Float, used: Bool, level: float, photon: float, shape: Shape,
         counts: float = 0.0, weighted: tuple[Templates, Float] | None = None,
     ) -> SeriesSurvey:  # fmt: skip
-        """Prepare the frames that can be searched, `used`, without a process; see the attributes.
+        """Prepare the search of the `used` frames, without a process yet.
 
-        The flux is searched, or sums of spectra, which are given by `weighted` with their templates.
+        Flux and its variance have the shape (n_frame,), of all frames; for the others see the attributes. The flux
+        itself is searched, or else the sums of spectra in `weighted`, shape (n_frame, n_sum), with their templates.
         """
         stare, scale, typical = stare_of(frames, used), float(np.sqrt(np.median(variance[used]))), abs(level)
         net, relative_variance = flux[used] / scale, variance[used] / scale**2
@@ -371,7 +379,7 @@ class SeriesSurvey:
         """Return the survey with the processes of another one."""
         return replace(self, processes=other.processes, flux_process=other.flux_process)
 
-    def frames(self, chosen: Bool) -> SeriesSurvey:
+    def frames(self, chosen: Bool | slice) -> SeriesSurvey:
         """Return the survey of some of the frames."""
         arrays = {name: getattr(self, name)[chosen] for name in ("sums", "variance", "flux", "time_s")}
         return replace(self, stare=select_frames(self.stare, chosen), **arrays)
@@ -385,7 +393,7 @@ def stare_of(frames: Frames, used: Bool) -> Stare:
 
 
 def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
-    """Return the template bank for a stare."""
+    """Return the template bank for a stare, with half-widths from its cadence to a share of its longest part."""
     low = NARROWEST * stare.frame_s
     gaps = np.flatnonzero(np.diff(stare.numbers) * stare.frame_s > DAY_S) + 1
     longest = int(np.diff(np.concatenate([[0], gaps, [stare.n_frames]])).max())
@@ -438,7 +446,6 @@ class SimulatedRate:
         rate = float(np.log(-np.log1p(-float(scipy.stats.beta.ppf(UPPER, above + 1, n - above))) / self.days))
         if threshold <= anchor:
             return rate
-        # Beyond the simulated values, it falls as the tail of normal noise.
         fall = float(np.subtract(*scipy.special.log_ndtr([-anchor, -threshold])))
         if self.heavy and above:
             # The exponential that fits the largest values best (Pickands 1975, doi 10.1214/aos/1176343003), if slower.
@@ -461,11 +468,11 @@ def simulated_rates(
 ) -> tuple[SimulatedRate, SimulatedRate]:
     """Return the false-alarm rates in light curves of the fitted process, and in those of measured residuals.
 
-    The noise of the first is normal, or Poisson noise for counts; that of the second are blocks of the residuals of
-    quiescent frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough are drawn for
-    `MIN_ALARMS` at the smallest rate of interest, per star-day, up to a limit; `steps` reports each batch.
+    The noise of the first is normal, or Poisson noise for counts; that of the second consists of blocks of the
+    residuals of `quiet` frames, drawn with replacement (Kuensch 1989, doi 10.1214/aos/1176347265). Enough light curves
+    are drawn for `MIN_ALARMS` at the smallest rate of interest, per star-day, within limits. `steps` reports batches.
     """
-    residual, beginning = innovations(survey, quiet), survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
+    residual, beginning = innovations(survey, quiet), survey.frames(slice(MAX_LENGTH))
     n, n_sum = beginning.sums.shape
     days = beginning.stare.observed_s / DAY_S
     most = max(MIN_SIMULATED, MAX_VALUES // (n * n_sum))
@@ -509,7 +516,7 @@ def innovations(survey: SeriesSurvey, quiet: Bool) -> Float:
 
 
 def block_length(residual: Float) -> int:
-    """Return the number of consecutive residuals to draw together: beyond the first insignificant correlation."""
+    """Return the number of consecutive residuals that are drawn together, beyond the lags at which they correlate."""
     n = residual.size
     centred = residual - residual.mean()
     power = float(centred @ centred)

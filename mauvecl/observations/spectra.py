@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -17,7 +18,7 @@ from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.spectrum import Measurement, fit
 from mauvecl.flares.shapes import Shape
 from mauvecl.host.arrays import Bool, Float
-from mauvecl.noise.unknowns import NUISANCES
+from mauvecl.noise.unknowns import PROCESSES
 from mauvecl.observations import frame_model as models
 from mauvecl.observations.detector import variance_of_steps
 from mauvecl.observations.events import Kind
@@ -127,30 +128,28 @@ def survey_spectra(
     reasons = frames.faults | np.where(cleaned.saturated, Reason.SATURATED, 0)
     check_usable(frames, reasons)
     used = reasons == 0
-    events = np.zeros(flux.size, np.bool_)
-    events[used] = guess_flares(frames.numbers[used], flux[used])
+    in_events = np.zeros(flux.size, np.bool_)
+    in_events[used] = guess_flares(frames.numbers[used], flux[used])
     for _ in range(ROUNDS):
-        series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters or {})
-        lit, level = np.maximum(series.light, 0.0), float(np.median(flux[used & ~events]))
+        quiet = used & ~in_events
+        series, templates, sums = _weighted_sums(cleaned, reasons, quiet, rank, jitters or {})
+        lit, level = np.maximum(series.light, 0.0), float(np.median(flux[quiet]))
         # Frames without light, such as dark frames, have no photon noise that could weight the gains.
         photon = float(np.average(cleaned.model.gain, weights=lit if lit.any() else None))
         # The noise of the sums follows that of the whole light in time.
         survey = SeriesSurvey.of(frames, flux, error**2, used, level, photon, shape, weighted=(templates, sums))
-        survey, in_events = fit_quiet_light(survey, events[used], None, fits)
-        now = np.zeros(flux.size, np.bool_)
-        now[used] = in_events
-        sigmas = np.zeros(flux.size)
-        sigmas[used] = survey.along(len(survey.bank.directions) // 2, ~in_events)
+        survey, searched_in_events = fit_quiet_light(survey, in_events[used], None, fits)
+        before, in_events, sigmas = in_events, np.zeros(flux.size, np.bool_), np.zeros(flux.size)
+        in_events[used] = searched_in_events
+        sigmas[used] = survey.along(len(survey.bank.directions) // 2, ~searched_in_events)
         single = single_frames(frames.numbers, sigmas, used)
-        settled = not single.any() and float((now ^ events).mean()) <= SETTLED_EVENTS
-        events = now
-        if settled:
+        if not single.any() and float((in_events ^ before).mean()) <= SETTLED_EVENTS:
             break
         reasons = np.where(single, reasons | Reason.SPIKE, reasons)
         used = reasons == 0
     survey = survey.frames(reasons[np.searchsorted(frames.time_s, survey.time_s)] == 0)
     series = replace(series, excess=series.excess[used])
-    return survey, series, quiescent_light(frames, survey, reasons, ~events, seed, steps.part(0.9, 1.0))
+    return survey, series, quiescent_light(frames, survey, reasons, ~in_events, seed, steps.part(0.9, 1.0))
 
 
 def _weighted_sums(
@@ -175,20 +174,25 @@ def _weighted_sums(
     alternatives = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
     changes = models.light_changes(excess, compared, frames.numbers, light, alternatives, noise.used)
     dark, drift = _dark_changes(excess, pairs, quiet, noise.used, shared)
-    deviations = {"light": np.inf} | dark | dict(jitters)
-    names = tuple(name for name in deviations if name in unknown)
-    nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
-                          np.array([deviations[name] for name in names]))  # fmt: skip
+    deviations = {"light": np.inf} | ({"dark": dark} if dark > 0 else {}) | dict(jitters)
+    nuisances = _nuisances(unknown, deviations)
     # Flares that double the light of the star, in the sum over wavelength.
     flares *= abs(float(light.sum())) / flares.sum(axis=1, keepdims=True)
-    spectra, included = (noise.used**2, flares, model.gain, TEMPERATURES_K), (nuisances, nuisances.without(["light"]))
-    templates, steady = (Templates.of(*spectra, nuisances=unknowns, rank=rank) for unknowns in included)
+    templates_for = partial(Templates.of, noise.used**2, flares, model.gain, TEMPERATURES_K, rank=rank)
+    templates = templates_for(nuisances=nuisances)
+    steady = templates_for(nuisances=nuisances.without(["light"]))
     snr_kept = float(np.median(templates.best / steady.best))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
     mixing = _independent(sums, pairs, quiet)
     templates, sums = templates.mixed(mixing), sums @ mixing.T
     drift *= abs(float(unknown["dark"].sum() / light.sum()))
     return SpectralSeries(excess, light, noise, cleaned, deviations, changes, snr_kept, drift), templates, sums
+
+
+def _nuisances(spectra: Mapping[str, Float], deviations: Mapping[str, float]) -> Nuisances:
+    """Return the unknowns with a spectrum and a standard deviation."""
+    names = tuple(name for name in deviations if name in spectra)
+    return Nuisances(names, np.array([spectra[name] for name in names]), np.array([deviations[name] for name in names]))
 
 
 def _independent(sums: Float, pairs: NDArray[np.intp], quiet: Bool) -> Float:
@@ -217,26 +221,24 @@ def fit_changes(excess: Float, spectra: Float, sd: Float) -> tuple[Float, Float]
     return excess @ (covariance @ white / sd).T, covariance
 
 
-def _dark_changes(
-    excess: Float, pairs: NDArray[np.intp], quiet: Bool, sd: Float, shared: Float
-) -> tuple[dict[str, float], float]:
+def _dark_changes(excess: Float, pairs: NDArray[np.intp], quiet: Bool, sd: Float, shared: Float) -> tuple[float, float]:
     """Measure changes of the dark current, which is fitted together with the light; both spectra are `shared`.
 
-    Return its standard deviation from frame to frame beyond noise, by name, if it is significant (infinite if it
-    drifts), and the range of nine tenths of its slow changes if it drifts, or else 0.
+    Return its standard deviation from frame to frame beyond noise, 0 if it is not significant and infinite if the dark
+    current drifts, and the range of nine tenths of its slow changes, 0 unless it drifts.
     """
     amplitudes, covariance = fit_changes(excess, shared, sd)
     amplitude, error = amplitudes[:, 1], float(np.sqrt(covariance[1, 1]))
     variance = float(np.mean((amplitude[pairs + 1] - amplitude[pairs]) ** 2)) / 2
     beyond = variance - error**2
-    significant = beyond > DEPARTS * 2 * relative_error(pairs.size) * error**2
-    jitter = {"dark": float(np.sqrt(beyond))} if significant else {}
+    is_significant = beyond > DEPARTS * 2 * relative_error(pairs.size) * error**2
+    jitter = float(np.sqrt(beyond)) if is_significant else 0.0
     means = _slow_means(amplitude[quiet])
     if len(means) < 2:
         return jitter, 0.0
     drift = float(np.ptp(np.quantile(means, [0.05, 0.95])))
     independent = NINE_TENTHS * float(np.sqrt(variance / SLOW_FRAMES))
-    return ({"dark": np.inf}, drift) if drift > max(DARK_DRIFTS * error, BEYOND_JITTER * independent) else (jitter, 0.0)
+    return (np.inf, drift) if drift > max(DARK_DRIFTS * error, BEYOND_JITTER * independent) else (jitter, 0.0)
 
 
 def event_colour(spectra: Float, error: Float, event: Bool, quiet: Bool) -> tuple[float, float, float]:
@@ -249,8 +251,8 @@ def event_colour(spectra: Float, error: Float, event: Bool, quiet: Bool) -> tupl
     spectra, error = spectra[:, fine], error[:, fine]
     star = spectra[quiet].mean(axis=0)
     excess = spectra[event].mean(axis=0) - star
-    count, base = np.count_nonzero(event), np.count_nonzero(quiet)
-    variance = (error[event] ** 2).sum(axis=0) / count**2 + (error[quiet] ** 2).sum(axis=0) / base**2
+    n_event, n_quiet = np.count_nonzero(event), np.count_nonzero(quiet)
+    variance = (error[event] ** 2).sum(axis=0) / n_event**2 + (error[quiet] ** 2).sum(axis=0) / n_quiet**2
     scale, half = _multiple(excess, star, variance)[0], fine.sum() // 2
     chi2 = ((excess - scale * star) ** 2 / variance).sum()
     blue, red = (_multiple(excess[k], star[k], variance[k]) for k in (slice(None, half), slice(half, None)))
@@ -286,9 +288,8 @@ class EventSpectrum:
     cause: Kind  # explanation of the spectrum: a flare, or a change that resembles one
     snr: float  # S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky
     chi2: dict[Kind, float]  # of single causes, with the best amplitude, and of flares of the best temperature
-    dof: int
-    p_value: float  # probability of a chi-squared at least as large as the smallest, if its cause is right
-    p_together: float  # the same of flares whose amplitude is fitted together with those changes
+    # Probability of a chi-squared at least as large as that of a flare whose amplitude is fitted with those changes.
+    p_together: float
 
     @property
     def ambiguous(self) -> bool:
@@ -319,7 +320,7 @@ def event_spectrum(
 
     Its spectrum is that of the template of the search, which is fitted to each pixel with a straight line.
     """
-    model, at = series.cleaned.model, _window(survey, in_events, event)[0]
+    model, at = series.cleaned.model, _surroundings(survey, in_events, event)[0]
     start = survey.stare.start_s[at]
     edges = np.column_stack([start, start + survey.stare.frame_s])
     shape = survey.bank.shape.mean_over(edges, event.peak_s, event.half_width_s)
@@ -331,30 +332,30 @@ def event_spectrum(
     flares, unknown = model.flares(TEMPERATURES_K), model.unknowns(series.light)
     causes: dict[Kind, Float] = {"flare": flares}
     causes |= {CAUSES[name]: row[None] for name, row in unknown.items()}
-    fits = {cause: models.chi2_of_one(spectrum, variance, rows) for cause, rows in causes.items()}
+    fits = {cause: models.chi2_of_each(spectrum, variance, rows) for cause, rows in causes.items()}
     chi2 = {cause: float(values.min()) for cause, values in fits.items()}
     # Light is added, never taken away.
     rises = flares @ (spectrum / variance) > 0
     chi2["flare"] = float(np.where(rises, fits["flare"], (spectrum**2 / variance).sum()).min())
-    together = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.full(len(unknown), np.inf))
+    together = _nuisances(unknown, dict.fromkeys(unknown, np.inf))
     rows = together.rows(variance, together.spectra)
     optimal = flares / variance - (flares @ rows.T) @ rows
     snr = float(((optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))).max())
     left = float((spectrum**2 / variance).sum() - ((rows @ spectrum) ** 2).sum() - max(snr, 0.0) ** 2)
     p_together = float(scipy.stats.chi2.sf(left, spectrum.size - 1 - len(unknown)))
     cause: Kind = min(chi2, key=lambda name: chi2[name])
-    dof, least, row = spectrum.size - 1, chi2[cause], causes[cause][fits[cause].argmin()]
+    least, row = chi2[cause], causes[cause][fits[cause].argmin()]
     residual = spectrum - (row @ (spectrum / variance)) / (row @ (row / variance)) * row
-    p_value = float(scipy.stats.chi2.sf(least, dof))
-    if p_value < NO_FIT and (residual**2 / variance).max() > RAY_SHARE * least:
+    is_unexplained = scipy.stats.chi2.sf(least, spectrum.size - 1) < NO_FIT
+    if is_unexplained and (residual**2 / variance).max() > RAY_SHARE * least:
         cause = "cosmic ray"
     elif cause != "flare" and (chi2["flare"] - least < models.CLEARLY or snr >= FLARE_SNR):
         cause = "flare"
-    return EventSpectrum(cause, snr, chi2, dof, p_value, p_together)
+    return EventSpectrum(cause, snr, chi2, p_together)
 
 
-def _window(survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> tuple[NDArray[np.intp], Bool]:
-    """Return the frames of an event and of its surroundings without other events, and which belong to the event."""
+def _surroundings(survey: SeriesSurvey, in_events: Bool, event: DetectedEvent) -> tuple[NDArray[np.intp], Bool]:
+    """Return the frames of an event and of its surroundings without other events, and which of them are its own."""
     lead, tail = survey.bank.window(event.half_width_s)
     numbers = survey.stare.numbers
     inside = np.zeros(numbers.size, np.bool_)
@@ -390,9 +391,7 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, in_events: Bool, n_fram
             expected = float(covariance[k, k]) * float((share[:-2] / 4 + share[1:-1] + share[2:] / 4).mean())
             beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
             drift[name] = n_frames / size * float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
-    if "sky" in unknown and (sd := NUISANCES["sky"].sd) is not None:
-        drift["sky"] = sd
-    return drift
+    return drift | ({"sky": PROCESSES["sky_level"].moments[1]} if "sky" in unknown else {})
 
 
 def measure_flare(
@@ -402,7 +401,7 @@ def measure_flare(
 
     Star, dark current and sky may differ from the surroundings as much as other parts of the frames do; see `drifts`.
     """
-    at, inside = _window(survey, in_events, event)
+    at, inside = _surroundings(survey, in_events, event)
     n, base = int(inside.sum()), int((~inside).sum())
     if base < MIN_BASELINE:
         return f"{base} frames around it show the quiescent star, {MIN_BASELINE} are needed"
@@ -411,11 +410,10 @@ def measure_flare(
     # The level is that of a finite number of frames.
     exposure = model.exposure(series.light, series.noise.used**2 * (1 + n / base), n)
     unknown = {name: row * n / model.per_dn for name, row in model.unknowns(series.light).items()}
-    sd = drifts(survey, series, in_events, n)
-    spectra, errors = np.array(list(unknown.values())), np.array([sd[name] for name in unknown])
+    nuisances = _nuisances(unknown, drifts(survey, series, in_events, n))
     # A change of the throughput changes the light of the flare as much as that of the star.
-    of_flare = np.array([np.full(summed.size, float(name == "light")) for name in unknown])
-    nuisances = Nuisances(tuple(unknown), spectra, errors, of_flare)
+    of_flare = np.array([np.full(summed.size, float(name == "light")) for name in nuisances.names])
+    nuisances = replace(nuisances, of_flare=of_flare)
     # In the sum of the frames, with one pixel for each value.
     flares = replace(model.flare, hot=model.flare.hot @ model.bins.T, fixed=model.flare.fixed @ model.bins.T)
     try:

@@ -72,7 +72,7 @@ class ThroughputFit(GoodnessOfFit):
         return np.asarray(np.sqrt(np.diag(self.joint)[: self.wavelength_nm.size]))
 
 
-class _Linearised:
+class _LinearProblem:
     """Observed counts as a linear function of the parameters, and the parameters that fit them best.
 
     Values and the rows of the design are independent and of variance one. The spline's coefficients are the first
@@ -85,7 +85,7 @@ class _Linearised:
         n = len(penalty)
         middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(penalty))
         # The smoothing parameter of the largest restricted likelihood.
-        self.smoothing = _best(self.likelihood, tuple(middle + np.array(LOG_SMOOTHING)))
+        self.smoothing = _most_likely(self.likelihood, tuple(middle + np.array(LOG_SMOOTHING)))
         self.covariance: Float = np.asarray(np.linalg.inv(self._information(self.smoothing, prior)))
         self.solution: Float = self.covariance @ self.projected
 
@@ -153,7 +153,7 @@ class _Linearised:
         return disagree, chi2, dof - float(share.sum()), float(np.sqrt(variance)), *factors
 
 
-def _best(likelihood: Callable[[float], float], log_range: tuple[float, float]) -> float:
+def _most_likely(likelihood: Callable[[float], float], log_range: tuple[float, float]) -> float:
     """Return the positive number at which -2 log likelihood is smallest."""
     minimum = minimize_scalar(lambda log: likelihood(np.exp(log)), bounds=log_range, method="bounded")
     return float(np.exp(minimum.x))
@@ -205,8 +205,9 @@ class ThroughputModel:
         self.slopes_dn = list[Float]()
         for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
             moved = step * np.eye(self.n_shape)[place]
-            more, less = (self.light_dn(np.zeros(nm.size), sign * moved) for sign in (1, -1))
-            self.slopes_dn += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
+            above, below = (self.light_dn(np.zeros(nm.size), sign * moved) for sign in (1, -1))
+            slope = (above - below) / (2 * step)
+            self.slopes_dn += [slope, slope * self.x]
 
     def light_dn(self, log_factor: Float, shape: Float) -> Float:
         """Return the mean light of a frame of each star, DN, shape (n_star, n_pixel).
@@ -238,7 +239,7 @@ class ThroughputModel:
         gains = self.nominal.per_pixel("gain", 1.0)
         return np.asarray(self.transfer.noise.variance(gains * light_dn, dark) / frames[:, None])
 
-    def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
+    def linearised(self, coefficients: Float, shape: Float, error: float) -> _LinearProblem:
         """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""
         n_star, log_factor = len(self.stars), self.basis @ coefficients
         model = self.light_dn(log_factor, shape)
@@ -268,7 +269,7 @@ class ThroughputModel:
         masked = [np.where(used.T, values, 0.0) for values in (*columns, self.observed_dn - model)]
         *columns, observed = (np.einsum("pij,jp->ip", inverse, values).ravel() for values in masked)
         design = np.column_stack(columns)
-        return _Linearised(observed + design[:, : around.size] @ around, design, np.array(prior), self.penalty)
+        return _LinearProblem(observed + design[:, : around.size] @ around, design, np.array(prior), self.penalty)
 
 
 def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) -> ThroughputFit:
@@ -279,41 +280,49 @@ def fit_throughput(model: ThroughputModel, spectrum_error: float | None = None) 
     disagree.
     """
     nm, fwhm, several = model.nominal.wavelength_nm, model.nominal.gaussian_fwhm_nm, model.n_stars > 1
-    error = spectrum_error if spectrum_error is not None else 0.0
-    best = _iterated(model, error)
+    error = spectrum_error or 0.0
+    best = _solve(model, error)
     m, n = model.n_shape, model.basis.shape[1]
     if several and spectrum_error is None and best.pixels(model)[0]:
-        trial = _iterated(model, ONE_STAR_ERROR)
+        trial = _solve(model, ONE_STAR_ERROR)
         of_spectra = trial.prior == ONE_STAR_ERROR
-        error = _best(lambda sd: trial.likelihood(trial.smoothing, np.where(of_spectra, sd, trial.prior)), LOG_ERROR)
-        best = _iterated(model, error)
+        error = _most_likely(
+            lambda sd: trial.likelihood(trial.smoothing, np.where(of_spectra, sd, trial.prior)), LOG_ERROR
+        )
+        best = _solve(model, error)
     shape = best.solution[n : n + m]
     if (np.abs(shape) > LIMITS[:m]).any():
         fault = "the stars' spectra must match a wavelength scale and line width near the nominal ones, but do not"
         most = f"use standards with shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %"
         raise InputError(f"{fault}; {most}", key="observations")
-    # One star cannot tell errors of its spectrum from the throughput.
-    apart = 0.0 if several or spectrum_error is not None else ONE_STAR_ERROR
     _, chi2, dof, structure, log_pixel, variance = best.pixels(model)
-    onto, errors = scipy.linalg.block_diag(model.basis, np.eye(m)), apart * _linear_basis(nm)
-    joint = np.asarray(onto @ best.scaled(model.basis)[: n + m, : n + m] @ onto.T)
+    to_pixels = scipy.linalg.block_diag(model.basis, np.eye(m))
+    joint = np.asarray(to_pixels @ best.scaled(model.basis)[: n + m, : n + m] @ to_pixels.T)
+    # The fit to one star cannot tell errors of its spectrum from the throughput.
+    unfitted_error = 0.0 if several or spectrum_error is not None else ONE_STAR_ERROR
+    errors = unfitted_error * _linear_basis(nm)
     joint[: nm.size, : nm.size] += np.diag(variance) + errors @ errors.T + model.transfer.relative_gain_error**2
     log_factor = model.basis @ best.solution[:n] + log_pixel
     light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
-    known = {"wavelength zero point": m > 0, "line width": m == 4, "errors of the star's spectrum": several}
+    fitted = {"wavelength zero point": m > 0, "line width": m == 4, "errors of the star's spectrum": several}
     # Widths are relative to the nominal one.
-    scale, errors = np.array([1.0, 1.0, fwhm, fwhm]), np.append(np.sqrt(np.diag(joint))[nm.size :], [np.nan] * (4 - m))
+    scale, shape_error = np.array([1.0, 1.0, fwhm, fwhm]), np.sqrt(np.diag(joint))[nm.size :]
     return ThroughputFit(
-        nm, log_factor, joint, scale * (np.append(shape, np.zeros(4 - m)) + [0, 0, 1, 0]), scale * errors,
-        residual=residual, chi2=chi2, dof=dof,
-        spectrum_error=apart or error, structure=structure, assumed=tuple(name for name in known if not known[name]),
+        nm, log_factor, joint,
+        shape_nm=scale * (np.pad(shape, (0, 4 - m)) + [0, 0, 1, 0]),
+        shape_error_nm=scale * np.pad(shape_error, (0, 4 - m), constant_values=np.nan),
+        residual=residual, chi2=chi2, dof=dof, spectrum_error=unfitted_error or error, structure=structure,
+        assumed=tuple(name for name in fitted if not fitted[name]),
     )  # fmt: skip
 
 
-def _iterated(model: ThroughputModel, error: float) -> _Linearised:
-    """Return the problem that is linearised around its solution."""
+def _solve(model: ThroughputModel, error: float) -> _LinearProblem:
+    """Return the linear problem around its own solution, for a relative error of the stars' spectra.
+
+    Raises InputError if the iterations do not settle.
+    """
     n, m = model.basis.shape[1], model.n_shape
     coefficients, shape = np.zeros(n), np.zeros(m)
     for _ in range(ITERATIONS):

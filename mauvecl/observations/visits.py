@@ -51,16 +51,16 @@ class PeriodRecovery:
 
 
 def visit_times_d(windows: Windows, visits: int, exposure_s: float, seed: int) -> Float:
-    """Draw the middles of visits in windows, evenly over the time in which an exposure fits, in days; ascending."""
+    """Draw the middles of visits, in days, ascending; they begin at any time from which an exposure fits a window."""
     room = np.maximum(windows.length_s - exposure_s, 0.0)
     if not room.sum() > 0:
         longest = windows.length_s.max(initial=0.0)
         expected = f"at most the longest window, {longest:.0f} s"
         raise InputError.of("observation.exposure_s", exposure_s, expected, unit="s")
     ends = np.cumsum(room)
-    at = np.sort(np.random.default_rng(seed).uniform(0.0, ends[-1], visits))
-    window = np.searchsorted(ends, at, side="right")
-    start = windows.start_s[window] + at - (ends[window] - room[window])
+    places = np.sort(np.random.default_rng(seed).uniform(0.0, ends[-1], visits))
+    window = np.searchsorted(ends, places, side="right")
+    start = windows.start_s[window] + places - (ends[window] - room[window])
     return np.asarray((start + exposure_s / 2) / 86_400.0)
 
 
@@ -116,8 +116,8 @@ def recover_periods(
     def recovery(amplitude: float, period: float) -> Interval:
         phases = generator.uniform(0, 2 * np.pi, trials)
         peaks = [peak(amplitude * np.sin(2 * np.pi * time / period + phase)) for phase in phases]
-        found = sum(power > threshold and abs(at - 1 / period) < 0.5 / base for power, at in peaks)
-        return clopper_pearson(found, trials)
+        recovered = sum(power > threshold and abs(best - 1 / period) < 0.5 / base for power, best in peaks)
+        return clopper_pearson(recovered, trials)
 
     threshold = float(np.sort([peak(0.0)[0] for _ in range(int(np.ceil(IN_TAIL / fap)))])[-IN_TAIL])
     recovered = [[recovery(amplitude, period) for period in periods_d] for amplitude in amplitudes]
