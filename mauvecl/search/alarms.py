@@ -2,7 +2,7 @@
 
 Each pass searches the residuals of the fits. A template raises an alarm if its value exceeds the threshold by more than
 the share of the fitted flux that a wrong shape may leave in the residuals. Flares that overlap are fitted together
-(`flare_fits`) from several starting points, and each must improve chi-squared by the square of the threshold. The
+(`survey`) from several starting points, and each must improve chi-squared by the square of the threshold. The
 passes end when there are no more alarms.
 """
 
@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import Float, true_runs
-from mauvecl.search.flare_fits import AMPLITUDE, KELVIN, PEAK, WIDTH, FittedFlares, ProfiledQuantity, SummedStare
-from mauvecl.search.templates import LEAD, TAIL
+from mauvecl.search.search import LEAD, TAIL
+from mauvecl.search.survey import AMPLITUDE, KELVIN, PEAK, WIDTH, FittedFlares, ProfiledQuantity, SummedStare
 
 if TYPE_CHECKING:
-    from mauvecl.search.flare_fits import BlendFit, Block, Factor
-    from mauvecl.search.search import Row, Survey
+    from mauvecl.search.search import Row
+    from mauvecl.search.survey import BlendFit, Block, Factor, Survey
 
 
 #: Values of a fit without a measurement.

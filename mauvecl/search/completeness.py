@@ -21,7 +21,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S, Duration, DurationExponent, DurationScatter, Energy, NotNegative, Positive
 from mauvecl.search.false_alarms import TemplateGrid
-from mauvecl.search.templates import Bank, white_bank
+from mauvecl.search.search import Bank, white_bank
 
 #: Energies per decade of the closed form, and its numbers of half-widths and peak times.
 PER_DECADE, WIDTHS, PEAKS = 20, 40, 24

@@ -44,8 +44,8 @@ from mauvecl.flares.stare import select_frames
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
-from mauvecl.search.search import Search, Survey
-from mauvecl.search.templates import Bank
+from mauvecl.search.search import Bank, Search
+from mauvecl.search.survey import Survey
 
 #: Smallest number of alarms for a counted threshold.
 MIN_ALARMS = 10

@@ -29,9 +29,8 @@ from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
-from mauvecl.search.flare_fits import WIDTH, FittedFlares, SummedStare
-from mauvecl.search.search import Search, SearchedFrames, Survey
-from mauvecl.search.templates import Bank
+from mauvecl.search.search import Bank, Search
+from mauvecl.search.survey import WIDTH, FittedFlares, SearchedFrames, SummedStare, Survey
 
 #: Quantities of each fit: ratios of fitted to injected values, the peak offset in half-widths, and whether the
 #: equivalent duration is within its standard error.
