@@ -8,7 +8,7 @@ higher one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import (
+    APART,
     NEAR_SIGMA,
     DerivedQuantity,
     FlareModel,
@@ -26,6 +27,7 @@ from mauvecl.fits.flare_model import (
     ReducedSums,
     check_enough,
     derived_values,
+    nodes_below,
     undimmed,
 )
 from mauvecl.fits.profile import BestFit, Profile, Slopes, covariance, intervals, with_bounds
@@ -64,6 +66,13 @@ def _values(measured: Measurement | Forecast, values: Float, errors: Float) -> s
         f"{name} = {formatted(value, '.4g')} +- {formatted(error, '.2g')} {unit}".rstrip()
         for name, value, error, unit in zip(measured.names, values, errors, measured.units, strict=True)
     )
+
+
+#: Axis of the frames in each array of a `Measurement`.
+FRAME_AXES = {
+    "estimates": 0, "covariance": 0, "low": 1, "high": 1, "chi2": 0, "p_value": 0, "snr": 0, "log_k": 0,
+    "amplitudes": 0, "factor": 0,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,26 +127,22 @@ class Measurement:
     @classmethod
     def joined(cls, parts: Sequence[Self], numbers: Sequence[ArrayLike] | None = None) -> Self:
         """Return the measurements of several batches of frames as one, in the order of the frames' numbers if given."""
-        values: dict[str, Any] = {field.name: getattr(parts[0], field.name) for field in fields(cls)}
-        for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                axis = 1 if name in ("low", "high") else 0
-                values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
-        joined = cls(**values | {"dof": min(part.dof for part in parts)})
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts], axis) for name, axis in FRAME_AXES.items()
+        }
+        joined = replace(parts[0], **arrays, dof=min(part.dof for part in parts))
         return joined if numbers is None else joined.rows(np.argsort(np.concatenate(numbers)))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return all arrays that depend on the frames, for files."""
-        values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
+        """Return all arrays that depend on the frames, and the degrees of freedom, for files."""
+        return {name: np.asarray(getattr(self, name)) for name in (*FRAME_AXES, "dof")}
 
     def rows(self, index: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
         arrays: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                arrays[field.name] = value[:, index] if field.name in ("low", "high") else value[index]
+        for name, axis in FRAME_AXES.items():
+            values = getattr(self, name)
+            arrays[name] = values[:, index] if axis else values[index]
         return replace(self, **arrays)
 
     def column(self, name: str) -> int:
@@ -287,7 +292,7 @@ class _Problem:
         """
         raw, quiet, n = self.raw, self.quiet, len(self.raw)
         log_k, linear = np.empty(n), np.empty((n, len(self.model.linear)))
-        usual = self.reduction(None)
+        usual = self.reduction()
         used = usual.variance > 0.0
         counts = np.count_nonzero(raw > np.where(used, _highest_usable(quiet), np.inf), axis=1)
 
@@ -303,10 +308,10 @@ class _Problem:
             for batch in _batches(np.flatnonzero((step == key) & (counts > 0))):
                 clipped = clipped_pixels(raw[batch], quiet)
                 if (~clipped & used).sum() >= LEAST_SHARED * (used.sum() - counts[batch].max()):
-                    fit_rows(batch, self.reduction(None, clipped=clipped))
+                    fit_rows(batch, self.reduction(clipped=clipped))
                     continue
                 for row in batch[:, None]:
-                    fit_rows(row, self.reduction(None, clipped=clipped_pixels(raw[row], quiet)))
+                    fit_rows(row, self.reduction(clipped=clipped_pixels(raw[row], quiet)))
         return log_k, linear, counts > 0
 
     def groups(
@@ -395,7 +400,6 @@ def clipped_pixels(raw: NDArray[Any], quiet: Expectation) -> NDArray[np.bool_]:
     Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
     """
     clipped = (raw > _highest_usable(quiet)).any(axis=0)
-    # With neighbours, the noise of single pixels does not select the pixels of a fit.
     return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
 
 
@@ -486,7 +490,7 @@ def forecast_model(
     flare, response, slopes = single, reduction, None
     if isinstance(model, TwoTemperatures):
         second, log_k = float(log_k[1]), log_k[:1]
-        flare, response = model.at(second), reduction.with_second(second, model.end(second))
+        flare, response = model.at(second), reduction.with_second(second)
         slopes = model.slopes(second, reduction, log_k, linear)
     sums, factors = linear[0] @ np.vstack([response.spline(log_k), response.fixed]), np.array([factor])
     spread = covariance(flare, response, BestFit(log_k, linear, np.array([sums @ sums])), factors, slopes)[0]
@@ -498,8 +502,6 @@ def forecast_model(
 PER_NODE = 3
 #: Steps between the temperatures that are tried first, and number of those in and next to an interval.
 COARSE, TRIES = 36, 20
-#: Smallest number of nodes between the two temperatures; closer temperatures cannot be distinguished.
-APART = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -525,14 +527,9 @@ class TwoTemperatures:
         assert spline is not None
         return spline
 
-    def end(self, log_k: float) -> int:
-        """Return the number of nodes that are at least `APART` nodes below a temperature."""
-        nodes = self.single.log_k
-        return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
-
     def at(self, log_k: float) -> FlareModel:
         """Return a model of lower temperatures with a blackbody of a second temperature as another component."""
-        single, end = self.single, self.end(log_k)
+        single, end = self.single, nodes_below(self.single.log_k, log_k)
 
         def area(x: Float | float) -> Float:
             # The ratio of the flux at the telescope to that at the surface is proportional to the area.
@@ -657,8 +654,7 @@ class _SecondTemperatures:
 
     def profile(self, node: int, rows: NDArray[np.intp]) -> Profile:
         """Return the profile of some exposures at a second temperature."""
-        log_k = float(self.grid[node])
-        return self._sums.bounded_rows(rows, self._reduction.with_second(log_k, self._model.end(log_k)))
+        return self._sums.bounded_rows(rows, self._reduction.with_second(float(self.grid[node])))
 
     def intervals(self) -> tuple[Float, Float]:
         """Return the ends of intervals, (n_level, n, n_derived): the outermost ones at all second temperatures."""
