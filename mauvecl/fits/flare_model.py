@@ -558,12 +558,6 @@ class ReducedSums(MeanSums):
             light = LightFactor(*means, row, scale, expected, share, unknown.factor_prior)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
 
-    def quiescent_chi2(self, excess_dn: Float) -> Float:
-        """Return chi-squared of frames less the quiescent mean, without a flare, shape (n,)."""
-        inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=self.variance > 0.0)
-        unknown = excess_dn @ self.rows.T
-        return np.asarray(excess_dn**2 @ inverse - np.vecdot(unknown, unknown))
-
 
 def spanning_weights(
     spectra: Float, plain: Float, nuisances: Nuisances | None, rows: Float | None, least: float

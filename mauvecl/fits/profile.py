@@ -165,7 +165,7 @@ class Profile:
     """
 
     def __init__(
-        self, reduction: MeanSums, sums: Float, light: Float | None = None, *, bounded: bool = False
+        self, reduction: ReducedSums, sums: Float, light: Float | None = None, *, bounded: bool = False
     ) -> None:  # fmt: skip
         """Take the sums of frames, (n, n_sum), and those of the factor on light, (n,), if it is unknown."""
         self.reduction, self.sums, self.light, self.bounded = reduction, sums, light, bounded
@@ -173,7 +173,7 @@ class Profile:
         #: Sums less what the fixed components explain.
         self.body_sums = reduction.without_fixed(sums)
 
-    def bounded_rows(self, rows: NDArray[np.intp], reduction: MeanSums | None = None) -> Profile:
+    def bounded_rows(self, rows: NDArray[np.intp], reduction: ReducedSums | None = None) -> Profile:
         """Return the bounded profile of some of the frames, optionally for another reduction to the same sums."""
         light = None if self.light is None else self.light[rows]
         return Profile(reduction or self.reduction, self.sums[rows], light, bounded=True)
@@ -246,6 +246,12 @@ class Profile:
                 positive = np.maximum(values, 0.0) if self.bounded or k == 0 else values
                 np.copyto(amplitudes[k], positive, where=better)
         return BestFit(log_k, np.ascontiguousarray(amplitudes.T), gain)
+
+    def bounded_best(self) -> BestFit:
+        """Return the best fit of each frame with amplitudes of at least zero."""
+        best = self.best()
+        negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
+        return best.replaced(negative, self.bounded_rows(negative).best()) if negative.size else best
 
     def _stationary(self, at_nodes: Float | None) -> Float:
         """Return the best temperatures without bounds on fixed components, shape (n,).
@@ -337,12 +343,6 @@ class Profile:
             a, fa = np.where(crossed, b, a), np.where(crossed, fb, 0.5 * fa)
         low, high = np.where(closed, x, np.nan).T
         return low, high
-
-
-def with_bounds(reduction: ReducedSums, sums: Float, best: BestFit) -> BestFit:
-    """Return fits with amplitudes of at least zero, from fits without this bound."""
-    negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
-    return best.replaced(negative, Profile(reduction, sums[negative], bounded=True).best()) if negative.size else best
 
 
 def intervals(

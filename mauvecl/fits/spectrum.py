@@ -30,7 +30,7 @@ from mauvecl.fits.flare_model import (
     nodes_below,
     undimmed,
 )
-from mauvecl.fits.profile import BestFit, Profile, Slopes, covariance, intervals, with_bounds
+from mauvecl.fits.profile import BestFit, Profile, Slopes, covariance, intervals
 from mauvecl.host.arrays import Float
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, formatted, table_of
@@ -228,8 +228,7 @@ def fit(
     saturated = [np.flatnonzero(saturates)] * (SATURATED_REFITS if any_saturates else 0)
     for rows in [*saturated, *[all_rows] * (REFITS - 1)]:
         for batch, reduction in problem.groups(log_k, linear, rows, any_saturates):
-            profile = problem.profile(reduction, batch)
-            best = with_bounds(reduction, profile.sums, profile.best())
+            best = problem.profile(reduction, batch).bounded_best()
             log_k[batch], linear[batch] = best.log_k, best.linear
     measurements, batches = [], []
     for batch, reduction in problem.groups(log_k, linear, all_rows, any_saturates):
@@ -264,7 +263,7 @@ class _Problem:
         self.raw, self.quiet, self.model, self.nuisances, self.levels = raw, quiet, model, nuisances, tuple(levels)
         #: Mean of the frames without a flare, and rises of chi-squared at the ends of intervals of each level.
         self.mean_dn = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
-        self.rises = [float(scipy.stats.chi2.isf(1 - level, 1)) for level in levels]
+        self.rises = scipy.stats.chi2.isf(1 - np.array(levels), 1).tolist()
         #: Reduction of exposures with a flare, for its mean and further options of `ReducedSums.of`.
         self.reduction = partial(ReducedSums.of, model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
 
@@ -283,7 +282,12 @@ class _Problem:
 
     def quiescent_chi2(self, reduction: ReducedSums, rows: NDArray[np.intp]) -> Float:
         """Return chi-squared of some frames without a flare, shape (n,)."""
-        return np.concatenate([reduction.quiescent_chi2(excess) for excess in self._excess(rows)])
+        variance, chi2 = reduction.variance, []
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0.0)
+        for excess in self._excess(rows):
+            unknown = excess @ reduction.rows.T
+            chi2.append(excess**2 @ inverse - np.vecdot(unknown, unknown))
+        return np.concatenate(chi2)
 
     def pilot(self) -> tuple[Float, Float, NDArray[np.bool_]]:
         """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
@@ -369,22 +373,22 @@ class _Problem:
                 ends_at_bound = intervals(model, bounded, bounded_best, bounded_at_nodes, rise)
                 low[k, near_bound], high[k, near_bound] = ends_at_bound
             best = best.replaced(near_bound, bounded_best)
-        return self.measurement(model, reduction, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
+        return self.measurement(model, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
 
     def measurement(
-        self, model: FlareModel, reduction: ReducedSums, profile: Profile, best: BestFit, quiescent: Float,
-        ends: tuple[Float, Float], second: tuple[float, Slopes] | None = None,
+        self, model: FlareModel, profile: Profile, best: BestFit, quiescent: Float, ends: tuple[Float, Float],
+        second: tuple[float, Slopes] | None = None,
     ) -> Measurement:  # fmt: skip
         """Return the measurement of best fits with the ends of their intervals.
 
         `quiescent` is chi-squared without a flare. A second blackbody is given by its log temperature and the
         derivatives with respect to it.
         """
-        chi2 = quiescent - best.gain
+        chi2, reduction = quiescent - best.gain, profile.reduction
         n_used = int(np.count_nonzero(reduction.variance))
         dof = n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
         factor, log_k = profile.factor(best), best.log_k
-        spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])
+        spread = covariance(model, reduction, best, factor, None if second is None else second[1])
         if second is not None:
             log_k = np.column_stack([log_k, np.full(log_k.size, second[0])])
         return Measurement(
@@ -607,7 +611,7 @@ def fit_two_temperatures(
     for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
         quiescent = problem.quiescent_chi2(reduction, rows)
-        search = _SecondTemperatures(two, problem.profile(reduction, rows), reduction, problem.rises)
+        search = _SecondTemperatures(two, problem.profile(reduction, rows), problem.rises)
         low, high = search.intervals()
         best_node = search.gain.argmax(axis=1)
         # Exposures with the same best second temperature are measured together.
@@ -617,21 +621,22 @@ def fit_two_temperatures(
             best = replace(profile.best(profile.gain_at_nodes()), gain=search.gain[alike, node])
             second = log_k, two.slopes(log_k, reduction, best.log_k, best.linear)
             flare = two.at(log_k)
-            measurements.append(problem.measurement(flare, reduction, profile, best, quiescent[alike], ends, second))
+            measurements.append(problem.measurement(flare, profile, best, quiescent[alike], ends, second))
             order.append(rows[alike])
     measured, n = Measurement.joined(measurements, order), len(recorded)
     # Without light of the other blackbody, the estimates are those of one.
-    of_one = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
+    single_estimates = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
     absent = (measured.amplitudes[:, :2] <= 0.0).any(axis=1, keepdims=True)
-    return replace(measured, estimates=np.where(absent, of_one, measured.estimates))
+    return replace(measured, estimates=np.where(absent, single_estimates, measured.estimates))
 
 
 class _SecondTemperatures:
     """Largest gains of exposures with a common variance at second temperatures in and next to their intervals."""
 
-    def __init__(self, model: TwoTemperatures, profile: Profile, reduction: ReducedSums, rises: list[float]) -> None:
-        self._model, self._sums, self._reduction, self._rises = model, profile, reduction, rises
-        log_k = reduction.log_k
+    def __init__(self, model: TwoTemperatures, profile: Profile, rises: list[float]) -> None:
+        """Take the exposures' profile for a single temperature, and the rises of chi-squared at ends of intervals."""
+        self._model, self._single, self._rises = model, profile, rises
+        log_k = profile.nodes
         #: Second log temperatures that may be tried, and the largest gain at each, minus infinity if not tried.
         self.grid = np.linspace(log_k[2 * APART], log_k[-1], PER_NODE * (log_k.size - 1 - 2 * APART) + 1)
         self.gain = np.full((len(profile.sums), self.grid.size), -np.inf)
@@ -654,7 +659,7 @@ class _SecondTemperatures:
 
     def profile(self, node: int, rows: NDArray[np.intp]) -> Profile:
         """Return the profile of some exposures at a second temperature."""
-        return self._sums.bounded_rows(rows, self._reduction.with_second(float(self.grid[node])))
+        return self._single.bounded_rows(rows, self._single.reduction.with_second(float(self.grid[node])))
 
     def intervals(self) -> tuple[Float, Float]:
         """Return the ends of intervals, (n_level, n, n_derived): the outermost ones at all second temperatures."""

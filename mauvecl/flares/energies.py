@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mauvecl.flares import DAYS
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.stars.flare import (
@@ -233,7 +234,7 @@ def _through(wavelength_nm: Float, flux_flam: Float, band: str) -> float:
 
 
 def _integral(wavelength_nm: Float, flux_flam: Float) -> float:
-    # erg s-1 cm-2 A-1 over nm.
+    """Return the integral of a flux in erg s-1 cm-2 A-1 over nm, erg s-1 cm-2."""
     return 10.0 * float(np.trapezoid(flux_flam, wavelength_nm))
 
 
@@ -247,7 +248,6 @@ ENERGIES = (1e22, 1e42)
 #: Scatter of the rates of single stars about a published relation, dex (assumption: stars of equal mass and age differ
 #: by factors of a few).
 SCATTER_DEX = 0.5
-DAYS_PER_YEAR = 365.25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -469,7 +469,7 @@ def sunlike() -> PowerLaw:
     scatter covers other results: Maehara et al. 2015 find 1e34 erg once in 800 years, others once in 5000.
     """
     return PowerLaw.through(
-        2.0, 7e33, 1 / (3000 * DAYS_PER_YEAR), band=BOLOMETRIC,
+        2.0, 7e33, 1 / (3000 * DAYS["year"]), band=BOLOMETRIC,
         source="Sun-like G dwarfs: 7e33 erg per 3000 yr (Okamoto et al. 2021), exponent 2 (Shibayama et al. 2013)",
         measured_erg=(1e33, 1e36), scatter_dex=SCATTER_DEX, definition="patch",
     )  # fmt: skip

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
+from mauvecl.flares import MOST_TEMPERATURES, ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.energies import EnergyScale, amplitude_of
 from mauvecl.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.host.arrays import Float, set_read_only
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
 
-#: Largest number of flare spectra of a stare (`frames.MOST_FLARES`), and the smallest for flares that cool.
-MOST_TEMPERATURES, LEAST_STEPS = 8, 3
+#: Smallest number of a stare's temperatures that are left for flares that cool.
+LEAST_STEPS = 3
 #: For a flare that cools: smallest number of steps per frame, half-width and cooling time, and largest per frame.
 PARTS, MOST_PARTS = 16, 512
 #: Fraction of a flare's peak and of its fluence below which its light in a frame is neglected.
@@ -514,6 +514,7 @@ def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float
 
 
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
+    """Raise InputError unless a standard deviation lies between `least` and the largest for positive levels."""
     most = 100.0 if of == "temperature" else LARGEST_SPREAD
     if not least <= sd <= most:
         unit = "deg C" if of == "temperature" else ""
@@ -592,7 +593,7 @@ def stare_along(
     is_visible = visible.seen[:, 0]
     if not is_visible.any():
         raise InputError(
-            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}; try another time "
+            f"target {place.name!r} is never seen in {duration_s / HOUR_S:g} h from {times.iso(0.0)}; try another time "
             "or other limits",
             key="target",
         )

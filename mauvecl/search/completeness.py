@@ -12,7 +12,7 @@ from scipy import interpolate, optimize, stats
 
 from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
 from mauvecl.detection.nuisances import Nuisances
-from mauvecl.flares import HALF_WIDTHS_S as BANK_S
+from mauvecl.flares import HALF_WIDTHS_S
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
 from mauvecl.host.arrays import Float, set_read_only
@@ -25,7 +25,8 @@ from mauvecl.search.search import Bank, white_bank
 
 #: Energies per decade of the closed form, and its numbers of half-widths and peak times.
 PER_DECADE, WIDTHS, PEAKS = 20, 40, 24
-HALF_WIDTHS_S = (2.0, 20_000.0)
+#: Range of its half-widths, s.
+WIDTH_RANGE_S = (2.0, 20_000.0)
 #: Range of thresholds, sigma.
 THRESHOLDS = (2.0, 20.0)
 
@@ -123,7 +124,7 @@ class Completeness:
         """
         if scale.kind != "bolometric":
             raise InputError.of("kind", scale.kind, "bolometric")
-        law, bank = law or DurationLaw(), bank or white_bank(BANK_S, shape_of("davenport2014"), 5.0)
+        law, bank = law or DurationLaw(), bank or white_bank(HALF_WIDTHS_S, shape_of("davenport2014"), 5.0)
         threshold = search_threshold(false_alarms_per_day, bank)
         widths, gain = _gains(bank.shape, window_s, bank.frame_s)
         # From undetectable energies to those that are always detected.
@@ -210,7 +211,7 @@ def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]
     edges = np.arange(n + 1) * frame_s
     line = np.stack([np.ones(n), np.linspace(-1, 1, n)])
     line /= np.linalg.norm(line, axis=1)[:, None]
-    widths = np.geomspace(*HALF_WIDTHS_S, WIDTHS)
+    widths = np.geomspace(*WIDTH_RANGE_S, WIDTHS)
     # Peaks have irregular phases within frames, which averages over the phase of short flares.
     peaks = (np.arange(PEAKS) + 0.5) / PEAKS * n * frame_s + frame_s * ((np.arange(PEAKS) * 0.618034) % 1.0 - 0.5)
     gain = np.empty((WIDTHS, PEAKS))

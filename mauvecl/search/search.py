@@ -259,11 +259,12 @@ class Search:
                 "curves and level.cycle must be given both or not at all, but only one is given", key="curves"
             )
         self.bank, self.stare = bank, stare
+        # The grid has every frame from the first to the last, those in gaps included, with a weight of zero.
         self._first = int(stare.numbers[0])
-        self._at = stare.numbers - self._first
-        self.n_grid = int(self._at[-1]) + 1
+        self._places = stare.numbers - self._first
+        self.n_grid = int(self._places[-1]) + 1
         self._weight = np.zeros(self.n_grid)
-        self._weight[self._at] = 1.0 if variance is None else 1.0 / variance
+        self._weight[self._places] = 1.0 if variance is None else 1.0 / variance
         series = [np.ones(stare.n_frames)]
         for curve in np.zeros((0, stare.n_frames)) if curves is None else curves:
             scale = float(np.std(curve))
@@ -273,7 +274,7 @@ class Search:
         # Terms of the baseline: a power of time in the window, and the index of a series in the stare.
         self._terms = [(power, 0) for power in bank.baseline.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
         self._series = np.zeros((len(series), self.n_grid))
-        self._series[:, self._at] = series
+        self._series[:, self._places] = series
         # Only the part of a long template within a stare's length of the onset overlaps data.
         reach = min(max(t.shapes.shape[1] for t in bank.templates), self.n_grid)
         self._size = int(scipy.fft.next_fast_len(self.n_grid + reach, real=True))
@@ -342,8 +343,8 @@ class Search:
         templates = np.zeros((onsets.size, self.stare.n_frames))
         if not onsets.size:
             return templates
-        reached = slice(*np.searchsorted(self._at, [first.min(), first.max() + size]))
-        grid = self._at[reached]
+        reached = slice(*np.searchsorted(self._places, [first.min(), first.max() + size]))
+        grid = self._places[reached]
         at = grid - first[:, None]
         inside = (at >= 0) & (at < size)
         at = np.where(inside, at, 0)
@@ -362,7 +363,7 @@ class Search:
     @property
     def variance(self) -> Float:
         """Variance of each frame's sums, shape (n_frame,)."""
-        return np.asarray(1.0 / self._weight[self._at])
+        return np.asarray(1.0 / self._weight[self._places])
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
@@ -371,14 +372,14 @@ class Search:
         if self._terms:
             # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
             levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
-        weighted[:, :, self._at] = levelled * self._weight[self._at]
+        weighted[:, :, self._places] = levelled * self._weight[self._places]
         return [scipy.fft.rfft(weighted * series.astype(sums.dtype), self._size) for series in self._series]
 
     @cached_property
     def _level_span(self) -> Float:
         """Orthonormal columns that span all baselines of the stare, (n_frame, n)."""
-        time = (self._at - self._at.mean()) / max(self.n_grid, 1)
-        columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
+        time = (self._places - self._places.mean()) / max(self.n_grid, 1)
+        columns = np.array([time**power * self._series[series][self._places] for power, series in self._terms])
         return np.asarray(scipy.linalg.orth(columns.T, rcond=1e-12))
 
     def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
@@ -421,7 +422,8 @@ class Search:
             power = over(0, 0, shape**2) - 2 * np.sum(solved * shared, axis=1)
             power += np.einsum("ni,nij,nj->n", solved, gram, solved)
             without_gaps = template.detrended(phase, self.bank.baseline.powers)
-            tried = power >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
+            least = LEAST_SHARE * float(without_gaps @ without_gaps)
+            tried = power >= least * float(np.median(self._weight[self._places]))
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, power, 0.0)), solved.T)
 
 
