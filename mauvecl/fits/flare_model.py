@@ -222,7 +222,7 @@ class FlareModel:
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 
     @cached_property
-    def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
+    def amplitude_sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
         """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
         factors = [derived.factors for derived in self.derived]
         is_sum = np.array([factor is not None for factor in factors])
@@ -274,7 +274,7 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
     dimmed (n,).
     """
     values = np.empty((log_k.size, len(model.derived)))
-    is_sum, spline = model.sums
+    is_sum, spline = model.amplitude_sums
     values[:, is_sum] = undimmed(np.einsum("nql,nl->nq", spline(log_k), linear), factor)
     for q in np.flatnonzero(~is_sum):
         derived, ratio = model.derived[q], model.splines[q]

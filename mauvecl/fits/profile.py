@@ -631,7 +631,7 @@ def covariance(
     if light is None:
         return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
     over = np.where(factor > 0.0, factor, np.nan)
-    is_sum, _ = model.sums
+    is_sum, _ = model.amplitude_sums
     gradient[:, is_sum] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
     by_factor = np.where(is_sum, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
@@ -646,7 +646,7 @@ def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
     """Return derivatives with respect to amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
     n, m = linear.shape
     gradient = np.zeros((n, len(model.derived), m + 1))
-    is_sum, spline = model.sums
+    is_sum, spline = model.amplitude_sums
     gradient[:, is_sum, :m] = spline(log_k)
     gradient[:, is_sum, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)
     for q in np.flatnonzero(~is_sum):

@@ -562,7 +562,7 @@ class TwoTemperatures:
         """
         model, amplitude = self.at(log_k), linear[:, 1]
         quantities = np.zeros((amplitude.size, len(model.derived)))
-        quantities[:, model.sums[0]] = amplitude[:, None] * self.single.sums[1](log_k, 1)[:, 0]
+        quantities[:, model.amplitude_sums[0]] = amplitude[:, None] * self.single.amplitude_sums[1](log_k, 1)[:, 0]
         quantities[:, -2] = np.exp(log_k)
         areas = derived_values(model, lower, linear, np.ones(1))[:, -1]
         quantities[:, -1] = areas * (self._bolometric(log_k, 1)[0] / self._bolometric(log_k)[0] - 4.0)

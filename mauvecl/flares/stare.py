@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.flares import MOST_TEMPERATURES, ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.energies import EnergyScale, amplitude_of
-from mauvecl.flares.shapes import SHAPES, Shape, shape_of
+from mauvecl.flares.shapes import SHAPES, Shape, TableShape, shape_of
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.orbit import Limits
 from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid
@@ -145,10 +145,14 @@ class Event:
         if cooling is None:
             return self.energy(scale_of(self.hottest_k))
         nodes = temperatures_of([self]) if nodes is None else nodes
-        tau = np.concatenate([np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, 1000.0, 1001)[1:]])
+        # Published shapes end within these half-widths; a table may be longer, as one in seconds is.
+        first, last = -10.0, 1000.0
+        if isinstance(self.form, TableShape):
+            first, last = min(first, float(self.form.tau[0])), max(last, float(self.form.tau[-1]))
         # Steps resolve the half-width and the cooling time; rounding removes duplicates that differ in their last bits.
+        tau = np.concatenate([[first], np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, last, 1001)[1:]])
         fold = np.linspace(0.0, 20.0, 2001) * cooling.fold_s / self.half_width_s
-        edges = self.half_width_s * np.unique(np.concatenate([tau, fold[fold < 1000.0]]).round(6))
+        edges = self.half_width_s * np.unique(np.concatenate([tau, fold[fold < last]]).round(6))
         light = self.form.mean_over(edges, 0.0, self.half_width_s) * np.diff(edges)
         kelvin = cooling.at((edges[1:] + edges[:-1]) / 2)
         per_s = 0.0

@@ -414,7 +414,7 @@ class SumTable:
                 multiplicity = 1
                 if order == 4:
                     multiplicity = math.factorial(4) // math.prod(math.factorial(m) for m in Counter(key).values())
-                columns.append(multiplicity * np.array([reference[key], *by_component[:, *key]]))
+                columns.append(multiplicity * np.array([tensor[key] for tensor in (reference, *by_component)]))
         return cls(np.array(columns, np.float32).T.copy(), lower[np.tril_indices(n)].astype(np.float32), fourths)
 
 

@@ -75,8 +75,8 @@ class Trend:
 
     def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
-        star, sky, dark, near = self.means.mean(axis=1)
-        slopes = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
+        star, sky, dark, neighbours = self.means.mean(axis=1)
+        slopes = {"star": star, "light": star + sky + neighbours, "sky": sky, "temperature": self.slope_per_c * dark}
         linear = np.reshape([slopes[of] for of in self.of], (len(self.of), star.size))
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
         return np.asarray(self.effect(amplitudes) - first)
@@ -115,12 +115,12 @@ class SearchedFrames:
         """Fit the trend, if there is one, to sums less their known mean, and subtract it beyond first order."""
         if (trend := self.trend) is None:
             return sums
-        return np.array([stare - trend.nonlinear_effect(self._fitted(trend, stare))[0] for stare in sums.astype(float)])
+        return np.array([stare - trend.nonlinear_effect(self._fitted(stare))[0] for stare in sums.astype(float)])
 
-    def _fitted(self, trend: Trend, sums: Float) -> Float:
+    def _fitted(self, sums: Float) -> Float:
         """Return the most likely amplitudes for the sums of a stare, in standard deviations, shape (1, n_unknown)."""
         first, weight, means = self._blocks
-        y, n = np.add.reduceat(sums / self.variance[:, None], first) / weight[:, None], len(trend.of)
+        y, n = np.add.reduceat(sums / self.variance[:, None], first) / weight[:, None], len(means.of)
         amplitudes, steps = np.zeros((1, n)), DIFFERENCE * np.eye(n + 1, n, -1)
         for _ in range(STEPS):
             effect = means.effect(amplitudes + steps)
