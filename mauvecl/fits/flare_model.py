@@ -347,7 +347,7 @@ SHARES, LARGEST = np.linspace(0.0, 1.0, 65), 10.0
 
 @lru_cache(maxsize=16)
 def _thresholds(prior: bytes, allowed: float) -> Float:
-    """Return squared thresholds at `SHARES` that deviations exceed as often as normal ones exceed `allowed`."""
+    """Return squared thresholds that deviations exceed as often as normal ones exceed `allowed`, shape of `SHARES`."""
     deviation, weight = np.frombuffer(prior).reshape(2, -1)
     level = 2.0 * scipy.special.ndtr(np.sqrt(allowed)) - 1.0
 
@@ -373,7 +373,7 @@ def undimmed(values: Float, factor: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class Ratio:
-    """Ratio of two normal estimates, such as a flux as it is recorded and the factor on the light."""
+    """Ratio of two normal estimates, such as a recorded flux and the factor on the light; arrays of one shape."""
 
     top: Float
     bottom: Float
@@ -589,8 +589,9 @@ def spanning_weights(
 def variance_of(
     quiet: Expectation, added_dn: Float | None = None, highest_dn: Float | None = None
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the variance of an exposure with a flare, DN^2, zero in saturated pixels, and which pixels are used.
+    """Return the variance of an exposure with a flare and which pixels are used, shape (n_pixel,) each.
 
+    The variance, DN^2, is zero in saturated pixels.
     Pixels saturate with the light `highest_dn` of a flare, by default the mean `added_dn`.
     """
     added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
@@ -608,7 +609,10 @@ def usable_variance(
     quiet: Expectation, added_dn: Float | None = None, skipped_nm: Ranges = (), nuisances: Nuisances | None = None,
     highest_dn: Float | None = None,
 ) -> tuple[Float, NDArray[np.bool_]]:  # fmt: skip
-    """Return `variance_of` without skipped pixels, at the unknowns' means; raises InputError without a pixel."""
+    """Return `variance_of` at the unknowns' means, without the pixels at `skipped_nm`.
+
+    Raises InputError if no pixel is left.
+    """
     if nuisances and nuisances.mean_dn.any():
         added_dn = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
         # A frame may have more light than the mean exposure, up to what the expectation has.

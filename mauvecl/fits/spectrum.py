@@ -268,7 +268,7 @@ class _Problem:
         self.reduction = partial(ReducedSums.of, model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
 
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
-        """Yield frames less their mean without a flare, in blocks that fit into a processor's cache."""
+        """Yield frames less their mean without a flare, (n, n_pixel), in blocks that fit into a processor's cache."""
         for start in range(0, rows.size, FRAMES_AT_ONCE):
             yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
 
@@ -290,9 +290,9 @@ class _Problem:
         return np.concatenate(chi2)
 
     def pilot(self) -> tuple[Float, Float, NDArray[np.bool_]]:
-        """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
+        """Fit all frames with the variance of the quiescent star, without the pixels that are near saturation in them.
 
-        Pixels that are near saturation in a frame are not used.
+        Returns log temperatures, (n,), amplitudes, (n, n_linear), and whether a frame has saturated pixels, (n,).
         """
         raw, quiet, n = self.raw, self.quiet, len(self.raw)
         log_k, linear = np.empty(n), np.empty((n, len(self.model.linear)))

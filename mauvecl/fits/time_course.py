@@ -181,7 +181,10 @@ def measure_along(
 
 
 def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -> tuple[Float, Stare]:
-    """Return raw frames of a stare and the stare; raises InputError unless they and the expectation agree."""
+    """Return raw frames, (n_frame, n_pixel), and their stare, by default one without gaps and changes.
+
+    Raises InputError unless frames, stare and expectation agree.
+    """
     raw = np.asarray(frames, np.float64)
     if raw.ndim != 2:
         raise InputError(f"frames must have two dimensions, frames and pixels, not the shape {raw.shape}", key="frames")
@@ -303,6 +306,7 @@ class _Data:
         return array_cache(2)(self._flare)
 
     def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
+        """Compute the values of `flare`."""
         peak_s, log_peak_k, end_share = theta[[PEAK, KELVIN, END]]
         width, amplitude, fold = np.exp(theta[[WIDTH, AMPLITUDE, FOLD]])
         rise = amplitude * self.light * self.shape.mean_over(self.edges, peak_s, width)
@@ -560,7 +564,7 @@ def _data(
 
 
 def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cooling: bool) -> Float:
-    """Return starting parameters: the best amplitude and temperature at the given peak and half-width."""
+    """Return starting parameters, (6,): the best amplitude and temperature at the given peak and half-width."""
     rise = data.light * data.shape.mean_over(data.edges, peak_s, half_width_s)
     if not rise.any():
         raise InputError.of("peak_s", peak_s, "the peak of a flare with light in the stare")

@@ -170,13 +170,11 @@ class EnergyScale:
         """Return the scale for the light that a flare of amplitude 1 adds to a flux, over a sphere around the star."""
         check_scales(flare)
         light = added_light(wavelength_nm, flux_flam, flare, band, geometry, photosphere_k)
-        lost = 0.0
         if kind == "band":
             flux = light.hot * flux_in_band(band, flare)
-            if light.lost:
-                lost = light.lost * _through(wavelength_nm, flux_flam, band)
+            lost = light.lost * _through(wavelength_nm, flux_flam, band)
         else:
-            flux = light.hot * flare.bolometric_flux()
+            flux, lost = light.hot * flare.bolometric_flux(), 0.0
             if light.lost and photosphere_k is not None:
                 # The bolometric flux of the blackbody with the star's photons in the band.
                 body = photons(wavelength_nm, blackbody(wavelength_nm, photosphere_k), band)
@@ -221,7 +219,7 @@ def flux_in_band(band: str, flare: FlareSpectrum) -> float:
 
 
 def _response(band: str) -> tuple[Float, Float]:
-    """Return the wavelengths and the response of a band, with a maximum of 1."""
+    """Return the wavelengths, nm, and the response of a band, with a maximum of 1, shape (POINTS,) each."""
     at, throughput = find_band(band)["wavelength"], find_band(band)["throughput"]
     wavelength = np.linspace(at[0], at[-1], POINTS)
     return wavelength, np.interp(wavelength, at, throughput / throughput.max())
@@ -347,6 +345,7 @@ class PowerLaw(Rates):
         return np.asarray(np.maximum(self._untruncated(energy) - self._untruncated(self.largest_erg), 0.0))
 
     def _untruncated(self, energy: ArrayLike) -> Float:
+        """Return `per_day_above` without a largest energy."""
         exponent = self.log10_beta - np.log10(self.alpha - 1) + (1 - self.alpha) * np.log10(energy)
         return np.asarray(10.0**exponent)
 

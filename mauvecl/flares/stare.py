@@ -247,7 +247,7 @@ def _cooling_of(event: Event) -> Cooling | None:
 
 
 def _node_weights(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
-    """Return the weights of the nodes for temperatures, linear in 1 / T, by index of the node."""
+    """Return indices of nodes that have a weight, and their weights, linear in 1 / T, shape of the temperature."""
     if temperature.min() < nodes[0] - SAME_K or temperature.max() > nodes[-1] + SAME_K:
         raise InputError(
             f"the temperatures of a flare must be within {nodes[0]:g} to {nodes[-1]:g} K, but are "
@@ -501,7 +501,7 @@ def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
 
 
 def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float]]) -> Float:
-    """Return the starts of the frames of a stare that do not overlap a gap."""
+    """Return the starts of the frames of a stare that do not overlap a gap, s, shape (n_frame,)."""
     count = np.ceil(duration_s / frame_s * (1 - 1e-12))
     if count > MOST_FRAMES:
         raise InputError.of("duration_s", duration_s, f"at most {MOST_FRAMES} frames", unit="s")

@@ -272,6 +272,7 @@ def _mixtures(components: Components, base_dn: NDArray[np.int64]) -> NDArray[np.
 
 
 def _not_joint_error(name: str) -> InputError:
+    """Return the error of frames whose noise is not Gaussian enough."""
     return InputError(
         f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare: it must be "
         "Gaussian with the variance of at least 1.5 Poisson counts in each pixel, and more where counts are few",

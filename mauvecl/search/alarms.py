@@ -137,11 +137,14 @@ class _StareSearch:
         return [chain[k : k + n] for chain in chains for k in range(0, len(chain), n)]
 
     def others(self, group: Collection[Candidate]) -> Float:
-        """Return the parameters of the flares outside of a group."""
+        """Return the parameters of the flares outside of a group, shape (n_flare, 4)."""
         return _thetas(flare for flare in self.flares if flare not in group)
 
     def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Callable[[int], Candidate]]]:
-        """Yield per row the largest excess over fit residuals and the peak time of each onset, and its candidate."""
+        """Yield the excess over fit residuals and the peak times, s, (n_onset,) each, for each row of the search.
+
+        The third value is a function of the onset that returns its candidate.
+        """
         theta, (low, high) = _thetas(self.flares), self.sums.bounds
         light = self.sums.light(theta)
         # Flares at the bounds of the fit may remain in the residuals entirely.
@@ -246,7 +249,7 @@ class _StareSearch:
         )
 
     def _evened(self, residuals: Float, light: Float) -> Float:
-        """Scale residuals under flares down to the noise of frames without a flare."""
+        """Return residuals, (n_frame, n_sum), scaled down under flares to the noise of frames without a flare."""
         if not self.flares:
             return residuals
         noise = self.sums.noise(_thetas(self.flares), light)

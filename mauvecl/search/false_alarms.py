@@ -409,7 +409,7 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, 
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
-    """Return binned means of templates' values, and the share of templates in each bin for each draw."""
+    """Return binned means of templates' values, (n_shift,), and the share of templates in each, (n_draw, n_shift)."""
     bins = np.arange(-MAX_SHIFT, MAX_SHIFT + SHIFT_STEP, SHIFT_STEP)
     shares = np.zeros((len(amplitudes), bins.size))
     weights = TemplateGrid.from_bank(survey.bank).peak_probabilities(WEIGHTING_THRESHOLD)

@@ -334,6 +334,7 @@ class CriticalAmplitudes:
         )
 
     def _critical(self, site: InjectionSite, values: tuple[Single, Single, Single]) -> Single:
+        """Return the smallest detected amplitude in each draw, (n_draw,), from a, b and c of the module's formula."""
         a, b, c = values
         missing = np.float32(self.threshold) - a
         # Root of b x^2 + c x = missing in its numerically stable form; zero if there is an alarm without the flare.

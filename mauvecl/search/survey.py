@@ -233,7 +233,7 @@ class Survey:
         return Trend(tuple(unknown.of for unknown in unknowns), curves, means, slope)
 
     def unsubtracted(self, amplitudes: Float) -> Float:
-        """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
+        """Return the `effect` of unknowns that is not subtracted before the search, (n_stare, n_frame, n_sum)."""
         return self.frames.subtracted(self.unknowns.effect(amplitudes))
 
     def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
@@ -360,7 +360,7 @@ class SummedStare:
         return total
 
     def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
-        """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
+        """Yield the flares that contribute to some frames, the affected frames, and their mean amplitudes."""
         first, last, _ = frames.indices(len(self.net))
         shape = self.survey.bank.shape
         peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
