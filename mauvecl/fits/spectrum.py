@@ -51,9 +51,11 @@ REFITS = 2
 VARIANCE_STEP, VARIANCE_RANGES = 0.03, 12
 #: Frames that are fitted together, which bounds the memory, and number of frames per block of sums over pixels.
 BATCH, FRAMES_AT_ONCE = 2048, 64
-#: Fits more of exposures with pixels near saturation; the logarithmic step of the number of such pixels of those that
-#: share the others in the first fit, and the least share of their pixels that all must be able to use there.
-SATURATED_REFITS, SATURATED_STEP, LEAST_SHARED = 4, 0.05, 0.5
+#: Number of additional fits of exposures with pixels near saturation.
+SATURATED_REFITS = 4
+#: Exposures share a first fit if the logarithms of their numbers of such pixels agree to this step, and at least this
+#: share of the pixels that each of them could use is not near saturation in any of them.
+SATURATED_STEP, LEAST_SHARED = 0.05, 0.5
 #: Pixels on both sides of one near saturation that are not used.
 NEIGHBOURS = 4
 #: Factor by which the largest flare of a group may exceed the mean one.
@@ -221,18 +223,18 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
-    log_k, linear, saturates = problem.pilot()
+    exposures = _Exposures(frames, expectation, model, nuisances, levels, skipped_nm)
+    log_k, linear, saturates = exposures.pilot()
     any_saturates, all_rows = bool(saturates.any()), np.arange(len(saturates))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
     saturated = [np.flatnonzero(saturates)] * (SATURATED_REFITS if any_saturates else 0)
     for rows in [*saturated, *[all_rows] * (REFITS - 1)]:
-        for batch, reduction in problem.groups(log_k, linear, rows, any_saturates):
-            best = problem.profile(reduction, batch).bounded_best()
+        for batch, reduction in exposures.groups(log_k, linear, rows, any_saturates):
+            best = exposures.profile(reduction, batch).bounded_best()
             log_k[batch], linear[batch] = best.log_k, best.linear
     measurements, batches = [], []
-    for batch, reduction in problem.groups(log_k, linear, all_rows, any_saturates):
-        measurements.append(problem.measured(batch, reduction))
+    for batch, reduction in exposures.groups(log_k, linear, all_rows, any_saturates):
+        measurements.append(exposures.measured(batch, reduction))
         batches.append(batch)
     return Measurement.joined(measurements, batches)
 
@@ -243,7 +245,7 @@ def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         yield rows[start : start + BATCH]
 
 
-class _Problem:
+class _Exposures:
     """Exposures, and the model of the flares that are fitted to them."""
 
     def __init__(
@@ -605,13 +607,13 @@ def fit_two_temperatures(
     if any(derived.ratio is not None for derived in model.derived):
         raise InputError("the model must have blackbodies, with or without lines, and no Balmer jump", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
+    exposures = _Exposures(frames, expectation, model, nuisances, levels, skipped_nm)
     measurements, order, two = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
-    for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
+    for rows, reduction in exposures.groups(single.log_k, recorded, np.arange(len(recorded)), True):
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
-        quiescent = problem.quiescent_chi2(reduction, rows)
-        search = _SecondTemperatures(two, problem.profile(reduction, rows), problem.rises)
+        quiescent = exposures.quiescent_chi2(reduction, rows)
+        search = _SecondTemperatures(two, exposures.profile(reduction, rows), exposures.rises)
         low, high = search.intervals()
         best_node = search.gain.argmax(axis=1)
         # Exposures with the same best second temperature are measured together.
@@ -621,7 +623,7 @@ def fit_two_temperatures(
             best = replace(profile.best(profile.gain_at_nodes()), gain=search.gain[alike, node])
             second = log_k, two.slopes(log_k, reduction, best.log_k, best.linear)
             flare = two.at(log_k)
-            measurements.append(problem.measurement(flare, profile, best, quiescent[alike], ends, second))
+            measurements.append(exposures.measurement(flare, profile, best, quiescent[alike], ends, second))
             order.append(rows[alike])
     measured, n = Measurement.joined(measurements, order), len(recorded)
     # Without light of the other blackbody, the estimates are those of one.
