@@ -30,13 +30,13 @@ UNMEASURED = FittedFlares(**{field.name: np.full(1, np.nan) for field in fields(
 #: Share of a flare's S/N that may remain in nearby residuals without an alarm, because its shape or temperature differs
 #: from that of the fit.
 LEFT_BEHIND = 0.05
-#: The same as a share of a template's response to the fitted flux, when a block is tested for a further flare.
+#: The same as a share of a template's response to the fitted flux, when a group is tested for a further flare.
 LEFT_UNSEEN = 0.15
 #: Largest number of flares per fit; longer chains of overlapping flares are fitted in parts, alternately.
 MAX_FLARES_PER_FIT = 6
 #: Iterations over parts and their neighbours after each pass.
 TURNS = 2
-#: Starting points for a further flare in each block.
+#: Starting points for a further flare in each group.
 SPLITS = 3
 #: Distance from a bound, as a share of the parameter's range, at which a parameter counts as at the bound.
 AT_BOUND = 1e-3
