@@ -365,7 +365,12 @@ class FittedPowerLaw:
 
 @validated
 def fit_power_law(
-    energy_erg: Float, completeness: Completeness, days: Positive, *, error_dex: float = 0.0, bias_dex: float = 0.0
+    energy_erg: Float,
+    completeness: Completeness,
+    days: Positive,
+    *,
+    error_dex: NotNegative = 0.0,
+    bias_dex: float = 0.0,
 ) -> FittedPowerLaw:
     """Estimate exponent and rate of flares from recovered energies by maximum likelihood.
 
@@ -382,10 +387,18 @@ def fit_power_law(
         Observed time.
     error_dex, bias_dex : float
         Standard deviation and mean of the normal error of the logarithm of a recovered energy.
+
+    Raises
+    ------
+    InputError
+        For fewer than 3 flares, energies that are not above 0, or a completeness that is zero at all energies.
     """
-    logs = np.log10(np.asarray(energy_erg, np.float64))
-    if logs.size < 3 or not np.isfinite(logs).all():
-        raise InputError(f"energy_erg has {logs.size} flares, but needs at least 3, all above 0", key="energy_erg")
+    energy = np.asarray(energy_erg, np.float64)
+    if energy.size < 3 or not (np.isfinite(energy) & (energy > 0)).all():
+        raise InputError(f"energy_erg has {energy.size} flares, but needs at least 3, all above 0", key="energy_erg")
+    if not completeness.probability.any():
+        raise InputError("the completeness must be above 0 at some energy, as flares are recovered", key="completeness")
+    logs = np.log10(energy)
     pivot = float(np.median(logs))
     x = np.linspace(*completeness.decades, GRID)
     step = float(x[1] - x[0])
