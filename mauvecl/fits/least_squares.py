@@ -1,4 +1,4 @@
-"""Least-squares fits within limits, and ends of intervals from the profile likelihood."""
+"""Least-squares fits within limits, covariances, and ends of intervals from the profile likelihood."""
 
 from __future__ import annotations
 
@@ -57,6 +57,17 @@ def least_squares(
         full_output=True, ftol=tolerance, xtol=1e-9, maxfev=MAX_EVALUATIONS,
     )  # fmt: skip
     return middle + half * np.sin(angles), float(report["fvec"] @ report["fvec"]), status in (1, 2, 3, 4)
+
+
+def parameter_covariance(derivatives: Float) -> Float:
+    """Return the covariance of fitted parameters from the derivatives of the residuals, (n, n_parameter).
+
+    It is the inverse of the information, zero for parameters that have no effect.
+    """
+    scale = np.linalg.norm(derivatives, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    columns = derivatives / scale
+    return np.asarray(np.linalg.pinv(columns.T @ columns, hermitian=True) / np.outer(scale, scale))
 
 
 def interval_end(

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
 from mauvecl.fits.flare_model import NODE_STRIDE, FlareModel, Ranges, RawCounts, ReducedSums
-from mauvecl.fits.least_squares import interval_end
+from mauvecl.fits.least_squares import interval_end, parameter_covariance
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares import Cooling
 from mauvecl.flares.frames import Components, known_strengths
@@ -386,8 +386,8 @@ class _Quantity:
             rise, log_k, of_rise, of_log_k = data.flare(theta)
             light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
             total = float(np.sum(data.intrinsic(rise) * light))
-            slope = data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total
-            return self.factor * total, slope
+            slope = data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1)
+            return self.factor * total, slope / (total if total > 0.0 else np.nan)
         value, gradient = theta[self.place], np.eye(N_PARAMETERS)[self.place]
         if self.place == END:
             coolest = data.model.log_k[0]
@@ -465,12 +465,14 @@ def fit_cooling(
     fit = _BestFit.of(data, stare.frame_s, peak_s, half_width_s, cooling=cooling)
     theta, free, best = fit.theta, fit.free, fit.chi2
     jacobian = data.linearised(theta, fit.whiten)[1][:, free]
-    covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
     estimates, slopes = (np.array(values) for values in zip(*(q.at(theta, data) for q in quantities), strict=True))
     scale = np.where([quantity.place == PEAK for quantity in quantities], 1.0, estimates)
     slopes = scale[:, None] * slopes[:, free]
-    spread = slopes @ covariance @ slopes.T
+    spread = slopes @ parameter_covariance(jacobian) @ slopes.T
+    # Nothing is known of quantities of a flare without light, or of the cooling time of one that does not cool.
+    unknown = (slopes[:, ~jacobian.any(axis=0)] != 0.0).any(axis=1)
+    spread[unknown], spread[:, unknown] = np.nan, np.nan
     rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
     ends = [fit.end(sign * rise, quantity) for sign, rise, quantity in product((-1.0, 1.0), rises, quantities)]
     low, high = np.reshape(ends, (2, len(rises), 1, len(quantities)))

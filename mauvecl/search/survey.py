@@ -25,7 +25,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.fits.flare_model import MeanSums
-from mauvecl.fits.least_squares import interval_end, least_squares
+from mauvecl.fits.least_squares import interval_end, least_squares, parameter_covariance
 from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.shapes import between, sides
 from mauvecl.flares.stare import Stare, select_frames
@@ -485,11 +485,7 @@ class Block:
 
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
-        _, rows = self.residuals(theta.ravel())
-        scale = np.linalg.norm(rows, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
-        inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), hermitian=True) / np.outer(scale, scale)
-        return np.asarray(inverse.reshape(theta.shape * 2))
+        return parameter_covariance(self.residuals(theta.ravel())[1]).reshape(theta.shape * 2)
 
     def interval(self, best: BlendFit, j: int, quantity: ProfiledQuantity, rise: float) -> tuple[float, float, bool]:
         """Return the interval of a flare's quantity from the profile likelihood, and whether the fit ends it.
