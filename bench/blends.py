@@ -18,8 +18,7 @@ from mauvecl.answers.inject import survey_star
 from mauvecl.answers.stare import log_energy
 from mauvecl.flares.stare import Event, coefficients
 from mauvecl.search.alarms import Alarm, alarms
-from mauvecl.search.flare_fits import Factor
-from mauvecl.search.search import Survey
+from mauvecl.search.survey import Factor, Survey
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 

@@ -42,7 +42,7 @@ from mauvecl import (
 )
 from mauvecl.detection.statistics import Linear
 from mauvecl.fits.flare_model import ReducedSums, derived_values
-from mauvecl.fits.profile import Profile, covariance, with_bounds
+from mauvecl.fits.profile import Profile, covariance
 from mauvecl.fits.spectrum import BATCH
 
 #: Fits of the slower ways, and rounds.
@@ -55,7 +55,7 @@ def estimate(values: np.ndarray, model: FlareModel, reduction: ReducedSums) -> N
     sums = np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
     for start in range(0, len(sums), BATCH):
         profile = Profile(reduction, sums[start : start + BATCH])
-        best = with_bounds(reduction, profile.sums, profile.best())
+        best = profile.bounded_best()
         derived_values(model, best.log_k, best.linear, np.ones(1))
         covariance(model, reduction, best, profile.factor(best))
 

@@ -25,8 +25,8 @@ from mauvecl.schema.fields import DAY_S
 from mauvecl.search.completeness import SMALL, InjectedCompleteness, frame_signal
 from mauvecl.search.false_alarms import consecutive_alarm_rate, counted_threshold, sampled_rate
 from mauvecl.search.injections import ACCURACY_COLUMNS, Injections, fit_accuracy
-from mauvecl.search.search import Survey
-from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
+from mauvecl.search.search import TEMPERATURES_K, Bank, Templates, frame_nuisances
+from mauvecl.search.survey import Survey
 from mauvecl.study.cases import Case, cases, collect_messages
 from mauvecl.study.star import FlareLight
 from mauvecl.study.stare import orbit_lines, threshold_line

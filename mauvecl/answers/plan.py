@@ -33,7 +33,7 @@ from mauvecl.schema.errors import InputError, Message, of_kind, printable, toget
 from mauvecl.schema.fields import DAY_S
 from mauvecl.schema.section import given_keys
 from mauvecl.search.completeness import PER_DECADE, SMALL, Completeness, Yield, frame_signal, recovered_per_day
-from mauvecl.search.templates import frame_nuisances
+from mauvecl.search.search import frame_nuisances
 from mauvecl.study.cases import SATURATED, Case, collect_messages
 from mauvecl.study.observation import SkyLight
 from mauvecl.study.plan import RATES, PlanTarget

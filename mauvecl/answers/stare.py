@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.search.flare_fits import Factor
+    from mauvecl.search.survey import Factor
     from mauvecl.study.observation import SkyLight
 
 #: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.

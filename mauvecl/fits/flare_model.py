@@ -57,6 +57,8 @@ TEMPERATURES_K = (3_000.0, float(range_of(Temperature).high))
 NODES = 225
 #: Grid of the spectra, nm: it exceeds the instrument's range by the line spread, with steps far below the resolution.
 GRID_NM = np.linspace(170.0, 760.0, 2361)
+#: Smallest number of nodes between two temperatures of a flare; closer ones cannot be distinguished.
+APART = 4
 #: Bands in which light is reported by default, nm.
 BANDS_NM = ((200.0, 320.0), (200.0, 700.0))
 
@@ -99,7 +101,7 @@ class FlareModel:
         1 erg s-1 cm-2.
     linear : tuple of str
         Names of the amplitudes, the blackbody's first.
-    derived : tuple of Derived
+    derived : tuple of DerivedQuantity
         Quantities that fits report, the temperature first.
     """
 
@@ -220,7 +222,7 @@ class FlareModel:
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 
     @cached_property
-    def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
+    def amplitude_sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
         """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
         factors = [derived.factors for derived in self.derived]
         is_sum = np.array([factor is not None for factor in factors])
@@ -250,6 +252,7 @@ class FlareModel:
         return self._checked(temperature_k, [amplitude, *balmer, *lines])
 
     def _checked(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
+        """Return amplitudes as an array; raises InputError for those, or a temperature, that the model cannot have."""
         low, high = np.exp(self.log_k[[0, -1]])
         if not low * (1 - 1e-9) <= temperature_k <= high * (1 + 1e-9):
             raise InputError.of("temperature_k", temperature_k, f"between {low:g} and {high:g}")
@@ -259,6 +262,11 @@ class FlareModel:
         return linear
 
 
+def nodes_below(nodes: Float, log_k: float) -> int:
+    """Return the number of a model's nodes that are at least `APART` of them below a temperature."""
+    return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
+
+
 def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float) -> Float:
     """Return the reported quantities of flares, shape (n, n_derived).
 
@@ -266,7 +274,7 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float, factor: Float
     dimmed (n,).
     """
     values = np.empty((log_k.size, len(model.derived)))
-    is_sum, spline = model.sums
+    is_sum, spline = model.amplitude_sums
     values[:, is_sum] = undimmed(np.einsum("nql,nl->nq", spline(log_k), linear), factor)
     for q in np.flatnonzero(~is_sum):
         derived, ratio = model.derived[q], model.splines[q]
@@ -299,14 +307,14 @@ def _derived(
 ) -> Iterator[DerivedQuantity]:  # fmt: skip
     """Yield the quantities of a model; `light` holds fluxes per amplitude by range, those of blackbodies first."""
 
-    def of_one(column: int, values: Float | float) -> Float:
-        """Return the factors of a quantity that only one amplitude changes, shape (n_node, n_linear)."""
+    def single(column: int, values: Float | float) -> Float:
+        """Return the factors of a quantity that a single amplitude changes, shape (n_node, n_linear)."""
         factors = np.zeros((NODES, len(names)))
         factors[:, column] = values
         return factors
 
     yield DerivedQuantity("temperature", "K", "temperature of the flare's blackbody")
-    yield DerivedQuantity("amplitude", "", "relative rise of the band's photons by the blackbody", of_one(0, 1.0))
+    yield DerivedQuantity("amplitude", "", "relative rise of the band's photons by the blackbody", single(0, 1.0))
     if "balmer" in names:
         edge = np.array([float(blackbody(np.array([BALMER_EDGE_NM]), float(k))[0]) for k in kelvin])
         yield DerivedQuantity(
@@ -315,22 +323,22 @@ def _derived(
     for column, name in enumerate(names):
         if name.startswith("line "):
             text = f"flux of the line {name[5:]} at the telescope"
-            yield DerivedQuantity(name, "erg / (cm2 s)", text, of_one(column, 1.0))
-    fluxes = [(where, np.column_stack([f[:NODES], np.tile(f[NODES:], (NODES, 1))])) for where, f in light]
-    for where, flux in fluxes:
-        yield DerivedQuantity(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", flux)
+            yield DerivedQuantity(name, "erg / (cm2 s)", text, single(column, 1.0))
+    fluxes = [(band, np.column_stack([flux[:NODES], np.tile(flux[NODES:], (NODES, 1))])) for band, flux in light]
+    for band, flux in fluxes:
+        yield DerivedQuantity(f"flux {band}", "erg / (cm2 s)", f"flux at the telescope, {band}", flux)
     if distance_pc is None:
         return
-    far = distance_pc * PARSEC_CM
-    area = of_one(0, np.pi * far**2 * scale)
+    distance_cm = distance_pc * PARSEC_CM
+    area = single(0, np.pi * distance_cm**2 * scale)
     yield DerivedQuantity("area", "cm2", "projected area of the blackbody", area)
     if radius_rsun is not None:
         share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
         yield DerivedQuantity("filling factor", "", "share of the star's disc that the blackbody covers", share)
-    for where, flux in fluxes:
-        total = flux * 4 * np.pi * far**2
-        yield DerivedQuantity(f"luminosity {where}", "erg / s", f"luminosity, {where}", total)
-        yield DerivedQuantity(f"energy {where}", "erg", f"energy within the exposure, {where}", total * exposure_s)
+    for band, flux in fluxes:
+        total = flux * 4 * np.pi * distance_cm**2
+        yield DerivedQuantity(f"luminosity {band}", "erg / s", f"luminosity, {band}", total)
+        yield DerivedQuantity(f"energy {band}", "erg", f"energy within the exposure, {band}", total * exposure_s)
 
 
 #: Shares of a prior in the variance of a ratio at which thresholds are computed, and their largest root.
@@ -339,7 +347,7 @@ SHARES, LARGEST = np.linspace(0.0, 1.0, 65), 10.0
 
 @lru_cache(maxsize=16)
 def _thresholds(prior: bytes, allowed: float) -> Float:
-    """Return squared thresholds at `SHARES` that deviations exceed as often as normal ones exceed `allowed`."""
+    """Return squared thresholds that deviations exceed as often as normal ones exceed `allowed`, shape of `SHARES`."""
     deviation, weight = np.frombuffer(prior).reshape(2, -1)
     level = 2.0 * scipy.special.ndtr(np.sqrt(allowed)) - 1.0
 
@@ -365,7 +373,7 @@ def undimmed(values: Float, factor: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class Ratio:
-    """Ratio of two normal estimates, such as a flux as it is recorded and the factor on the light."""
+    """Ratio of two normal estimates, such as a recorded flux and the factor on the light; arrays of one shape."""
 
     top: Float
     bottom: Float
@@ -413,16 +421,17 @@ class Ratio:
         return np.where(may_be_zero | (self.bottom > 0.0), np.where(closed, end, sign * np.inf), -sign * np.inf)
 
 
+#: Ranges of wavelength, nm.
 Ranges = Sequence[tuple[float, float]]
 
-#: The spectra of every `EVERY`-th node of the model span the directions.
-EVERY = 4
+#: The spectra of every `NODE_STRIDE`-th node of the model span the directions.
+NODE_STRIDE = 4
 #: Directions with eigenvalues below this share of the largest are due to rounding.
-LEAST = 1e-11
+LEAST_EIGENVALUE = 1e-11
 #: Pixels within this many standard deviations of saturation in a frame are not used.
 NEAR_SIGMA = 5.0
 #: Smallest share of S/N^2 that must remain after marginalisation over the unknowns.
-LEAST_KEPT = 1e-10
+LEAST_REMAINING = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,7 +451,7 @@ class MeanSums:
         q, r = np.linalg.qr(self.fixed.T)
         return q.T, np.linalg.inv(r)
 
-    def free(self, sums: Float) -> Float:
+    def without_fixed(self, sums: Float) -> Float:
         """Return sums, (n, n_sum), less what the fixed components explain."""
         basis, _ = self.basis
         return np.asarray(sums - (sums @ basis.T) @ basis)
@@ -453,8 +462,8 @@ class MeanSums:
 
         Shapes (n_node, n_sum) and, of the spline's coefficients, (n_node - 1, 4, n_sum).
         """
-        free = self.free(self.hot)
-        units = free / np.linalg.norm(free, axis=1)[:, None]
+        bodies = self.without_fixed(self.hot)
+        units = bodies / np.linalg.norm(bodies, axis=1)[:, None]
         return units, np.moveaxis(scipy.interpolate.CubicSpline(self.log_k, units).c, 0, 1).copy()
 
     @cached_property
@@ -462,10 +471,10 @@ class MeanSums:
         """Sums of the blackbody over log temperature."""
         return scipy.interpolate.CubicSpline(self.log_k, self.hot)
 
-    def with_second(self, log_k: float, end: int) -> Self:
-        """Return the response below node `end`, with a blackbody of a second temperature as another component."""
-        light = None if self.light is None else self.light.with_second(log_k, end)
-        fixed = np.vstack([self.spline(log_k), self.fixed])
+    def with_second(self, log_k: float) -> Self:
+        """Return the response to lower temperatures, with a blackbody of a second one as another component."""
+        light = None if self.light is None else self.light.with_second(log_k)
+        fixed, end = np.vstack([self.spline(log_k), self.fixed]), nodes_below(self.log_k, log_k)
         return replace(self, hot=self.hot[:end], fixed=fixed, log_k=self.log_k[:end], light=light)
 
 
@@ -534,9 +543,9 @@ class ReducedSums(MeanSums):
         check_enough(quiet, used, len(model.linear) + 1 + free)
         unknown = nuisances.around(added) if nuisances else None
         rows = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, variance.size))
-        spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
+        spanning = np.vstack([model.hot[::NODE_STRIDE], model.fixed]) * used
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
-        weights, _ = spanning_weights(spanning, spanning * inverse, nuisances, rows, LEAST)
+        weights, _ = spanning_weights(spanning, spanning * inverse, nuisances, rows, LEAST_EIGENVALUE)
         hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
         light = None
         if unknown is not None and unknown.has_factor:
@@ -548,12 +557,6 @@ class ReducedSums(MeanSums):
             expected, share = 1.0 + float(unknown.mean[-1]), precision / scale**2
             light = LightFactor(*means, row, scale, expected, share, unknown.factor_prior)
         return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
-
-    def quiescent_chi2(self, excess_dn: Float) -> Float:
-        """Return chi-squared of frames less the quiescent mean, without a flare, shape (n,)."""
-        inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=self.variance > 0.0)
-        unknown = excess_dn @ self.rows.T
-        return np.asarray(excess_dn**2 @ inverse - np.vecdot(unknown, unknown))
 
 
 def spanning_weights(
@@ -572,7 +575,7 @@ def spanning_weights(
         raise InputError(
             "each component of a flare must have light in pixels that neither saturate nor are left out", key="model"
         )
-    if not (power > LEAST_KEPT * power_if_known).all():
+    if not (power > LEAST_REMAINING * power_if_known).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
         raise InputError(
             f"the light of a flare cannot be distinguished from {unknown}; give fewer unknowns", key="nuisances"
@@ -586,8 +589,9 @@ def spanning_weights(
 def variance_of(
     quiet: Expectation, added_dn: Float | None = None, highest_dn: Float | None = None
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the variance of an exposure with a flare, DN^2, zero in saturated pixels, and which pixels are used.
+    """Return the variance of an exposure with a flare and which pixels are used, shape (n_pixel,) each.
 
+    The variance, DN^2, is zero in saturated pixels.
     Pixels saturate with the light `highest_dn` of a flare, by default the mean `added_dn`.
     """
     added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
@@ -605,7 +609,10 @@ def usable_variance(
     quiet: Expectation, added_dn: Float | None = None, skipped_nm: Ranges = (), nuisances: Nuisances | None = None,
     highest_dn: Float | None = None,
 ) -> tuple[Float, NDArray[np.bool_]]:  # fmt: skip
-    """Return `variance_of` without skipped pixels, at the unknowns' means; raises InputError without a pixel."""
+    """Return `variance_of` at the unknowns' means, without the pixels at `skipped_nm`.
+
+    Raises InputError if no pixel is left.
+    """
     if nuisances and nuisances.mean_dn.any():
         added_dn = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
         # A frame may have more light than the mean exposure, up to what the expectation has.

@@ -1,4 +1,4 @@
-"""Least-squares fits within limits, and ends of intervals from the profile likelihood."""
+"""Least-squares fits within limits, covariances, and ends of intervals from the profile likelihood."""
 
 from __future__ import annotations
 
@@ -18,12 +18,15 @@ Linearised = Callable[[Float], tuple[Float, Float]]
 MAX_EVALUATIONS = 200
 #: Largest distance of starting parameters from the middle of their limits, over that of the limits.
 LARGEST_SINE = 1.0 - 1e-9
-#: Number of steps to the end of an interval; largest length of a step and of the last, relative to the root of the rise
-#: of chi-squared; relative regularisation of degenerate parameters.
-NEWTON_STEPS, LONGEST, CONVERGED, RIDGE = 200, 1.5, 1e-3, 1e-10
+#: Largest number of steps to the end of an interval.
+NEWTON_STEPS = 200
+#: Largest length of a step, and of the last one, relative to the root of the rise of chi-squared.
+LONGEST, CONVERGED = 1.5, 1e-3
 #: Factor on the lengths of all steps after one that turns back.
 SHORTER = 0.5
-#: Largest number of holds and releases per parameter.
+#: Relative regularisation of degenerate parameters.
+RIDGE = 1e-10
+#: Largest number of holds and releases per parameter in a step.
 TURNS = 3
 
 
@@ -56,6 +59,17 @@ def least_squares(
     return middle + half * np.sin(angles), float(report["fvec"] @ report["fvec"]), status in (1, 2, 3, 4)
 
 
+def parameter_covariance(derivatives: Float) -> Float:
+    """Return the covariance of fitted parameters from the derivatives of the residuals, (n, n_parameter).
+
+    It is the inverse of the information, zero for parameters that have no effect.
+    """
+    scale = np.linalg.norm(derivatives, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    columns = derivatives / scale
+    return np.asarray(np.linalg.pinv(columns.T @ columns, hermitian=True) / np.outer(scale, scale))
+
+
 def interval_end(
     linearised: Linearised, quantity: Callable[[Float], tuple[float, Float]], theta: Float,
     limits: tuple[Float, Float], chi2: float, rise: float, free: NDArray[np.intp] | None = None,
@@ -79,34 +93,34 @@ def interval_end(
     free
         Numbers of the parameters that change, all by default.
     """
-    (low, high), there, unit = limits, theta.copy(), np.sqrt(abs(rise))
+    (low, high), point, radius = limits, theta.copy(), np.sqrt(abs(rise))
     fitted = np.arange(theta.size) if free is None else free
     damping, last_change = 1.0, np.zeros(1)
     for _ in range(NEWTON_STEPS):
-        residuals, derivatives = linearised(there)
+        residuals, derivatives = linearised(point)
         # A parameter without any effect, such as the cooling time of a flare that does not cool, keeps its value.
         power = np.sum(derivatives**2, axis=0)
         free = fitted[power[fitted] > 0.0]
-        jacobian, slope = derivatives[:, free], np.sign(rise) * quantity(there)[1][free]
+        jacobian, slope = derivatives[:, free], np.sign(rise) * quantity(point)[1][free]
         information = jacobian.T @ jacobian + np.diag(RIDGE * power[free])
-        distances = (low - there)[free], (high - there)[free]
+        distances = (low - point)[free], (high - point)[free]
         room = chi2 + abs(rise) - float(residuals @ residuals)
         step, held = _bounded_step(information, residuals @ jacobian, slope, room, distances)
         change = jacobian @ step
         # Steps across a kink, where the peak changes frames, would not become shorter.
         damping *= SHORTER if np.sum(change * last_change) < 0.0 else 1.0
-        length, last_change = float(np.linalg.norm(change)) / unit, change
+        length, last_change = float(np.linalg.norm(change)) / radius, change
         share = LONGEST / max(length, LONGEST) * damping
-        there[free] += share * step
+        point[free] += share * step
         if share * length < CONVERGED:
-            there[free[held]] += (1.0 - share) * step[held]
-            there = np.clip(there, low, high)
-            value, slope = quantity(there)
+            point[free[held]] += (1.0 - share) * step[held]
+            point = np.clip(point, low, high)
+            value, slope = quantity(point)
             if slope[free[~held]].any():
                 return value, 1.0
             break
     reached = (float(residuals @ residuals) - chi2) / abs(rise)
-    return quantity(there)[0], min(reached, float(np.nextafter(1.0, 0.0)))
+    return quantity(point)[0], min(reached, float(np.nextafter(1.0, 0.0)))
 
 
 def _bounded_step(

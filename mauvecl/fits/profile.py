@@ -36,9 +36,12 @@ if TYPE_CHECKING:
 REFINEMENTS, NARROWER = 3, 8.0
 #: The search for the best temperature starts from every `COARSE`-th node of the model.
 COARSE = 4
-#: Share of a refinement's step above which a best temperature still moves; distance in nodes at which the gain beside
-#: it is then tried, its least rise that counts, and the number of narrowing grids that follow it.
-SETTLED, BESIDE, LEAST_RISE, CLIMBS = 0.5, 0.05, 1e-3, 4
+#: A best temperature that moves by more than this share of the last refinement's step has not settled.
+SETTLED = 0.5
+#: Distance in nodes at which the gain next to it is then tried, and smallest rise of the gain that counts.
+TRIAL_DISTANCE, LEAST_RISE = 0.05, 1e-3
+#: Number of grids, each with a quarter of the step of the last, on which temperatures with a rising gain are moved.
+CLIMBS = 4
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 #: Steps of the search for the end of an interval.
@@ -162,14 +165,15 @@ class Profile:
     """
 
     def __init__(
-        self, reduction: MeanSums, sums: Float, light: Float | None = None, *, bounded: bool = False
+        self, reduction: ReducedSums, sums: Float, light: Float | None = None, *, bounded: bool = False
     ) -> None:  # fmt: skip
         """Take the sums of frames, (n, n_sum), and those of the factor on light, (n,), if it is unknown."""
         self.reduction, self.sums, self.light, self.bounded = reduction, sums, light, bounded
         self.nodes = reduction.log_k
-        self.free_sums = reduction.free(sums)
+        #: Sums less what the fixed components explain.
+        self.body_sums = reduction.without_fixed(sums)
 
-    def bounded_rows(self, rows: NDArray[np.intp], reduction: MeanSums | None = None) -> Profile:
+    def bounded_rows(self, rows: NDArray[np.intp], reduction: ReducedSums | None = None) -> Profile:
         """Return the bounded profile of some of the frames, optionally for another reduction to the same sums."""
         light = None if self.light is None else self.light[rows]
         return Profile(reduction or self.reduction, self.sums[rows], light, bounded=True)
@@ -243,6 +247,12 @@ class Profile:
                 np.copyto(amplitudes[k], positive, where=better)
         return BestFit(log_k, np.ascontiguousarray(amplitudes.T), gain)
 
+    def bounded_best(self) -> BestFit:
+        """Return the best fit of each frame with amplitudes of at least zero."""
+        best = self.best()
+        negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
+        return best.replaced(negative, self.bounded_rows(negative).best()) if negative.size else best
+
     def _stationary(self, at_nodes: Float | None) -> Float:
         """Return the best temperatures without bounds on fixed components, shape (n,).
 
@@ -250,11 +260,11 @@ class Profile:
         between two nodes, so that its maximum has a closed form.
         """
         units, cubics = self.reduction.directions
-        node = np.argmax(np.maximum(self.free_sums @ units.T, 0.0) if at_nodes is None else at_nodes, axis=1)
+        node = np.argmax(np.maximum(self.body_sums @ units.T, 0.0) if at_nodes is None else at_nodes, axis=1)
         interval = np.minimum(node, self.nodes.size - 2)
-        falling = np.vecdot(self.free_sums, cubics[interval, 2]) < 0.0
+        falling = np.vecdot(self.body_sums, cubics[interval, 2]) < 0.0
         interval = np.where(falling, np.maximum(node - 1, 0), interval)
-        c = np.einsum("npk,nk->pn", cubics[interval], self.free_sums)
+        c = np.einsum("npk,nk->pn", cubics[interval], self.body_sums)
         span = self.nodes[interval + 1] - self.nodes[interval]
         with np.errstate(divide="ignore", invalid="ignore"):
             top = c[2] / (np.sqrt(c[1] ** 2 - 3 * c[0] * c[2]) - c[1])
@@ -294,8 +304,8 @@ class Profile:
             return
         low, high = self.nodes[0], self.nodes[-1]
         step = float(self.nodes[1] - self.nodes[0])
-        beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
-        gain = self.bounded_rows(moving).gain(beside)
+        tried = np.clip(x[moving, None] + TRIAL_DISTANCE * step * np.array([-1.0, 0.0, 1.0]), low, high)
+        gain = self.bounded_rows(moving).gain(tried)
         rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
         if not rising.size:
             return
@@ -333,12 +343,6 @@ class Profile:
             a, fa = np.where(crossed, b, a), np.where(crossed, fb, 0.5 * fa)
         low, high = np.where(closed, x, np.nan).T
         return low, high
-
-
-def with_bounds(reduction: ReducedSums, sums: Float, best: BestFit) -> BestFit:
-    """Return fits with amplitudes of at least zero, from fits without this bound."""
-    negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
-    return best.replaced(negative, Profile(reduction, sums[negative], bounded=True).best()) if negative.size else best
 
 
 def intervals(
@@ -520,15 +524,15 @@ def _sums_at_end(
     direction, (basis, inverse) = _quantity_direction(reduction, spline, x), reduction.basis
     # The fitted sums at the end, with the quantity moved there.
     hot = reduction.spline(x)
-    body = reduction.free(hot)
+    body = reduction.without_fixed(hot)
     body /= np.linalg.norm(body, axis=1)[:, None]
-    mean = profile.sums[rows] - profile.free_sums[rows] + np.vecdot(profile.free_sums[rows], body)[:, None] * body
+    mean = profile.sums[rows] - profile.body_sums[rows] + np.vecdot(profile.body_sums[rows], body)[:, None] * body
     mean += (moved / np.linalg.norm(direction, axis=1))[:, None] * direction
     amplitude = np.vecdot(mean, body) / np.vecdot(hot, body)
     fixed_amplitudes = (mean @ basis.T - amplitude[:, None] * (hot @ basis.T)) @ inverse.T
     # The gradient of the quantity: that at this temperature, and along the change of the mean with temperature.
     slope = reduction.spline(x, 1)
-    change = reduction.free(slope)
+    change = reduction.without_fixed(slope)
     change -= np.vecdot(change, body)[:, None] * body
     steeper = np.vecdot(spline(x, 1), np.column_stack([amplitude, fixed_amplitudes]))
     steeper -= amplitude * np.vecdot(direction, slope)
@@ -627,7 +631,7 @@ def covariance(
     if light is None:
         return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
     over = np.where(factor > 0.0, factor, np.nan)
-    is_sum, _ = model.sums
+    is_sum, _ = model.amplitude_sums
     gradient[:, is_sum] /= over[:, None, None]
     # The best factor follows the amplitudes and the temperature, and scatters about that.
     by_factor = np.where(is_sum, -derived_values(model, log_k, linear, over) / over[:, None], 0.0)
@@ -642,7 +646,7 @@ def _gradient(model: FlareModel, log_k: Float, linear: Float) -> Float:
     """Return derivatives with respect to amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
     n, m = linear.shape
     gradient = np.zeros((n, len(model.derived), m + 1))
-    is_sum, spline = model.sums
+    is_sum, spline = model.amplitude_sums
     gradient[:, is_sum, :m] = spline(log_k)
     gradient[:, is_sum, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)
     for q in np.flatnonzero(~is_sum):

@@ -8,7 +8,7 @@ higher one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.fits.flare_model import (
+    APART,
     NEAR_SIGMA,
     DerivedQuantity,
     FlareModel,
@@ -26,9 +27,10 @@ from mauvecl.fits.flare_model import (
     ReducedSums,
     check_enough,
     derived_values,
+    nodes_below,
     undimmed,
 )
-from mauvecl.fits.profile import BestFit, Profile, Slopes, covariance, intervals, with_bounds
+from mauvecl.fits.profile import BestFit, Profile, Slopes, covariance, intervals
 from mauvecl.host.arrays import Float
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import Column, formatted, table_of
@@ -49,9 +51,11 @@ REFITS = 2
 VARIANCE_STEP, VARIANCE_RANGES = 0.03, 12
 #: Frames that are fitted together, which bounds the memory, and number of frames per block of sums over pixels.
 BATCH, FRAMES_AT_ONCE = 2048, 64
-#: Fits more of exposures with pixels near saturation; the logarithmic step of the number of such pixels of those that
-#: share the others in the first fit, and the least share of their pixels that all must be able to use there.
-SATURATED_REFITS, SATURATED_STEP, LEAST_SHARED = 4, 0.05, 0.5
+#: Number of additional fits of exposures with pixels near saturation.
+SATURATED_REFITS = 4
+#: Exposures share a first fit if the logarithms of their numbers of such pixels agree to this step, and at least this
+#: share of the pixels that each of them could use is not near saturation in any of them.
+SATURATED_STEP, LEAST_SHARED = 0.05, 0.5
 #: Pixels on both sides of one near saturation that are not used.
 NEIGHBOURS = 4
 #: Factor by which the largest flare of a group may exceed the mean one.
@@ -64,6 +68,13 @@ def _values(measured: Measurement | Forecast, values: Float, errors: Float) -> s
         f"{name} = {formatted(value, '.4g')} +- {formatted(error, '.2g')} {unit}".rstrip()
         for name, value, error, unit in zip(measured.names, values, errors, measured.units, strict=True)
     )
+
+
+#: Axis of the frames in each array of a `Measurement`.
+FRAME_AXES = {
+    "estimates": 0, "covariance": 0, "low": 1, "high": 1, "chi2": 0, "p_value": 0, "snr": 0, "log_k": 0,
+    "amplitudes": 0, "factor": 0,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,26 +129,22 @@ class Measurement:
     @classmethod
     def joined(cls, parts: Sequence[Self], numbers: Sequence[ArrayLike] | None = None) -> Self:
         """Return the measurements of several batches of frames as one, in the order of the frames' numbers if given."""
-        values: dict[str, Any] = {field.name: getattr(parts[0], field.name) for field in fields(cls)}
-        for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                axis = 1 if name in ("low", "high") else 0
-                values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
-        joined = cls(**values | {"dof": min(part.dof for part in parts)})
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts], axis) for name, axis in FRAME_AXES.items()
+        }
+        joined = replace(parts[0], **arrays, dof=min(part.dof for part in parts))
         return joined if numbers is None else joined.rows(np.argsort(np.concatenate(numbers)))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return all arrays that depend on the frames, for files."""
-        values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
+        """Return all arrays that depend on the frames, and the degrees of freedom, for files."""
+        return {name: np.asarray(getattr(self, name)) for name in (*FRAME_AXES, "dof")}
 
     def rows(self, index: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
         arrays: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                arrays[field.name] = value[:, index] if field.name in ("low", "high") else value[index]
+        for name, axis in FRAME_AXES.items():
+            values = getattr(self, name)
+            arrays[name] = values[:, index] if axis else values[index]
         return replace(self, **arrays)
 
     def column(self, name: str) -> int:
@@ -216,19 +223,18 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
-    log_k, linear, saturates = problem.pilot()
+    exposures = _Exposures(frames, expectation, model, nuisances, levels, skipped_nm)
+    log_k, linear, saturates = exposures.pilot()
     any_saturates, all_rows = bool(saturates.any()), np.arange(len(saturates))
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
     saturated = [np.flatnonzero(saturates)] * (SATURATED_REFITS if any_saturates else 0)
     for rows in [*saturated, *[all_rows] * (REFITS - 1)]:
-        for batch, reduction in problem.groups(log_k, linear, rows, any_saturates):
-            profile = problem.profile(reduction, batch)
-            best = with_bounds(reduction, profile.sums, profile.best())
+        for batch, reduction in exposures.groups(log_k, linear, rows, any_saturates):
+            best = exposures.profile(reduction, batch).bounded_best()
             log_k[batch], linear[batch] = best.log_k, best.linear
     measurements, batches = [], []
-    for batch, reduction in problem.groups(log_k, linear, all_rows, any_saturates):
-        measurements.append(problem.measured(batch, reduction))
+    for batch, reduction in exposures.groups(log_k, linear, all_rows, any_saturates):
+        measurements.append(exposures.measured(batch, reduction))
         batches.append(batch)
     return Measurement.joined(measurements, batches)
 
@@ -239,7 +245,7 @@ def _batches(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         yield rows[start : start + BATCH]
 
 
-class _Problem:
+class _Exposures:
     """Exposures, and the model of the flares that are fitted to them."""
 
     def __init__(
@@ -259,12 +265,12 @@ class _Problem:
         self.raw, self.quiet, self.model, self.nuisances, self.levels = raw, quiet, model, nuisances, tuple(levels)
         #: Mean of the frames without a flare, and rises of chi-squared at the ends of intervals of each level.
         self.mean_dn = quiet.recorded_dn if nuisances is None else quiet.recorded_dn + nuisances.mean_dn
-        self.rises = [float(scipy.stats.chi2.isf(1 - level, 1)) for level in levels]
+        self.rises = scipy.stats.chi2.isf(1 - np.array(levels), 1).tolist()
         #: Reduction of exposures with a flare, for its mean and further options of `ReducedSums.of`.
         self.reduction = partial(ReducedSums.of, model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
 
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
-        """Yield frames less their mean without a flare, in blocks that fit into a processor's cache."""
+        """Yield frames less their mean without a flare, (n, n_pixel), in blocks that fit into a processor's cache."""
         for start in range(0, rows.size, FRAMES_AT_ONCE):
             yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
 
@@ -278,16 +284,21 @@ class _Problem:
 
     def quiescent_chi2(self, reduction: ReducedSums, rows: NDArray[np.intp]) -> Float:
         """Return chi-squared of some frames without a flare, shape (n,)."""
-        return np.concatenate([reduction.quiescent_chi2(excess) for excess in self._excess(rows)])
+        variance, chi2 = reduction.variance, []
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0.0)
+        for excess in self._excess(rows):
+            unknown = excess @ reduction.rows.T
+            chi2.append(excess**2 @ inverse - np.vecdot(unknown, unknown))
+        return np.concatenate(chi2)
 
     def pilot(self) -> tuple[Float, Float, NDArray[np.bool_]]:
-        """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
+        """Fit all frames with the variance of the quiescent star, without the pixels that are near saturation in them.
 
-        Pixels that are near saturation in a frame are not used.
+        Returns log temperatures, (n,), amplitudes, (n, n_linear), and whether a frame has saturated pixels, (n,).
         """
         raw, quiet, n = self.raw, self.quiet, len(self.raw)
         log_k, linear = np.empty(n), np.empty((n, len(self.model.linear)))
-        usual = self.reduction(None)
+        usual = self.reduction()
         used = usual.variance > 0.0
         counts = np.count_nonzero(raw > np.where(used, _highest_usable(quiet), np.inf), axis=1)
 
@@ -303,10 +314,10 @@ class _Problem:
             for batch in _batches(np.flatnonzero((step == key) & (counts > 0))):
                 clipped = clipped_pixels(raw[batch], quiet)
                 if (~clipped & used).sum() >= LEAST_SHARED * (used.sum() - counts[batch].max()):
-                    fit_rows(batch, self.reduction(None, clipped=clipped))
+                    fit_rows(batch, self.reduction(clipped=clipped))
                     continue
                 for row in batch[:, None]:
-                    fit_rows(row, self.reduction(None, clipped=clipped_pixels(raw[row], quiet)))
+                    fit_rows(row, self.reduction(clipped=clipped_pixels(raw[row], quiet)))
         return log_k, linear, counts > 0
 
     def groups(
@@ -364,22 +375,22 @@ class _Problem:
                 ends_at_bound = intervals(model, bounded, bounded_best, bounded_at_nodes, rise)
                 low[k, near_bound], high[k, near_bound] = ends_at_bound
             best = best.replaced(near_bound, bounded_best)
-        return self.measurement(model, reduction, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
+        return self.measurement(model, profile, best, self.quiescent_chi2(reduction, rows), (low, high))
 
     def measurement(
-        self, model: FlareModel, reduction: ReducedSums, profile: Profile, best: BestFit, quiescent: Float,
-        ends: tuple[Float, Float], second: tuple[float, Slopes] | None = None,
+        self, model: FlareModel, profile: Profile, best: BestFit, quiescent: Float, ends: tuple[Float, Float],
+        second: tuple[float, Slopes] | None = None,
     ) -> Measurement:  # fmt: skip
         """Return the measurement of best fits with the ends of their intervals.
 
         `quiescent` is chi-squared without a flare. A second blackbody is given by its log temperature and the
         derivatives with respect to it.
         """
-        chi2 = quiescent - best.gain
+        chi2, reduction = quiescent - best.gain, profile.reduction
         n_used = int(np.count_nonzero(reduction.variance))
         dof = n_used - reduction.n_free - len(model.linear) - (1 if second is None else 2)
         factor, log_k = profile.factor(best), best.log_k
-        spread = covariance(model, profile.reduction, best, factor, None if second is None else second[1])
+        spread = covariance(model, reduction, best, factor, None if second is None else second[1])
         if second is not None:
             log_k = np.column_stack([log_k, np.full(log_k.size, second[0])])
         return Measurement(
@@ -395,7 +406,6 @@ def clipped_pixels(raw: NDArray[Any], quiet: Expectation) -> NDArray[np.bool_]:
     Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
     """
     clipped = (raw > _highest_usable(quiet)).any(axis=0)
-    # With neighbours, the noise of single pixels does not select the pixels of a fit.
     return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
 
 
@@ -486,7 +496,7 @@ def forecast_model(
     flare, response, slopes = single, reduction, None
     if isinstance(model, TwoTemperatures):
         second, log_k = float(log_k[1]), log_k[:1]
-        flare, response = model.at(second), reduction.with_second(second, model.end(second))
+        flare, response = model.at(second), reduction.with_second(second)
         slopes = model.slopes(second, reduction, log_k, linear)
     sums, factors = linear[0] @ np.vstack([response.spline(log_k), response.fixed]), np.array([factor])
     spread = covariance(flare, response, BestFit(log_k, linear, np.array([sums @ sums])), factors, slopes)[0]
@@ -498,8 +508,6 @@ def forecast_model(
 PER_NODE = 3
 #: Steps between the temperatures that are tried first, and number of those in and next to an interval.
 COARSE, TRIES = 36, 20
-#: Smallest number of nodes between the two temperatures; closer temperatures cannot be distinguished.
-APART = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -525,14 +533,9 @@ class TwoTemperatures:
         assert spline is not None
         return spline
 
-    def end(self, log_k: float) -> int:
-        """Return the number of nodes that are at least `APART` nodes below a temperature."""
-        nodes = self.single.log_k
-        return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
-
     def at(self, log_k: float) -> FlareModel:
         """Return a model of lower temperatures with a blackbody of a second temperature as another component."""
-        single, end = self.single, self.end(log_k)
+        single, end = self.single, nodes_below(self.single.log_k, log_k)
 
         def area(x: Float | float) -> Float:
             # The ratio of the flux at the telescope to that at the surface is proportional to the area.
@@ -561,7 +564,7 @@ class TwoTemperatures:
         """
         model, amplitude = self.at(log_k), linear[:, 1]
         quantities = np.zeros((amplitude.size, len(model.derived)))
-        quantities[:, model.sums[0]] = amplitude[:, None] * self.single.sums[1](log_k, 1)[:, 0]
+        quantities[:, model.amplitude_sums[0]] = amplitude[:, None] * self.single.amplitude_sums[1](log_k, 1)[:, 0]
         quantities[:, -2] = np.exp(log_k)
         areas = derived_values(model, lower, linear, np.ones(1))[:, -1]
         quantities[:, -1] = areas * (self._bolometric(log_k, 1)[0] / self._bolometric(log_k)[0] - 4.0)
@@ -604,13 +607,13 @@ def fit_two_temperatures(
     if any(derived.ratio is not None for derived in model.derived):
         raise InputError("the model must have blackbodies, with or without lines, and no Balmer jump", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    problem = _Problem(frames, expectation, model, nuisances, levels, skipped_nm)
+    exposures = _Exposures(frames, expectation, model, nuisances, levels, skipped_nm)
     measurements, order, two = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
-    for rows, reduction in problem.groups(single.log_k, recorded, np.arange(len(recorded)), True):
+    for rows, reduction in exposures.groups(single.log_k, recorded, np.arange(len(recorded)), True):
         check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
-        quiescent = problem.quiescent_chi2(reduction, rows)
-        search = _SecondTemperatures(two, problem.profile(reduction, rows), reduction, problem.rises)
+        quiescent = exposures.quiescent_chi2(reduction, rows)
+        search = _SecondTemperatures(two, exposures.profile(reduction, rows), exposures.rises)
         low, high = search.intervals()
         best_node = search.gain.argmax(axis=1)
         # Exposures with the same best second temperature are measured together.
@@ -620,21 +623,22 @@ def fit_two_temperatures(
             best = replace(profile.best(profile.gain_at_nodes()), gain=search.gain[alike, node])
             second = log_k, two.slopes(log_k, reduction, best.log_k, best.linear)
             flare = two.at(log_k)
-            measurements.append(problem.measurement(flare, reduction, profile, best, quiescent[alike], ends, second))
+            measurements.append(exposures.measurement(flare, profile, best, quiescent[alike], ends, second))
             order.append(rows[alike])
     measured, n = Measurement.joined(measurements, order), len(recorded)
     # Without light of the other blackbody, the estimates are those of one.
-    of_one = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
+    single_estimates = np.column_stack([single.estimates, np.full(n, np.nan), np.zeros(n)])
     absent = (measured.amplitudes[:, :2] <= 0.0).any(axis=1, keepdims=True)
-    return replace(measured, estimates=np.where(absent, of_one, measured.estimates))
+    return replace(measured, estimates=np.where(absent, single_estimates, measured.estimates))
 
 
 class _SecondTemperatures:
     """Largest gains of exposures with a common variance at second temperatures in and next to their intervals."""
 
-    def __init__(self, model: TwoTemperatures, profile: Profile, reduction: ReducedSums, rises: list[float]) -> None:
-        self._model, self._sums, self._reduction, self._rises = model, profile, reduction, rises
-        log_k = reduction.log_k
+    def __init__(self, model: TwoTemperatures, profile: Profile, rises: list[float]) -> None:
+        """Take the exposures' profile for a single temperature, and the rises of chi-squared at ends of intervals."""
+        self._model, self._single, self._rises = model, profile, rises
+        log_k = profile.nodes
         #: Second log temperatures that may be tried, and the largest gain at each, minus infinity if not tried.
         self.grid = np.linspace(log_k[2 * APART], log_k[-1], PER_NODE * (log_k.size - 1 - 2 * APART) + 1)
         self.gain = np.full((len(profile.sums), self.grid.size), -np.inf)
@@ -657,8 +661,7 @@ class _SecondTemperatures:
 
     def profile(self, node: int, rows: NDArray[np.intp]) -> Profile:
         """Return the profile of some exposures at a second temperature."""
-        log_k = float(self.grid[node])
-        return self._sums.bounded_rows(rows, self._reduction.with_second(log_k, self._model.end(log_k)))
+        return self._single.bounded_rows(rows, self._single.reduction.with_second(float(self.grid[node])))
 
     def intervals(self) -> tuple[Float, Float]:
         """Return the ends of intervals, (n_level, n, n_derived): the outermost ones at all second temperatures."""

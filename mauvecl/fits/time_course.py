@@ -20,8 +20,8 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.detection.nuisances import Nuisances, fitted_amplitudes, spectrum_of
-from mauvecl.fits.flare_model import EVERY, FlareModel, Ranges, RawCounts, ReducedSums
-from mauvecl.fits.least_squares import interval_end
+from mauvecl.fits.flare_model import NODE_STRIDE, FlareModel, Ranges, RawCounts, ReducedSums
+from mauvecl.fits.least_squares import interval_end, parameter_covariance
 from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
 from mauvecl.flares import Cooling
 from mauvecl.flares.frames import Components, known_strengths
@@ -85,18 +85,18 @@ class MeasuredBins:
         ]  # fmt: skip
 
 
-def _columns_of(found: Measurement, q: int) -> list[Column]:
+def _columns_of(measured: Measurement, q: int) -> list[Column]:
     """Return the columns of a quantity's estimates, errors and intervals."""
     from astropy import units
 
-    name = found.names[q]
-    column, unit = name.replace(" ", "_"), str(units.Unit(found.units[q]))
+    name = measured.names[q]
+    column, unit = name.replace(" ", "_"), str(units.Unit(measured.units[q]))
     heading, spec, error = SHOWN.get(column, ("", "", ""))
     columns = [
-        Column(column, lambda _: found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
-        Column(f"{column}_error", lambda _: found.errors[:, q], unit, "its standard error", error, spec),
+        Column(column, lambda _: measured.estimates[:, q], unit, f"{name} of the flare", heading, spec),
+        Column(f"{column}_error", lambda _: measured.errors[:, q], unit, "its standard error", error, spec),
     ]
-    for level, *ends in zip(found.levels, found.low, found.high, strict=True):
+    for level, *ends in zip(measured.levels, measured.low, measured.high, strict=True):
         text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
         for side, values in zip(("lower", "higher"), ends, strict=True):
             named = f"{column}_{side.removesuffix('er')}_{100 * level:.0f}"
@@ -150,8 +150,8 @@ def measure_along(
         If the frames have another shape, the expectation has several frames, or no bin reaches the S/N.
     """
     raw, stare = checked_frames(frames, quiet, stare)
-    reduction = ReducedSums.of(model, quiet, None, nuisances, skipped_nm)
-    sums = less_known(raw, quiet, known_strengths(stare, quiet), reduction.weights)
+    reduction = ReducedSums.of(model, quiet, nuisances=nuisances, skipped_nm=skipped_nm)
+    sums = excess_sums(raw, quiet, known_strengths(stare, quiet), reduction.weights)
     total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
     shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
     widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
@@ -181,7 +181,10 @@ def measure_along(
 
 
 def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -> tuple[Float, Stare]:
-    """Return raw frames of a stare and the stare; raises InputError unless they and the expectation agree."""
+    """Return raw frames, (n_frame, n_pixel), and their stare, by default one without gaps and changes.
+
+    Raises InputError unless frames, stare and expectation agree.
+    """
     raw = np.asarray(frames, np.float64)
     if raw.ndim != 2:
         raise InputError(f"frames must have two dimensions, frames and pixels, not the shape {raw.shape}", key="frames")
@@ -241,7 +244,7 @@ def fit_bins(
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, measurement)
 
 
-def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
+def excess_sums(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
     """Return weighted sums, (n_frame, n_sum), of frames less their means without a flare for `known_strengths`."""
     means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn, quiet.bias_dn])
     strengths = np.column_stack([known, np.ones(len(known))])
@@ -251,9 +254,11 @@ def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> 
 #: Whitens sums, (n, n_frame, n_sum), to the shape (n, n_frame n_sum), or to more columns if levels are unknown.
 Whiten = Callable[[Float], Float]
 
-#: Parameters, all but the first as logarithms; that of the temperature at the end is the share of the way from the
-#: coolest temperature of the model to that at the peak.
-PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
+#: Places of the parameters: peak time in s; logarithms of half-width in s, amplitude, and temperature at the peak in K;
+#: logarithm of the end temperature, as the share of the way from that of the coolest temperature of the model to that
+#: at the peak; and logarithm of the cooling time in s.
+PEAK, WIDTH, AMPLITUDE, KELVIN, END, FOLD = range(6)
+N_PARAMETERS = 6
 #: Number of fits after the first, each with the covariances of the previous fit.
 REFITS = 3
 
@@ -301,21 +306,24 @@ class _Data:
         return array_cache(2)(self._flare)
 
     def _flare(self, theta: Float) -> tuple[Float, Float, Float, Float]:
-        width, amplitude, fold = np.exp(theta[[1, 2, 5]])
-        rise = amplitude * self.light * self.shape.mean_over(self.edges, theta[0], width)
-        since, (coolest, hottest) = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0), self.model.log_k[[0, -1]]
+        """Compute the values of `flare`."""
+        peak_s, log_peak_k, end_share = theta[[PEAK, KELVIN, END]]
+        width, amplitude, fold = np.exp(theta[[WIDTH, AMPLITUDE, FOLD]])
+        rise = amplitude * self.light * self.shape.mean_over(self.edges, peak_s, width)
+        since, (coolest, hottest) = np.maximum(self.edges.mean(axis=1) - peak_s, 0.0), self.model.log_k[[0, -1]]
         # Temperatures over that at the peak, as in `Cooling`.
-        left, above = np.exp(-since / fold), theta[3] - coolest
-        end = float(np.exp((theta[4] - 1.0) * above))
+        left, above = np.exp(-since / fold), log_peak_k - coolest
+        end = float(np.exp((end_share - 1.0) * above))
         cooled = end + (1.0 - end) * left
-        log_k, falling, ended = theta[3] + np.log(cooled), (1.0 - end) * left / cooled, end * (1.0 - left) / cooled
-        tau, span = (self.edges - theta[0]) / width, np.diff(self.edges, axis=1)[:, 0]
+        log_k, falling, ended = log_peak_k + np.log(cooled), (1.0 - end) * left / cooled, end * (1.0 - left) / cooled
+        tau, span = (self.edges - peak_s) / width, np.diff(self.edges, axis=1)[:, 0]
         at, factor = self.shape.at(tau), amplitude * self.light / span
-        of_rise, of_log_k = np.zeros((2, len(PARAMETERS), rise.size))
-        of_rise[0], of_rise[1] = factor * (at[:, 0] - at[:, 1]), rise - factor * width * np.diff(at * tau, axis=1)[:, 0]
-        of_rise[2] = rise
-        of_log_k[0], of_log_k[5] = (since > 0.0) * falling / fold, falling * since / fold
-        of_log_k[3], of_log_k[4] = 1.0 + (theta[4] - 1.0) * ended, above * ended
+        of_rise, of_log_k = np.zeros((2, N_PARAMETERS, rise.size))
+        of_rise[PEAK] = factor * (at[:, 0] - at[:, 1])
+        of_rise[WIDTH] = rise - factor * width * np.diff(at * tau, axis=1)[:, 0]
+        of_rise[AMPLITUDE] = rise
+        of_log_k[PEAK], of_log_k[FOLD] = (since > 0.0) * falling / fold, falling * since / fold
+        of_log_k[KELVIN], of_log_k[END] = 1.0 + (end_share - 1.0) * ended, above * ended
         of_log_k *= (log_k > coolest) & (log_k < hottest)
         return rise, np.clip(log_k, coolest, hottest), of_rise, of_log_k
 
@@ -378,14 +386,14 @@ class _Quantity:
             rise, log_k, of_rise, of_log_k = data.flare(theta)
             light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
             total = float(np.sum(data.intrinsic(rise) * light))
-            slope = data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total
-            return self.factor * total, slope
-        value, gradient = theta[self.place], np.eye(len(PARAMETERS))[self.place]
-        if self.place == 4:
+            slope = data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1)
+            return self.factor * total, slope / (total if total > 0.0 else np.nan)
+        value, gradient = theta[self.place], np.eye(N_PARAMETERS)[self.place]
+        if self.place == END:
             coolest = data.model.log_k[0]
-            gradient[3:5] = theta[4], theta[3] - coolest
-            value = coolest + theta[4] * (theta[3] - coolest)
-        return float(value if self.place == 0 else np.exp(value)), gradient
+            gradient[KELVIN], gradient[END] = theta[END], theta[KELVIN] - coolest
+            value = coolest + theta[END] * (theta[KELVIN] - coolest)
+        return float(value if self.place == PEAK else np.exp(value)), gradient
 
 
 class CoolingCourse(NamedTuple):
@@ -457,12 +465,14 @@ def fit_cooling(
     fit = _BestFit.of(data, stare.frame_s, peak_s, half_width_s, cooling=cooling)
     theta, free, best = fit.theta, fit.free, fit.chi2
     jacobian = data.linearised(theta, fit.whiten)[1][:, free]
-    covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
     estimates, slopes = (np.array(values) for values in zip(*(q.at(theta, data) for q in quantities), strict=True))
-    scale = np.where([quantity.place == 0 for quantity in quantities], 1.0, estimates)
+    scale = np.where([quantity.place == PEAK for quantity in quantities], 1.0, estimates)
     slopes = scale[:, None] * slopes[:, free]
-    spread = slopes @ covariance @ slopes.T
+    spread = slopes @ parameter_covariance(jacobian) @ slopes.T
+    # Nothing is known of quantities of a flare without light, or of the cooling time of one that does not cool.
+    unknown = (slopes[:, ~jacobian.any(axis=0)] != 0.0).any(axis=1)
+    spread[unknown], spread[:, unknown] = np.nan, np.nan
     rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
     ends = [fit.end(sign * rise, quantity) for sign, rise, quantity in product((-1.0, 1.0), rises, quantities)]
     low, high = np.reshape(ends, (2, len(rises), 1, len(quantities)))
@@ -474,7 +484,7 @@ def fit_cooling(
         estimates[None], spread[None], tuple(levels), low, high,
         chi2=np.array([best]), p_value=np.array([float(scipy.stats.chi2.sf(best, dof))]), dof=dof,
         snr=np.array([np.sqrt(max(none - best, 0.0))]),
-        log_k=theta[3:4], amplitudes=np.exp(theta[2:3])[None], factor=np.ones(1),
+        log_k=theta[[KELVIN]], amplitudes=np.exp(theta[[AMPLITUDE]])[None], factor=np.ones(1),
     )  # fmt: skip
 
 
@@ -497,7 +507,7 @@ def cooling_course(
     rise, log_k, *_ = data.flare(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
     strengths = known_strengths(stare, quiet)
-    drawn_dn = less_known(frames, quiet, strengths, used[None])[:, 0]
+    drawn_dn = excess_sums(frames, quiet, strengths, used[None])[:, 0]
     mean_dn = rise * (model.hot_spline(log_k) @ used)
     if stare.unknowns:
         # What the unknown changes add to the sum over pixels follows from its residuals.
@@ -527,7 +537,7 @@ def _data(
     clipped = clipped_pixels(raw, quiet)
     reduction = ReducedSums.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
-    sums = less_known(raw, quiet, strengths, weights)
+    sums = excess_sums(raw, quiet, strengths, weights)
     components = Components(quiet, np.zeros((0, weights.shape[1])), weights)
     covariance, changes = components.covariance(strengths), components.directions(strengths)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
@@ -556,11 +566,11 @@ def _data(
 
 
 def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cooling: bool) -> Float:
-    """Return starting parameters: the best amplitude and temperature at the given peak and half-width."""
+    """Return starting parameters, (6,): the best amplitude and temperature at the given peak and half-width."""
     rise = data.light * data.shape.mean_over(data.edges, peak_s, half_width_s)
     if not rise.any():
         raise InputError.of("peak_s", peak_s, "the peak of a flare with light in the stare")
-    nodes = slice(None, None, EVERY)
+    nodes = slice(None, None, NODE_STRIDE)
     templates = whiten(rise[:, None] * data.reduction.hot[nodes, None])
     power, along = np.sum(templates**2, axis=1), templates @ whiten(data.sums[None])[0]
     best = int(np.argmax(np.maximum(along, 0.0) ** 2 / power))
@@ -575,17 +585,17 @@ def _start(data: _Data, whiten: Whiten, peak_s: float, half_width_s: float, cool
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
     """Return the quantities that a fit reports."""
     quantities = [
-        _Quantity("peak time", "s", 0), _Quantity("half width", "s", 1), _Quantity("amplitude", "", 2),
-        _Quantity("temperature", "K", 3),
+        _Quantity("peak time", "s", PEAK), _Quantity("half width", "s", WIDTH), _Quantity("amplitude", "", AMPLITUDE),
+        _Quantity("temperature", "K", KELVIN),
     ]  # fmt: skip
     if cooling:
-        quantities += [_Quantity("end temperature", "K", 4), _Quantity("cooling time", "s", 5)]
+        quantities += [_Quantity("end temperature", "K", END), _Quantity("cooling time", "s", FOLD)]
     for derived, spline in zip(data.model.derived, data.model.splines, strict=True):
         kind, _, band = derived.name.partition(" ")
         if kind == "flux":
-            quantities.append(_Quantity(f"fluence {band}", "erg / cm2", 2, spline, stare.frame_s))
+            quantities.append(_Quantity(f"fluence {band}", "erg / cm2", AMPLITUDE, spline, stare.frame_s))
         elif kind == "energy":
-            quantities.append(_Quantity(derived.name, derived.unit, 2, spline))
+            quantities.append(_Quantity(derived.name, derived.unit, AMPLITUDE, spline))
     return quantities
 
 
@@ -603,7 +613,7 @@ class _BestFit:
     @classmethod
     def of(cls, data: _Data, frame_s: float, peak_s: float, half_width_s: float, *, cooling: bool) -> Self:
         """Fit a flare from a starting point, with the covariance of the frames at the fit before."""
-        free = np.arange(len(PARAMETERS) if cooling else 4)
+        free = np.arange(N_PARAMETERS if cooling else END)
         first, last = data.edges[0, 0], data.edges[-1, 0]
         duration_s, coolest, hottest = last - first + frame_s, data.model.log_k[0], data.model.log_k[-1]
         limits = (
@@ -626,7 +636,8 @@ class _BestFit:
         low, high = (end[free] for end in limits)
         for refits in range(REFITS + 1):
             whiten = data.whitening(theta) if refits else whiten
-            start, scale = np.clip(theta[free], low + 1e-9, high - 1e-9), np.where(free == 0, np.exp(theta[1]), 1.0)
+            start = np.clip(theta[free], low + 1e-9, high - 1e-9)
+            scale = np.where(free == PEAK, np.exp(theta[WIDTH]), 1.0)
             solution = scipy.optimize.least_squares(residuals, start, jacobian, bounds=(low, high), x_scale=scale)
             theta = with_free(solution.x)
         return cls(data, whiten, theta, free, limits, 2 * float(solution.cost))

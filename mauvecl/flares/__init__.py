@@ -34,6 +34,8 @@ HALF_WIDTHS_S = (12.0, 22.0, 42.0, 77.0, 144.0, 267.0, 496.0, 923.0, 1720.0)
 WINDOW_S = 1800.0
 #: Default number of sums per frame in a search.
 RANK = 3
+#: Largest number of temperatures, and thus of spectra, of a stare's flares.
+MOST_TEMPERATURES = 8
 Per = Literal["day", "month", "year"]
 #: Star-days per unit; a month is a twelfth of a Julian year.
 DAYS: dict[Per, float] = {"day": 1.0, "month": 365.25 / 12, "year": 365.25}
@@ -120,6 +122,7 @@ class Curve(Section):
 
     @cached_property
     def _time_and_value(self) -> tuple[Float, Float]:
+        """Times and values of the points, or of the file's rows."""
         import numpy as np
 
         from mauvecl.host.tables.text_tables import read_columns

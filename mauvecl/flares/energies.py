@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mauvecl.flares import DAYS
 from mauvecl.flares.shapes import Shape, shape_of
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.stars.flare import (
@@ -169,13 +170,11 @@ class EnergyScale:
         """Return the scale for the light that a flare of amplitude 1 adds to a flux, over a sphere around the star."""
         check_scales(flare)
         light = added_light(wavelength_nm, flux_flam, flare, band, geometry, photosphere_k)
-        lost = 0.0
         if kind == "band":
             flux = light.hot * flux_in_band(band, flare)
-            if light.lost:
-                lost = light.lost * _through(wavelength_nm, flux_flam, band)
+            lost = light.lost * _through(wavelength_nm, flux_flam, band)
         else:
-            flux = light.hot * flare.bolometric_flux()
+            flux, lost = light.hot * flare.bolometric_flux(), 0.0
             if light.lost and photosphere_k is not None:
                 # The bolometric flux of the blackbody with the star's photons in the band.
                 body = photons(wavelength_nm, blackbody(wavelength_nm, photosphere_k), band)
@@ -220,7 +219,7 @@ def flux_in_band(band: str, flare: FlareSpectrum) -> float:
 
 
 def _response(band: str) -> tuple[Float, Float]:
-    """Return the wavelengths and the response of a band, with a maximum of 1."""
+    """Return the wavelengths, nm, and the response of a band, with a maximum of 1, shape (POINTS,) each."""
     at, throughput = find_band(band)["wavelength"], find_band(band)["throughput"]
     wavelength = np.linspace(at[0], at[-1], POINTS)
     return wavelength, np.interp(wavelength, at, throughput / throughput.max())
@@ -233,7 +232,7 @@ def _through(wavelength_nm: Float, flux_flam: Float, band: str) -> float:
 
 
 def _integral(wavelength_nm: Float, flux_flam: Float) -> float:
-    # erg s-1 cm-2 A-1 over nm.
+    """Return the integral of a flux in erg s-1 cm-2 A-1 over nm, erg s-1 cm-2."""
     return 10.0 * float(np.trapezoid(flux_flam, wavelength_nm))
 
 
@@ -247,7 +246,6 @@ ENERGIES = (1e22, 1e42)
 #: Scatter of the rates of single stars about a published relation, dex (assumption: stars of equal mass and age differ
 #: by factors of a few).
 SCATTER_DEX = 0.5
-DAYS_PER_YEAR = 365.25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,6 +345,7 @@ class PowerLaw(Rates):
         return np.asarray(np.maximum(self._untruncated(energy) - self._untruncated(self.largest_erg), 0.0))
 
     def _untruncated(self, energy: ArrayLike) -> Float:
+        """Return `per_day_above` without a largest energy."""
         exponent = self.log10_beta - np.log10(self.alpha - 1) + (1 - self.alpha) * np.log10(energy)
         return np.asarray(10.0**exponent)
 
@@ -469,7 +468,7 @@ def sunlike() -> PowerLaw:
     scatter covers other results: Maehara et al. 2015 find 1e34 erg once in 800 years, others once in 5000.
     """
     return PowerLaw.through(
-        2.0, 7e33, 1 / (3000 * DAYS_PER_YEAR), band=BOLOMETRIC,
+        2.0, 7e33, 1 / (3000 * DAYS["year"]), band=BOLOMETRIC,
         source="Sun-like G dwarfs: 7e33 erg per 3000 yr (Okamoto et al. 2021), exponent 2 (Shibayama et al. 2013)",
         measured_erg=(1e33, 1e36), scatter_dex=SCATTER_DEX, definition="patch",
     )  # fmt: skip

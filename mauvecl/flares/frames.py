@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.flares import MOST_TEMPERATURES
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.schema.errors import InputError
 
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
 
 #: Components of every frame; one flare component per temperature follows.
 STEADY = ("star", "sky", "dark", "neighbours")
-#: Largest number of flare temperatures, and of weighted sums.
-MOST_FLARES, MOST_STATISTICS = 8, 8
-#: Fourth cumulant of the rounding error, DN^4; its variance is 1/12.
-ROUNDING_FOURTH = -1.0 / 120.0
+#: Largest number of weighted sums that are drawn together.
+MOST_STATISTICS = 8
+#: Variance and fourth cumulant of the rounding error, by their order, DN^order.
+ROUNDING = {2: 1.0 / 12.0, 4: -1.0 / 120.0}
 
 
 def known_strengths(stare: Stare, quiet: Expectation) -> Float:
@@ -58,8 +59,8 @@ class Components:
             if spectra.ndim != 2 or spectra.shape[1] != n_pixel or len(spectra) < least:
                 raise InputError(f"{text} must have the shape (n, {n_pixel}), not {spectra.shape}", key=name)
             set_read_only(self, **{name: spectra})
-        if len(self.flare_electrons) > MOST_FLARES:
-            raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
+        if len(self.flare_electrons) > MOST_TEMPERATURES:
+            raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_TEMPERATURES} spectra")
         flares, weights, finite = self.flare_electrons, self.weights, "must be finite, but those of pixel {} are not"
         for key, wrong, fault in (
             ("flare_electrons", ~np.isfinite(flares), f"flare spectra {finite}"),
@@ -73,8 +74,8 @@ class Components:
     @classmethod
     def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:
         """Return the components from a frame of the quiescent star and frames with flares of unit amplitude."""
-        more = [flare.source_electrons - quiet.source_electrons for flare in flares]
-        return cls(quiet, np.reshape(more, (len(flares), quiet.wavelength_nm.size)), weights)
+        added = [flare.source_electrons - quiet.source_electrons for flare in flares]
+        return cls(quiet, np.reshape(added, (len(flares), quiet.wavelength_nm.size)), weights)
 
     @property
     def n_statistics(self) -> int:
@@ -106,22 +107,20 @@ class Components:
         photon = x.gain_dn_per_electron ** (order - 1)
         if order > 2 and x.photon_noise == "gaussian":
             photon = np.zeros_like(photon)
-        each = self.mean_dn * photon
-        each[2] = x.dark_step_dn ** (order - 1) * x.dark_dn
-        constant = np.zeros_like(photon)
+        by_component = self.mean_dn * photon
+        by_component[2] = x.dark_step_dn ** (order - 1) * x.dark_dn
+        constant = np.full_like(photon, ROUNDING.get(order, 0.0))
         if order == 2:
-            constant += x.read_noise_dn**2 + 1 / 12
-        elif order == 4:
-            constant += ROUNDING_FOURTH
-        return constant, each
+            constant += x.read_noise_dn**2
+        return constant, by_component
 
     def sum_cumulants(self, order: int) -> tuple[Float, Float]:
         """Return the joint cumulants of the weighted sums, with as many axes of n_statistic as the order.
 
         They are the constant part, and a row for each component at a coefficient of one, as of `pixel_cumulants`.
         """
-        constant, each = self.pixel_cumulants(order)
-        rows = np.vstack([constant, each])
+        constant, by_component = self.pixel_cumulants(order)
+        rows = np.vstack([constant, by_component])
         letters = "ijklm"[:order]
         sums = np.einsum(
             ",".join(f"{a}p" for a in letters) + f",cp->c{letters}", *[self.weights] * order, rows, optimize=True
@@ -157,8 +156,8 @@ class Components:
 
     def covariance(self, coefficients: Float) -> Float:
         """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
-        constant, each = self.sum_cumulants(2)
-        return np.asarray(constant + np.tensordot(coefficients, each, 1))
+        constant, by_component = self.sum_cumulants(2)
+        return np.asarray(constant + np.tensordot(coefficients, by_component, 1))
 
     def jittered_covariance(self, coefficients: Float, stare: Stare) -> Float:
         """Return `covariance` with the jitters of a stare."""
@@ -213,6 +212,7 @@ class StareExpectation:
 
     @cached_property
     def _bare(self) -> Components:
+        """Components whose only sum adds up the used pixels."""
         return self.components(self.used[None].astype(np.float64))
 
     @cached_property
@@ -235,12 +235,12 @@ class StareExpectation:
 
     def snr(self, flare: Float) -> float:
         """Return the matched-filter S/N of a flare with mean amplitudes of shape (n_frame, n_flare)."""
-        constant, each = (values[..., self.used] for values in self._bare.pixel_cumulants(2))
+        constant, by_component = (values[..., self.used] for values in self._bare.pixel_cumulants(2))
         spectra, power = self._bare.mean_dn[len(STEADY) :, self.used], 0.0
         lit = np.flatnonzero(flare.any(axis=1))
         for begin in range(0, lit.size, BLOCK):
             rows = lit[begin : begin + BLOCK]
-            variance = constant + self.coefficients[rows, : len(STEADY)] @ each[: len(STEADY)]
+            variance = constant + self.coefficients[rows, : len(STEADY)] @ by_component[: len(STEADY)]
             power += float(np.sum((self.stare.light[rows, None] * flare[rows] @ spectra) ** 2 / variance))
         return float(np.sqrt(power))
 
@@ -280,9 +280,9 @@ class StareExpectation:
     def expected(self, weights: Float) -> tuple[Float, Float]:
         """Return standard deviation and mean of the net light in sums of pixels, DN/s, shape (n_frame, n_sum)."""
         frame_s, coefficients = self.stare.frame_s, self.coefficients
-        constant, each = self._bare.pixel_cumulants(2)
+        constant, by_component = self._bare.pixel_cumulants(2)
         squares, light = weights.T**2, np.delete(self._bare.mean_dn, 2, axis=0) @ weights.T
-        sd = np.sqrt(constant @ squares + coefficients @ (each @ squares))
+        sd = np.sqrt(constant @ squares + coefficients @ (by_component @ squares))
         return sd / frame_s, np.delete(coefficients, 2, axis=1) @ light / frame_s
 
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.flares import ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
+from mauvecl.flares import MOST_TEMPERATURES, ORBIT_S, SAME_K, Cooling, Curve, Sinusoid
 from mauvecl.flares.energies import EnergyScale, amplitude_of
-from mauvecl.flares.shapes import SHAPES, Shape, shape_of
+from mauvecl.flares.shapes import SHAPES, Shape, TableShape, shape_of
 from mauvecl.host.arrays import Float, set_read_only
 from mauvecl.host.orbit import Limits
 from mauvecl.host.orbit.orbit import Orbit, Target, TimeGrid
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
 
-#: Largest number of flare spectra of a stare (`frames.MOST_FLARES`), and the smallest for flares that cool.
-MOST_TEMPERATURES, LEAST_STEPS = 8, 3
+#: Smallest number of a stare's temperatures that are left for flares that cool.
+LEAST_STEPS = 3
 #: For a flare that cools: smallest number of steps per frame, half-width and cooling time, and largest per frame.
 PARTS, MOST_PARTS = 16, 512
 #: Fraction of a flare's peak and of its fluence below which its light in a frame is neglected.
@@ -145,10 +145,14 @@ class Event:
         if cooling is None:
             return self.energy(scale_of(self.hottest_k))
         nodes = temperatures_of([self]) if nodes is None else nodes
-        tau = np.concatenate([np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, 1000.0, 1001)[1:]])
+        # Published shapes end within these half-widths; a table may be longer, as one in seconds is.
+        first, last = -10.0, 1000.0
+        if isinstance(self.form, TableShape):
+            first, last = min(first, float(self.form.tau[0])), max(last, float(self.form.tau[-1]))
         # Steps resolve the half-width and the cooling time; rounding removes duplicates that differ in their last bits.
+        tau = np.concatenate([[first], np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, last, 1001)[1:]])
         fold = np.linspace(0.0, 20.0, 2001) * cooling.fold_s / self.half_width_s
-        edges = self.half_width_s * np.unique(np.concatenate([tau, fold[fold < 1000.0]]).round(6))
+        edges = self.half_width_s * np.unique(np.concatenate([tau, fold[fold < last]]).round(6))
         light = self.form.mean_over(edges, 0.0, self.half_width_s) * np.diff(edges)
         kelvin = cooling.at((edges[1:] + edges[:-1]) / 2)
         per_s = 0.0
@@ -243,7 +247,7 @@ def _cooling_of(event: Event) -> Cooling | None:
 
 
 def _node_weights(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
-    """Return the weights of the nodes for temperatures, linear in 1 / T, by index of the node."""
+    """Return indices of nodes that have a weight, and their weights, linear in 1 / T, shape of the temperature."""
     if temperature.min() < nodes[0] - SAME_K or temperature.max() > nodes[-1] + SAME_K:
         raise InputError(
             f"the temperatures of a flare must be within {nodes[0]:g} to {nodes[-1]:g} K, but are "
@@ -497,7 +501,7 @@ def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
 
 
 def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float]]) -> Float:
-    """Return the starts of the frames of a stare that do not overlap a gap."""
+    """Return the starts of the frames of a stare that do not overlap a gap, s, shape (n_frame,)."""
     count = np.ceil(duration_s / frame_s * (1 - 1e-12))
     if count > MOST_FRAMES:
         raise InputError.of("duration_s", duration_s, f"at most {MOST_FRAMES} frames", unit="s")
@@ -514,6 +518,7 @@ def _starts(duration_s: float, frame_s: float, gaps: Sequence[tuple[float, float
 
 
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
+    """Raise InputError unless a standard deviation lies between `least` and the largest for positive levels."""
     most = 100.0 if of == "temperature" else LARGEST_SPREAD
     if not least <= sd <= most:
         unit = "deg C" if of == "temperature" else ""
@@ -592,7 +597,7 @@ def stare_along(
     is_visible = visible.seen[:, 0]
     if not is_visible.any():
         raise InputError(
-            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}; try another time "
+            f"target {place.name!r} is never seen in {duration_s / HOUR_S:g} h from {times.iso(0.0)}; try another time "
             "or other limits",
             key="target",
         )

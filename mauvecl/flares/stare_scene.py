@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection.requests import ShardedRequest
-from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
+from mauvecl.flares.frames import MOST_STATISTICS, ROUNDING, STEADY, Components
 from mauvecl.flares.stare import Stare
 from mauvecl.host.arrays import Arrays, Float
 from mauvecl.noise import layout
@@ -188,14 +188,14 @@ class StareScene:
         """Smallest and largest factors on star, sky, dark, and neighbours and flares."""
         stare, spread, quiet = self.stare, self._spreads, self.components.quiet
         ends = []
-        for sign, of in ((-1.0, np.min), (1.0, np.max)):
+        for sign, extreme in ((-1.0, np.min), (1.0, np.max)):
             light, star, sky = (1.0 + sign * REACH_SIGMA * spread[name] for name in ("light", "star", "sky"))
             if sign < 0 and stare.pointing is not None:
                 light = light * (1.0 - stare.pointing.depth)
             warm = np.exp(sign * REACH_SIGMA * abs(quiet.conditions["dark_slope_per_c"]) * spread["temperature"])
             lights = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
             dark = stare.dark_factor(quiet) * warm
-            ends.append(np.array([float(of(values)) for values in (*lights, dark, stare.light * light)]))
+            ends.append(np.array([float(extreme(values)) for values in (*lights, dark, stare.light * light)]))
         return ends[0], ends[1]
 
     @property
@@ -247,8 +247,8 @@ def unique(n: int, order: int) -> list[tuple[int, ...]]:
 
 def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
     """Pad with zeros to full blocks of frames."""
-    more = padded_frames(values.shape[-1]) - values.shape[-1]
-    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)]).astype(kind)
+    padding = padded_frames(values.shape[-1]) - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, padding)]).astype(kind)
 
 
 def _mixtures(components: Components, base_dn: NDArray[np.int64]) -> NDArray[np.void]:
@@ -260,11 +260,11 @@ def _mixtures(components: Components, base_dn: NDArray[np.int64]) -> NDArray[np.
     for row, name in enumerate(STEADY):
         mixtures[name][:n_pixel] = components.mean_dn[row]
     for order, name in enumerate(layout.CUMULANTS, 2):
-        constant, each = components.pixel_cumulants(order)
+        constant, by_component = components.pixel_cumulants(order)
         # Rounding is done by the kernels.
-        constant = constant - {2: 1 / 12, 4: -1 / 120}.get(order, 0.0)
-        mixtures[name][:n_pixel] = constant + each[: len(STEADY)].sum(axis=0)
-        mixtures[f"dark_{name}"][:n_pixel] = each[2]
+        constant = constant - ROUNDING.get(order, 0.0)
+        mixtures[name][:n_pixel] = constant + by_component[: len(STEADY)].sum(axis=0)
+        mixtures[f"dark_{name}"][:n_pixel] = by_component[2]
         mixtures[f"photon_{name}"][:n_pixel] = (
             x.gain_dn_per_electron ** (order - 1) if order == 2 or x.photon_noise == "poisson" else 0.0
         )
@@ -272,6 +272,7 @@ def _mixtures(components: Components, base_dn: NDArray[np.int64]) -> NDArray[np.
 
 
 def _not_joint_error(name: str) -> InputError:
+    """Return the error of frames whose noise is not Gaussian enough."""
     return InputError(
         f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare: it must be "
         "Gaussian with the variance of at least 1.5 Poisson counts in each pixel, and more where counts are few",
@@ -398,8 +399,8 @@ class SumTable:
         Raises InputError if weights are linearly dependent, or counts are too few for the expansion.
         """
         n = components.n_statistics
-        constant, each = components.sum_cumulants(2)
-        covariance = constant + each[: len(STEADY)].sum(axis=0)
+        constant, by_component = components.sum_cumulants(2)
+        covariance = constant + by_component[: len(STEADY)].sum(axis=0)
         sd = np.sqrt(np.diag(covariance))
         if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
             raise InputError(f"the {n} spectral weights must be independent, but one is a sum of others", key="weights")
@@ -408,13 +409,13 @@ class SumTable:
         fourths = _fourths_are_needed(components) or _fourths_are_needed(white)
         columns = []
         for order in range(1, 5 if fourths else 4):
-            constant, each = white.sum_cumulants(order)
-            reference = constant + (0.0 if order == 1 else each[: len(STEADY)].sum(axis=0))
+            constant, by_component = white.sum_cumulants(order)
+            reference = constant + (0.0 if order == 1 else by_component[: len(STEADY)].sum(axis=0))
             for key in unique(n, order):
-                often = 1
+                multiplicity = 1
                 if order == 4:
-                    often = math.factorial(4) // math.prod(math.factorial(m) for m in Counter(key).values())
-                columns.append(often * np.array([reference[key], *(component[key] for component in each)]))
+                    multiplicity = math.factorial(4) // math.prod(math.factorial(m) for m in Counter(key).values())
+                columns.append(multiplicity * np.array([tensor[key] for tensor in (reference, *by_component)]))
         return cls(np.array(columns, np.float32).T.copy(), lower[np.tril_indices(n)].astype(np.float32), fourths)
 
 

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.flares.shapes import SHAPES, Davenport2014, Shape, TimeProfile, consecutive_integrals
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.observations.search import DetectedEvent, SeriesSurvey
-from mauvecl.search.templates import REACH
+from mauvecl.search.search import REACH
 
 #: Departures from a shape that are averaged (assumed); a flare of the general family is never exactly of its shapes.
 EPSILON, GENERAL_EPSILON = (0.0, 0.02, 0.06, 0.2), (0.04, 0.1, 0.2)

@@ -21,7 +21,7 @@ from mauvecl.observations.event_windows import GENERAL, LOG_TIME, FittedFlare, W
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.fields import DAY_S
-from mauvecl.search.templates import REACH
+from mauvecl.search.search import REACH
 
 #: Largest number of searches.
 MAX_PASSES = 40

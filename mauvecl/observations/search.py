@@ -31,8 +31,7 @@ from mauvecl.observations.frames import Frames
 from mauvecl.observations.level import ConditionalLevel
 from mauvecl.observations.process import UNREPORTED, Covariance, Process, Steps, level_fit
 from mauvecl.schema.fields import DAY_S
-from mauvecl.search.search import largest_values
-from mauvecl.search.templates import LEAST_SHARE, Bank, Baseline, Template, Templates
+from mauvecl.search.search import LEAST_SHARE, Bank, Baseline, Template, Templates, largest_values
 
 #: Flux of a template, relative to its peak, below which it is neglected.
 NEGLECTED = 1e-4

@@ -28,7 +28,7 @@ from mauvecl.observations.light_curve import fit_quiet_light, quiescent_light
 from mauvecl.observations.process import UNREPORTED, Steps
 from mauvecl.observations.search import MIN_BASELINE, DetectedEvent, SeriesSurvey
 from mauvecl.schema.errors import InputError
-from mauvecl.search.templates import TEMPERATURES_K, Templates
+from mauvecl.search.search import TEMPERATURES_K, Templates
 
 #: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0

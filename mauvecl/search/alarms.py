@@ -2,7 +2,7 @@
 
 Each pass searches the residuals of the fits. A template raises an alarm if its value exceeds the threshold by more than
 the share of the fitted flux that a wrong shape may leave in the residuals. Flares that overlap are fitted together
-(`flare_fits`) from several starting points, and each must improve chi-squared by the square of the threshold. The
+(`survey`) from several starting points, and each must improve chi-squared by the square of the threshold. The
 passes end when there are no more alarms.
 """
 
@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arrays import Float, true_runs
-from mauvecl.search.flare_fits import AMPLITUDE, KELVIN, PEAK, WIDTH, FittedFlares, ProfiledQuantity, SummedStare
-from mauvecl.search.templates import LEAD, TAIL
+from mauvecl.search.search import LEAD, TAIL
+from mauvecl.search.survey import AMPLITUDE, KELVIN, PEAK, WIDTH, FittedFlares, ProfiledQuantity, SummedStare
 
 if TYPE_CHECKING:
-    from mauvecl.search.flare_fits import BlendFit, Block, Factor
-    from mauvecl.search.search import Row, Survey
+    from mauvecl.search.search import Row
+    from mauvecl.search.survey import BlendFit, Block, Factor, Survey
 
 
 #: Values of a fit without a measurement.
@@ -30,13 +30,13 @@ UNMEASURED = FittedFlares(**{field.name: np.full(1, np.nan) for field in fields(
 #: Share of a flare's S/N that may remain in nearby residuals without an alarm, because its shape or temperature differs
 #: from that of the fit.
 LEFT_BEHIND = 0.05
-#: The same as a share of a template's response to the fitted flux, when a block is tested for a further flare.
+#: The same as a share of a template's response to the fitted flux, when a group is tested for a further flare.
 LEFT_UNSEEN = 0.15
 #: Largest number of flares per fit; longer chains of overlapping flares are fitted in parts, alternately.
 MAX_FLARES_PER_FIT = 6
 #: Iterations over parts and their neighbours after each pass.
 TURNS = 2
-#: Starting points for a further flare in each block.
+#: Starting points for a further flare in each group.
 SPLITS = 3
 #: Distance from a bound, as a share of the parameter's range, at which a parameter counts as at the bound.
 AT_BOUND = 1e-3
@@ -96,21 +96,21 @@ def alarms(survey: Survey, sums: NDArray[Any], threshold: float, energy: Factor 
     logarithm of the temperature.
     """
     net = np.asarray(survey.frames.net(sums[None])[0], np.float64)
-    search, found = _StareSearch(SummedStare(survey, net), threshold), []
-    # Until there are no alarms, and no block improves with a further flare.
-    while new := search.searched() or search.split():
-        search.found += new
+    search, detected = _StareSearch(SummedStare(survey, net), threshold), []
+    # Until there are no alarms, and no group improves with a further flare.
+    while new := search.alarms() or search.split():
+        search.flares += new
         changed = set(new)
         for _ in range(TURNS):
-            changed = search.fitted(changed)
-    for number, group in enumerate(search.blocks(), 1):
+            changed = search.refit(changed)
+    for number, group in enumerate(search.groups(), 1):
         theta = _thetas(group)
         block = search.sums.block(theta, search.others(group))
         best = block.fit(theta)
-        for j, candidate in enumerate(group):
+        for j, flare in enumerate(group):
             measured = _measured(block, best, j, energy)
-            found.append(Alarm(candidate.rho, *measured, number, len(group), best.chi2, best.dof, best.p_value))
-    return sorted(found, key=lambda alarm: -alarm.rho)
+            detected.append(Alarm(flare.rho, *measured, number, len(group), best.chi2, best.dof, best.p_value))
+    return sorted(detected, key=lambda alarm: -alarm.rho)
 
 
 @dataclass(eq=False)
@@ -119,30 +119,33 @@ class _StareSearch:
 
     sums: SummedStare
     threshold: float
-    found: list[Candidate] = field(default_factory=list)
-    refused: list[tuple[float, float]] = field(default_factory=list)
-    complete: set[tuple[float, ...]] = field(default_factory=set)  # blocks that no further flare improves
+    flares: list[Candidate] = field(default_factory=list)  # detected so far
+    refused: list[tuple[float, float]] = field(default_factory=list)  # templates of flares that fits do not need
+    complete: set[tuple[float, ...]] = field(default_factory=set)  # groups that no further flare improves
 
-    def blocks(self) -> list[list[Candidate]]:
-        """Group overlapping flares in order of time, with at most `MAX_FLARES_PER_FIT` flares per group."""
-        spans = sorted(((*self.sums.overlap(candidate.theta), k) for k, candidate in enumerate(self.found)))
-        blocks: list[list[Candidate]] = []
+    def groups(self) -> list[list[Candidate]]:
+        """Return groups of overlapping flares in order of time, of at most `MAX_FLARES_PER_FIT` flares each."""
+        spans = sorted(((*self.sums.overlap(flare.theta), k) for k, flare in enumerate(self.flares)))
+        chains: list[list[Candidate]] = []
         reach = -np.inf
         for first, last, k in spans:
             if first > reach:
-                blocks.append([])
-            blocks[-1].append(self.found[k])
+                chains.append([])
+            chains[-1].append(self.flares[k])
             reach = max(reach, last)
         n = MAX_FLARES_PER_FIT
-        return [block[k : k + n] for block in blocks for k in range(0, len(block), n)]
+        return [chain[k : k + n] for chain in chains for k in range(0, len(chain), n)]
 
     def others(self, group: Collection[Candidate]) -> Float:
-        """Return the parameters of the found flares outside of a group."""
-        return _thetas(candidate for candidate in self.found if candidate not in group)
+        """Return the parameters of the flares outside of a group, shape (n_flare, 4)."""
+        return _thetas(flare for flare in self.flares if flare not in group)
 
     def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Callable[[int], Candidate]]]:
-        """Yield per row the largest excess over fit residuals and the peak time of each onset, and its candidate."""
-        theta, (low, high) = _thetas(self.found), self.sums.bounds
+        """Yield the excess over fit residuals and the peak times, s, (n_onset,) each, for each row of the search.
+
+        The third value is a function of the onset that returns its candidate.
+        """
+        theta, (low, high) = _thetas(self.flares), self.sums.bounds
         light = self.sums.light(theta)
         # Flares at the bounds of the fit may remain in the residuals entirely.
         at_end = np.minimum(theta - low, high - theta) <= AT_BOUND * (high - low)
@@ -154,9 +157,9 @@ class _StareSearch:
             rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
             # Statistics of flares within reach of the templates.
             near = np.zeros(peaks.shape)
-            for candidate in self.found if near_share else ():
-                reach = TAIL * np.exp(candidate.theta[WIDTH]) + LEAD * row.template.half_width_s
-                near += np.where(np.abs(peaks - candidate.theta[PEAK]) < reach, candidate.rho, 0.0)
+            for flare in self.flares if near_share else ():
+                reach = TAIL * np.exp(flare.theta[WIDTH]) + LEAD * row.template.half_width_s
+                near += np.where(np.abs(peaks - flare.theta[PEAK]) < reach, flare.rho, 0.0)
             excess = rho[0] - np.maximum(rests, near_share * near)
             yield excess.max(axis=0), peaks, partial(self._candidate, row, rho[0], excess.argmax(axis=0))
 
@@ -170,7 +173,7 @@ class _StareSearch:
         theta = np.array([np.log(amplitude), peak, np.log(width), np.log(kelvin)])
         return Candidate(theta, rho, (peak, width))
 
-    def searched(self) -> list[Candidate]:
+    def alarms(self) -> list[Candidate]:
         """Return new candidates from the residuals, at most one within the window of another."""
         sums, bank, candidates = self.sums, self.sums.survey.bank, list[tuple[float, Candidate]]()
         for excess, _, candidate_at in self._values(LEFT_BEHIND):
@@ -192,62 +195,64 @@ class _StareSearch:
         return new
 
     def split(self) -> list[Candidate]:
-        """Return a further flare that improves the fit of a block as much as an alarm, if there is one."""
-        blocks = [block for block in self.blocks() if self._key(block) not in self.complete]
-        if not blocks:
+        """Return a further flare that improves the fit of a group as much as an alarm, if there is one."""
+        groups = [group for group in self.groups() if self._key(group) not in self.complete]
+        if not groups:
             return []
-        overlaps = [[self.sums.overlap(candidate.theta) for candidate in block] for block in blocks]
+        overlaps = [[self.sums.overlap(flare.theta) for flare in group] for group in groups]
         spans = [(min(a for a, _ in ends), max(b for _, b in ends)) for ends in overlaps]
-        best: list[list[tuple[float, Candidate]]] = [[] for _ in blocks]
+        best: list[list[tuple[float, Candidate]]] = [[] for _ in groups]
         for excess, peaks, candidate_at in self._values():
             for several, (first, last) in zip(best, spans, strict=True):
                 inside = np.flatnonzero((peaks >= first) & (peaks <= last) & np.isfinite(excess))
                 if inside.size:
                     k = int(inside[np.argmax(excess[inside])])
                     several.append((float(excess[k]), candidate_at(k)))
-        for block, several in zip(blocks, best, strict=True):
+        for group, several in zip(groups, best, strict=True):
             several.sort(key=lambda pair: -pair[0])
             for _, candidate in several[:SPLITS]:
-                if not self._was_refused(*candidate.template) and self._improves(block, candidate):
+                if not self._was_refused(*candidate.template) and self._improves(group, candidate):
                     return [candidate]
-            self.complete.add(self._key(block))
+            self.complete.add(self._key(group))
         return []
 
-    def _improves(self, block: list[Candidate], candidate: Candidate) -> bool:
-        """Return whether a further flare improves a block significantly, and update the flares to the better fit."""
-        before, with_it = _thetas(block), [*block, candidate]
-        rows = self.sums.block(_thetas(with_it), self.others(block))
-        best = self._best(rows, with_it, [candidate])
+    def _improves(self, group: list[Candidate], candidate: Candidate) -> bool:
+        """Return whether a further flare improves a group significantly, and update the flares to the better fit."""
+        before, extended = _thetas(group), [*group, candidate]
+        block = self.sums.block(_thetas(extended), self.others(group))
+        best = self._best(block, extended, [candidate])
         # The other flares alone may fit better from their new parameters.
-        alone = min((rows.fit(before), rows.without(best, len(block))), key=lambda fit: fit.chi2)
+        alone = min((block.fit(before), block.without(best, len(group))), key=lambda fit: fit.chi2)
         fall = alone.chi2 - best.chi2
         # The other flares may have another shape, which changes their overlap with this one.
-        light, other_light = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
+        light, other_light = block.model(best.theta[-1:])[0], block.model(best.theta[:-1])[0]
         response = abs(float(light @ other_light)) / max(float(np.linalg.norm(light)), 1e-300)
-        allowed = max(LEFT_UNSEEN * response, LEFT_BEHIND * max(flare.rho for flare in block))
+        allowed = max(LEFT_UNSEEN * response, LEFT_BEHIND * max(flare.rho for flare in group))
         improves = bool(fall >= (self.threshold + allowed) ** 2)
         if improves:
             candidate.rho = float(np.sqrt(fall))
-        flares, better = (with_it, best) if improves else (block, alone)
+        flares, better = (extended, best) if improves else (group, alone)
         for flare, theta in zip(flares, better.theta, strict=True):
             flare.theta = theta
         return improves
 
     @staticmethod
-    def _key(block: list[Candidate]) -> tuple[float, ...]:
-        return tuple(np.round(_thetas(block), 2).ravel().tolist())
+    def _key(group: list[Candidate]) -> tuple[float, ...]:
+        """Return the rounded parameters of a group, by which it is recognised."""
+        return tuple(np.round(_thetas(group), 2).ravel().tolist())
 
     def _was_refused(self, peak: float, width: float) -> bool:
+        """Return whether a flare of a similar template was not needed in a fit."""
         return any(
             abs(peak - refused_peak) <= max(width, refused_width) and 1 / 3 < width / refused_width < 3
             for refused_peak, refused_width in self.refused
         )
 
     def _evened(self, residuals: Float, light: Float) -> Float:
-        """Scale residuals under flares down to the noise of frames without a flare."""
-        if not self.found:
+        """Return residuals, (n_frame, n_sum), scaled down under flares to the noise of frames without a flare."""
+        if not self.flares:
             return residuals
-        noise = self.sums.noise(_thetas(self.found), light)
+        noise = self.sums.noise(_thetas(self.flares), light)
         base = self.sums.survey.covariance
         excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
         loud, evened = excess > 1.01, residuals.copy()
@@ -260,59 +265,62 @@ class _StareSearch:
             evened[rows] = level + (residuals[rows] - level) / np.sqrt(excess[rows])[:, None]
         return evened
 
-    def fitted(self, changed: set[Candidate]) -> set[Candidate]:
-        """Fit all blocks that have changed or adjoin changed ones, and return the flares whose parameters changed."""
+    def refit(self, changed: set[Candidate]) -> set[Candidate]:
+        """Fit all groups that have changed or adjoin changed ones, and return the flares whose parameters changed."""
         moved: set[Candidate] = set()
-        spans = [self.sums.window(candidate.theta) for candidate in changed]
-        for block in self.blocks():
-            windows = [self.sums.window(candidate.theta) for candidate in block]
+        spans = [self.sums.window(flare.theta) for flare in changed]
+        for group in self.groups():
+            windows = [self.sums.window(flare.theta) for flare in group]
             if any(a < d and c < b for a, b in windows for c, d in spans):
-                moved |= self._fit(block, changed)
+                moved |= self._fit(group, changed)
         return moved
 
-    def _fit(self, block: list[Candidate], new: Collection[Candidate]) -> set[Candidate]:
-        """Fit the flares of a block together, drop those that are not needed, and return those that moved."""
-        others = self.others(block)
-        best = self._best(self.sums.block(_thetas(block), others), block, new)
+    def _fit(self, group: list[Candidate], new: Collection[Candidate]) -> set[Candidate]:
+        """Fit the flares of a group together, drop those that are not needed, and return those that moved."""
+        others = self.others(group)
+        best = self._best(self.sums.block(_thetas(group), others), group, new)
         # The noise depends on the fitted flares.
-        rows = self.sums.block(best.theta, others)
-        best, flares = rows.fit(best.theta), list(block)
+        block = self.sums.block(best.theta, others)
+        best, flares = block.fit(best.theta), list(group)
         while len(flares) > 1:
-            reduced = [rows.without(best, j) for j in range(len(flares))]
+            reduced = [block.without(best, j) for j in range(len(flares))]
             j = int(np.argmin([fit.chi2 for fit in reduced]))
             if reduced[j].chi2 - best.chi2 >= self.threshold**2:
                 break
             self.refused.append(flares[j].template)
-            self.found.remove(flares.pop(j))
+            self.flares.remove(flares.pop(j))
             best = reduced[j]
         moved = set()
-        for candidate, theta in zip(flares, best.theta, strict=True):
-            if np.abs(theta - candidate.theta).max() > 1e-4:
-                moved.add(candidate)
-            candidate.theta = theta
+        for flare, theta in zip(flares, best.theta, strict=True):
+            if np.abs(theta - flare.theta).max() > 1e-4:
+                moved.add(flare)
+            flare.theta = theta
         return moved
 
-    def _best(self, rows: Block, block: list[Candidate], new: Collection[Candidate]) -> BlendFit:
+    @staticmethod
+    def _best(block: Block, group: list[Candidate], new: Collection[Candidate]) -> BlendFit:
         """Return the best of several fits with different starting points for blends with a new flare."""
-        start = _thetas(block)
-        fits = [rows.fit(start)]
-        for k in (k for k, candidate in enumerate(block) if candidate in new):
+        start = _thetas(group)
+        fits = [block.fit(start)]
+        for k in (k for k, flare in enumerate(group) if flare in new):
             # A flare that was fitted alone may be too wide because it includes another.
             for j in np.flatnonzero(start[:, WIDTH] > start[k, WIDTH]):
                 narrower = start.copy()
                 narrower[j, WIDTH] = start[k, WIDTH]
-                fits.append(rows.fit(narrower))
+                fits.append(block.fit(narrower))
         return min(fits, key=lambda fit: fit.chi2)
 
 
+#: Intervals of a flare without a measurement.
+NO_INTERVALS = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
 #: Values, intervals and note of a flare.
 Measured = tuple[FittedFlares, dict[str, tuple[float, float]], str]
 
 
-def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Measured:
-    """Measure a flare of a block."""
-    sums, theta, (low, high) = rows.sums, best.theta[j], rows.sums.bounds
-    snr = float(np.sqrt(max(rows.without(best, j).chi2 - best.chi2, 0.0)))
+def _measured(block: Block, best: BlendFit, j: int, energy: Factor | None) -> Measured:
+    """Measure flare `j` of a block, whose best fit is given; its values are NaN if the fit ends at a bound."""
+    sums, theta, (low, high) = block.sums, best.theta[j], block.sums.bounds
+    snr = float(np.sqrt(max(block.without(best, j).chi2 - best.chi2, 0.0)))
     at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))
     missing = "" if best.converged else "its fit did not converge"
     if at_low[WIDTH] or at_high[WIDTH]:
@@ -320,28 +328,27 @@ def _measured(rows: Block, best: BlendFit, j: int, energy: Factor | None) -> Mea
     if at_low[PEAK] or at_high[PEAK]:
         missing = "its best fit peaks outside the stare"
     if missing:
-        nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
-        return replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"
-    covariance = np.asarray(rows.covariance(best.theta)[j, :, j, :])
+        return replace(UNMEASURED, snr=np.array([snr])), NO_INTERVALS, f"detected but not measured: {missing}"
+    covariance = np.asarray(block.covariance(best.theta)[j, :, j, :])
     fitted = FittedFlares.of(theta[None], covariance[None], sums.survey, np.array([snr]))
-    return fitted, *_intervals(rows, best, j, snr, covariance, energy)
+    return fitted, *_intervals(block, best, j, snr, covariance, energy)
 
 
 def _intervals(
-    rows: Block, best: BlendFit, j: int, snr: float, covariance: Float, energy: Factor | None
+    block: Block, best: BlendFit, j: int, snr: float, covariance: Float, energy: Factor | None
 ) -> tuple[dict[str, tuple[float, float]], str]:
     """Return the intervals of a flare's values, and a note."""
-    area = np.log(rows.sums.survey.bank.shape.equivalent_duration)
+    area = np.log(block.sums.survey.bank.shape.equivalent_duration)
     quantities = QUANTITIES | ({} if energy is None else {"energy": ProfiledQuantity(AMPLITUDE, energy)})
-    intervals, notes = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan)), []
-    if not rows.sums.survey.templates.coloured:
+    intervals, notes = dict(NO_INTERVALS), []
+    if not block.sums.survey.templates.coloured:
         del quantities["temperature_k"]
     for name, quantity in quantities.items():
         middle, slope = quantity.of(best.theta[j])
         sd = float(np.sqrt(slope @ covariance @ slope))
         low, high, is_open = middle - sd, middle + sd, False
         if snr <= MAX_PROFILED_SNR:
-            low, high, is_open = rows.interval(best, j, quantity, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+            low, high, is_open = block.interval(best, j, quantity, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
         ends = np.array([low, high])
         if quantity.column != PEAK:
             ends = np.exp(ends if quantity.factor is None else ends + area)

@@ -12,7 +12,7 @@ from scipy import interpolate, optimize, stats
 
 from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
 from mauvecl.detection.nuisances import Nuisances
-from mauvecl.flares import HALF_WIDTHS_S as BANK_S
+from mauvecl.flares import HALF_WIDTHS_S
 from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
 from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
 from mauvecl.host.arrays import Float, set_read_only
@@ -21,11 +21,12 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S, Duration, DurationExponent, DurationScatter, Energy, NotNegative, Positive
 from mauvecl.search.false_alarms import TemplateGrid
-from mauvecl.search.templates import Bank, white_bank
+from mauvecl.search.search import Bank, white_bank
 
 #: Energies per decade of the closed form, and its numbers of half-widths and peak times.
 PER_DECADE, WIDTHS, PEAKS = 20, 40, 24
-HALF_WIDTHS_S = (2.0, 20_000.0)
+#: Range of its half-widths, s.
+WIDTH_RANGE_S = (2.0, 20_000.0)
 #: Range of thresholds, sigma.
 THRESHOLDS = (2.0, 20.0)
 
@@ -123,7 +124,7 @@ class Completeness:
         """
         if scale.kind != "bolometric":
             raise InputError.of("kind", scale.kind, "bolometric")
-        law, bank = law or DurationLaw(), bank or white_bank(BANK_S, shape_of("davenport2014"), 5.0)
+        law, bank = law or DurationLaw(), bank or white_bank(HALF_WIDTHS_S, shape_of("davenport2014"), 5.0)
         threshold = search_threshold(false_alarms_per_day, bank)
         widths, gain = _gains(bank.shape, window_s, bank.frame_s)
         # From undetectable energies to those that are always detected.
@@ -210,7 +211,7 @@ def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]
     edges = np.arange(n + 1) * frame_s
     line = np.stack([np.ones(n), np.linspace(-1, 1, n)])
     line /= np.linalg.norm(line, axis=1)[:, None]
-    widths = np.geomspace(*HALF_WIDTHS_S, WIDTHS)
+    widths = np.geomspace(*WIDTH_RANGE_S, WIDTHS)
     # Peaks have irregular phases within frames, which averages over the phase of short flares.
     peaks = (np.arange(PEAKS) + 0.5) / PEAKS * n * frame_s + frame_s * ((np.arange(PEAKS) * 0.618034) % 1.0 - 0.5)
     gain = np.empty((WIDTHS, PEAKS))
@@ -364,7 +365,12 @@ class FittedPowerLaw:
 
 @validated
 def fit_power_law(
-    energy_erg: Float, completeness: Completeness, days: Positive, *, error_dex: float = 0.0, bias_dex: float = 0.0
+    energy_erg: Float,
+    completeness: Completeness,
+    days: Positive,
+    *,
+    error_dex: NotNegative = 0.0,
+    bias_dex: float = 0.0,
 ) -> FittedPowerLaw:
     """Estimate exponent and rate of flares from recovered energies by maximum likelihood.
 
@@ -381,10 +387,18 @@ def fit_power_law(
         Observed time.
     error_dex, bias_dex : float
         Standard deviation and mean of the normal error of the logarithm of a recovered energy.
+
+    Raises
+    ------
+    InputError
+        For fewer than 3 flares, energies that are not above 0, or a completeness that is zero at all energies.
     """
-    logs = np.log10(np.asarray(energy_erg, np.float64))
-    if logs.size < 3 or not np.isfinite(logs).all():
-        raise InputError(f"energy_erg has {logs.size} flares, but needs at least 3, all above 0", key="energy_erg")
+    energy = np.asarray(energy_erg, np.float64)
+    if energy.size < 3 or not (np.isfinite(energy) & (energy > 0)).all():
+        raise InputError(f"energy_erg has {energy.size} flares, but needs at least 3, all above 0", key="energy_erg")
+    if not completeness.probability.any():
+        raise InputError("the completeness must be above 0 at some energy, as flares are recovered", key="completeness")
+    logs = np.log10(energy)
     pivot = float(np.median(logs))
     x = np.linspace(*completeness.decades, GRID)
     step = float(x[1] - x[0])

@@ -44,8 +44,8 @@ from mauvecl.flares.stare import select_frames
 from mauvecl.host.arrays import Bool, Float
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import DAY_S
-from mauvecl.search.search import Search, Survey
-from mauvecl.search.templates import Bank
+from mauvecl.search.search import Bank, Search
+from mauvecl.search.survey import Survey
 
 #: Smallest number of alarms for a counted threshold.
 MIN_ALARMS = 10
@@ -117,18 +117,18 @@ class TemplateGrid:
         for k, (template, filters) in enumerate(zip(bank.templates, rows, strict=True)):
             # The phases within a frame are followed by those of the next onset.
             onsets = np.concatenate([np.roll(filters, n * template.stride, axis=1) for n in (-1, 0, 1)])
-            for p, this in enumerate(filters, len(filters)):
+            for p, vector in enumerate(filters, len(filters)):
                 per_frame.append(1 / template.stride)
-                onset.append(_neighbour_correlations(this, [onsets[p - 1], onsets[p + 1]]))
+                onset.append(_neighbour_correlations(vector, [onsets[p - 1], onsets[p + 1]]))
                 aligned = []
                 for neighbours in _next_to(rows, k):
                     # The filter, of the neighbours at any shift, that has the largest correlation with this one.
-                    products = np.array([scipy.signal.correlate(this, row, method="fft") for row in neighbours])
+                    products = np.array([scipy.signal.correlate(vector, row, method="fft") for row in neighbours])
                     best_row, shift = np.unravel_index(int(np.argmax(products)), products.shape)
-                    aligned.append(np.roll(neighbours[best_row], int(shift) - this.size + 1))
-                width.append(_neighbour_correlations(this, aligned))
+                    aligned.append(np.roll(neighbours[best_row], int(shift) - vector.size + 1))
+                width.append(_neighbour_correlations(vector, aligned))
         directions = list(bank.directions)
-        temperature = [_neighbour_correlations(this, _next_to(directions, k)) for k, this in enumerate(directions)]
+        temperature = [_neighbour_correlations(vector, _next_to(directions, k)) for k, vector in enumerate(directions)]
         return cls(bank.frame_s, *map(np.array, (per_frame, onset, width, temperature)))
 
     def false_alarms_per_second(self, threshold: float) -> float:
@@ -149,10 +149,10 @@ def _next_to(values: list[Float], k: int) -> list[Float]:
     return values[max(k - 1, 0) : k] + values[k + 1 : k + 2]
 
 
-def _neighbour_correlations(this: Float, neighbours: list[Float]) -> tuple[float, float, float]:
-    """Return the correlations with two neighbours and between them; without one, those with the opposite of `this`."""
-    before, after = [*neighbours, -this, -this][:2]
-    return float(this @ before), float(this @ after), float(before @ after)
+def _neighbour_correlations(vector: Float, neighbours: list[Float]) -> tuple[float, float, float]:
+    """Return the correlations with two neighbours and between them; without one, those with its opposite."""
+    before, after = [*neighbours, -vector, -vector][:2]
+    return float(vector @ before), float(vector @ after), float(before @ after)
 
 
 def _below(z: Float, correlations: Float) -> Float:
@@ -207,6 +207,7 @@ class SampledRate:
 
     @property
     def _trusted(self) -> NDArray[np.bool_]:
+        """True for thresholds that few enough stares exceed, shape (n,)."""
         return np.asarray(self.probability <= MAX_PROBABILITY)
 
     @property
@@ -262,8 +263,6 @@ class SampledRate:
 
         Raises InputError if it is outside the sampled range, or if trends cause more alarms at all sampled thresholds.
         """
-        from scipy.optimize import brentq
-
         most = float(self.probability[-1])
         if self.shifted and most >= -np.expm1(-rate * self.days):
             least = -np.log1p(-min(most, 1 - 1e-16)) / self.days
@@ -283,13 +282,13 @@ class SampledRate:
                 f"of {self.days:.3g} star-days, not {rate:g}",
                 key="false_alarms",
             )
-        value = float(brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))
+        value = float(scipy.optimize.brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))
         # The rate falls by about a factor exp(-u) per unit of u.
         reach = CONFIDENCE_SD * self.log_rate(value)[1] / value
         return Interval(value, value - reach, value + reach)
 
 
-def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate:
+def normal_noise_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate:
     """Estimate the false-alarm rate of a search in normal noise of the assumed variance.
 
     The stare should not exceed a few days, since every draw evaluates all templates.
@@ -376,7 +375,7 @@ def sampled_rate(survey: Survey, seed: int) -> SampledRate:
     part, n = survey, int(SAMPLED_DAYS * DAY_S / survey.stare.frame_s)
     if survey.stare.n_frames > n:
         part = replace(survey, stare=select_frames(survey.stare, slice(0, n)))
-    return sample_rate(part.search, seed=seed).under(*draw_shifts(survey, seed, part))
+    return normal_noise_rate(part.search, seed=seed).under(*draw_shifts(survey, seed, part))
 
 
 def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, Float, Float]:
@@ -410,7 +409,7 @@ def draw_shifts(survey: Survey, seed: int, part: Survey) -> tuple[Float, Float, 
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
-    """Return binned means of templates' values, and the share of templates in each bin for each draw."""
+    """Return binned means of templates' values, (n_shift,), and the share of templates in each, (n_draw, n_shift)."""
     bins = np.arange(-MAX_SHIFT, MAX_SHIFT + SHIFT_STEP, SHIFT_STEP)
     shares = np.zeros((len(amplitudes), bins.size))
     weights = TemplateGrid.from_bank(survey.bank).peak_probabilities(WEIGHTING_THRESHOLD)

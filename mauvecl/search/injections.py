@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +29,8 @@ from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import Processes
 from mauvecl.schema.columns import Column
-from mauvecl.search.flare_fits import WIDTH, FittedFlares, SummedStare
-from mauvecl.search.search import Search, SearchedFrames, Survey
-from mauvecl.search.templates import Bank
+from mauvecl.search.search import Bank, Search
+from mauvecl.search.survey import WIDTH, FittedFlares, SearchedFrames, SummedStare, Survey
 
 #: Quantities of each fit: ratios of fitted to injected values, the peak offset in half-widths, and whether the
 #: equivalent duration is within its standard error.
@@ -114,22 +113,22 @@ class InjectionSite:
 
 def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[InjectionSite, ...]:
     """Return the sites of flares of several half-widths that peak at one time."""
-    bank, reaches = survey.bank, [_reach(survey.bank, width, peak_s) for width in widths_s]
+    bank, ranges = survey.bank, [_template_range(survey.bank, width, peak_s) for width in widths_s]
     search, first = survey.search, 0
     if survey.stare.n_frames > WHOLE:
         # Only the frames that templates cover are searched; those of the widest flare reach farthest.
-        widest, earliest, latest = reaches[int(np.argmax(widths_s))]
-        lead, tail = (frames * bank.frame_s for frames in bank.window(widest[-1]))
-        limits = earliest - lead, latest + tail + bank.frame_s
+        farthest = ranges[int(np.argmax(widths_s))]
+        lead, tail = (frames * bank.frame_s for frames in bank.window(farthest.half_widths_s[-1]))
+        limits = farthest.first_peak_s - lead, farthest.last_peak_s + tail + bank.frame_s
         first, last = np.searchsorted(survey.stare.start_s, limits).tolist()
-        tried = tuple(sorted({width for near, _, _ in reaches for width in near}))
+        tried = tuple(sorted({width for tried_range in ranges for width in tried_range.half_widths_s}))
         search = survey.frames.part(slice(first, last)).search(replace(bank, half_widths_s=tried))
     stare = search.stare
     edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
-    near = _near_templates(search, reaches, means, bank.directions @ survey.response)
+    detecting = _detecting_templates(search, ranges, means, bank.directions @ survey.response)
     # Flares of several half-widths share templates.
-    places, index = np.unique(np.concatenate([numbers for numbers, _, _ in near]), return_inverse=True)
+    places, index = np.unique(np.concatenate([site_places for site_places, _, _ in detecting]), return_inverse=True)
     numbers, onsets = np.divmod(places, search.n_grid)
     filters = np.empty((places.size, stare.n_frames), np.float32)
     for number in np.unique(numbers):
@@ -137,7 +136,7 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
         filters[in_row] = np.rint(search.in_time(search.grid[number], onsets[in_row]) / STEP) * STEP
     filter_widths_s = np.array([row.template.half_width_s for row in search.grid])[numbers]
     sites = []
-    for width, mean, (site_places, peaks_s, counts) in zip(widths_s, means, near, strict=True):
+    for width, mean, (site_places, peaks_s, counts) in zip(widths_s, means, detecting, strict=True):
         rows, index = np.split(index, [site_places.size])
         site_filters = filters[rows]
         used = np.flatnonzero(site_filters.any(axis=0))
@@ -147,30 +146,38 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float) -> tuple[
     return tuple(sites)
 
 
-def _reach(bank: Bank, width_s: float, peak_s: float) -> tuple[list[float], float, float]:
-    """Return the half-widths of the templates that are tried for a flare, and their earliest and latest peak."""
+class TemplateRange(NamedTuple):
+    """Templates that are tried for a flare."""
+
+    half_widths_s: list[float]  # ascending
+    first_peak_s: float
+    last_peak_s: float
+
+
+def _template_range(bank: Bank, width_s: float, peak_s: float) -> TemplateRange:
+    """Return the templates of a bank that are tried for a flare."""
     near = [w for w in bank.half_widths_s if width_s / WIDEST <= w <= width_s * WIDEST]
     near = near or [min(bank.half_widths_s, key=lambda w: abs(np.log(w / width_s)))]
-    return near, peak_s - (BEFORE * near[-1] + width_s), peak_s + AFTER * max(width_s, near[-1])
+    return TemplateRange(near, peak_s - (BEFORE * near[-1] + width_s), peak_s + AFTER * max(width_s, near[-1]))
 
 
-def _near_templates(
-    search: Search, reaches: Sequence[tuple[list[float], float, float]], means: Float, along: Float
+def _detecting_templates(
+    search: Search, ranges: Sequence[TemplateRange], means: Float, along: Float
 ) -> list[tuple[NDArray[np.int64], Float, NDArray[np.bool_]]]:
-    """Return the templates that may detect each flare.
+    """Return the templates that may detect each flare, of those in its range.
 
-    These are their rows in the search times `n_grid` plus their onsets, (n_template,), the times of their peaks, and
-    whether they count as a detection, (n_temperature, n_template). `reaches` and
-    `means` are those of the flares, and `along` is their light along the bank's directions.
+    These are their rows in the search times `n_grid` plus their onsets, (n_template,), the times of their peaks, s,
+    likewise, and whether they count as a detection, (n_temperature, n_template). `means` are the flares' shapes in the
+    frames, (n_flare, n_frame), and `along` is their light along the bank's directions, (n_temperature,).
     """
-    responding: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in reaches]
+    responding: list[list[tuple[NDArray[np.int64], Float, Float]]] = [[] for _ in ranges]
     # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         peaks = search.peaks_s(row)
-        for templates, (near, earliest, latest), value in zip(responding, reaches, correlated[:, 0], strict=True):
-            if row.template.half_width_s in near:
+        for templates, tried, value in zip(responding, ranges, correlated[:, 0], strict=True):
+            if row.template.half_width_s in tried.half_widths_s:
                 values = along[:, None] * value
-                inside = (peaks >= earliest) & (peaks <= latest) & (row.per_amplitude > 0)
+                inside = (peaks >= tried.first_peak_s) & (peaks <= tried.last_peak_s) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside & (values.max(axis=0) > 0))
                 templates.append((number * search.n_grid + onsets, peaks[onsets], values[:, onsets]))
     detecting = []
@@ -335,6 +342,7 @@ class CriticalAmplitudes:
         )
 
     def _critical(self, site: InjectionSite, values: tuple[Single, Single, Single]) -> Single:
+        """Return the smallest detected amplitude in each draw, (n_draw,), from a, b and c of the module's formula."""
         a, b, c = values
         missing = np.float32(self.threshold) - a
         # Root of b x^2 + c x = missing in its numerically stable form; zero if there is an alarm without the flare.

@@ -1,4 +1,8 @@
-"""Search of stares for flares with matched filters, exact over gaps, and the survey of a star.
+"""Search of stares for flares with a bank of matched filters, exact over gaps.
+
+Weights in wavelength reduce a frame to a few sums for flares of any temperature. The optimal weights for a flare with
+spectrum d are C^-1 d, where C is the covariance of a frame including nuisance parameters (METHODS section 7). Spectra
+of flares of 6000-30 000 K are similar, so that two or three singular vectors of the whitened spectra are enough.
 
 For sums y of a frame with unit covariance, a template s in time and c in the sums, and a baseline G a with unknown
 amplitudes a in the window, the statistic is that of generalised least squares,
@@ -8,32 +12,219 @@ amplitudes a in the window, the statistic is that of generalised least squares,
 with m the inverse variance of a frame, zero in gaps. Without a flare it is normal with unit variance; with a flare, its
 mean is the S/N. All sums over time are correlations, computed by FFT. (Matched filters: Turin 1960, doi
 10.1109/TIT.1960.1057571.)
-
-What unknowns do to the sums beyond first order, such as the bend of the dark current by a drifting temperature, is
-fitted to the whole stare and subtracted (docs/completeness.md, "Beyond first order"): by the Gauss-Newton method on
-means over half a minute, with the distribution of the unknowns as prior, and less weight for means with flares (Huber
-1964, doi 10.1214/aoms/1177703732).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, ClassVar
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.fits.flare_model import MeanSums
-from mauvecl.flares.frames import STEADY, Components
-from mauvecl.flares.stare import Stare, select_frames
-from mauvecl.flares.stare_scene import StaresRequest, method_for
-from mauvecl.host.arrays import Float
-from mauvecl.noise.unknowns import NONE, Changing, Processes
+from mauvecl.detection.nuisances import Nuisances
+from mauvecl.fits.flare_model import spanning_weights
+from mauvecl.flares import RANK, WINDOW_S
+from mauvecl.host.arrays import Float, set_read_only
+from mauvecl.noise.unknowns import CHANGED_PART
 from mauvecl.schema.errors import InputError
-from mauvecl.search.templates import LEAST_SHARE, Bank, Template, Templates
+
+if TYPE_CHECKING:
+    from mauvecl.flares.shapes import Shape
+    from mauvecl.flares.stare import Stare
+    from mauvecl.host.exposure.expectation import Expectation
+
+
+#: Shortest window before and after a peak, in half-widths of the template.
+LEAD, TAIL = 5.0, 10.0
+#: Half-widths before and after a peak beyond which the light of a flare is neglected.
+REACH = (5.0, 80.0)
+#: Smallest number of onsets per half-width.
+ONSETS = 10
+#: Half-width in frames below which two onsets per frame are searched.
+SUB_FRAME = 6.0
+#: Smallest share of a template's power outside gaps for which it is searched.
+LEAST_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Baseline under a flare: the terms that are marginalised over in each window."""
+
+    offset: bool = True
+    slope: bool = True
+    cycle: bool = False  #: curves of unknown amplitude, such as the orbital thermal cycle
+    window_s: float = WINDOW_S  #: of the smallest window; windows hold 5 half-widths before the peak and 10 after
+
+    @property
+    def powers(self) -> tuple[int, ...]:
+        """Powers of time in the baseline."""
+        return (*((0,) if self.offset else ()), *((1,) if self.slope else ()))
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """Flare shapes of one half-width on a grid of frames."""
+
+    half_width_s: float
+    first: int  # first frame of the window relative to the frame of the peak
+    phases: tuple[float, ...]  # positions of the peak within its frame, in frames
+    shapes: Float  # mean flux per frame for a peak of 1, shape (n_phase, n)
+    stride: int  # frames between onsets
+
+    @cached_property
+    def time(self) -> Float:
+        """Time of each frame of the window, from -1 to 1 about its middle, shape (n,)."""
+        n = self.shapes.shape[1]
+        return np.asarray((np.arange(n) - (n - 1) / 2) / max((n - 1) / 2, 1.0))
+
+    def detrended(self, phase: int, powers: tuple[int, ...]) -> Float:
+        """Return a shape less its projection on powers of time, shape (n,)."""
+        columns = np.array([self.time**power for power in powers]).reshape(len(powers), self.time.size).T
+        level, *_ = np.linalg.lstsq(columns, self.shapes[phase])
+        return np.asarray(self.shapes[phase] - columns @ level)
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """Template bank of a search."""
+
+    half_widths_s: tuple[float, ...]  #: ascending
+    #: Unit vectors of the change of a frame's sums for each temperature: rows of `Templates.directions`, or one row of
+    #: ones for a single light curve; shape (n_temperature, n_sum).
+    directions: Float
+    shape: Shape
+    frame_s: float
+    baseline: Baseline = Baseline()
+
+    def __post_init__(self) -> None:
+        directions = np.atleast_2d(np.array(self.directions, np.float64))
+        length = np.linalg.norm(directions, axis=1, keepdims=True)
+        if not (length > 0).all():
+            raise InputError("every direction of the bank must change a sum of a frame", key="directions")
+        set_read_only(self, directions=directions / length)
+
+    @cached_property
+    def templates(self) -> tuple[Template, ...]:
+        """Templates of all half-widths, with two phases of narrow ones and one of others."""
+        templates = []
+        for width in self.half_widths_s:
+            frames, (lead, tail) = width / self.frame_s, self.window(width)
+            phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
+            edges = np.arange(-lead, tail + 2) * self.frame_s
+            shapes = np.array([self.shape.mean_over(edges, p * self.frame_s, width) for p in phases])
+            templates.append(Template(width, -lead, phases, shapes, max(1, int(frames / ONSETS))))
+        return tuple(templates)
+
+    def window(self, half_width_s: float) -> tuple[int, int]:
+        """Return the number of frames of the window before and after the peak."""
+        half = self.baseline.window_s / 2
+        lead, tail = (max(reach * half_width_s, half) / self.frame_s for reach in (LEAD, TAIL))
+        return int(np.ceil(lead)), int(np.ceil(tail))
+
+
+@lru_cache(maxsize=8)
+def white_bank(half_widths_s: tuple[float, ...], shape: Shape, frame_s: float, baseline: Baseline = Baseline()) -> Bank:
+    """Return the bank of a single light curve with white noise; the same one for the same arguments."""
+    return Bank(half_widths_s, np.ones((1, 1)), shape, frame_s, baseline)
+
+
+#: Default temperatures of templates, K, in steps of a factor of 1.034.
+TEMPERATURES_K = tuple(float(t) for t in np.geomspace(6_000.0, 30_000.0, 49).round(-1))
+#: Angle between neighbouring directions of a bank in the space of whitened sums. A flare halfway between them loses
+#: 1 - cos(ANGLE / 2) = 0.3 % of its S/N.
+ANGLE = 0.15
+#: Smallest singular value relative to the largest; smaller ones are rounding errors.
+MIN_SINGULAR = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Templates:
+    """Weights of a frame's sums, and the effect of flares of unit amplitude on these sums."""
+
+    temperatures_k: tuple[float, ...]  #: ascending
+    #: Per DN; sums of a quiescent frame have unit covariance, including nuisance parameters; shape (n_sum, n_pixel).
+    weights: Float
+    directions: Float  #: mean sums, shape (n_temperature, n_sum)
+    best: Float  #: S/N in a frame with optimal weights: the norm of `directions` without loss, shape (n_temperature,)
+    noise: Float  #: covariance that photon noise of the flare adds to the sums, shape (n_temperature, n_sum, n_sum)
+
+    @classmethod
+    def of(
+        cls,
+        variance: Float,
+        flares: Float,
+        photon_variance: Float,
+        temperatures_k: Sequence[float],
+        *,
+        nuisances: Nuisances | None = None,
+        rank: int = RANK,
+    ) -> Self:
+        """Compute weights from the noise of a quiescent frame and flare spectra, all in one unit.
+
+        `variance` and `flares`, (n_temperature, n_pixel), are zero in unused pixels; `photon_variance` is the
+        rise of the variance with the flux. Flares have unit amplitude and ascending temperatures, in steps small enough
+        for `chosen`. `nuisances` are independent in each frame, such as jitter; `rank` is the largest number of sums.
+        """
+        rows = nuisances.rows(variance, nuisances.spectra * (variance > 0)) if nuisances else None
+        plain = np.divide(flares, variance, out=np.zeros_like(flares), where=variance > 0)
+        weights, length = spanning_weights(flares, plain, nuisances, rows, MIN_SINGULAR**2)
+        weights = weights[::-1][:rank]
+        # Signs are arbitrary; choose them so that the hottest flare increases each sum.
+        weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
+        photons = flares * photon_variance
+        noise = np.einsum("kp,lp,tp->tkl", weights, weights, photons, optimize=True)
+        return cls(tuple(temperatures_k), weights, flares @ weights.T, length, noise)
+
+    def mixed(self, matrix: Float) -> Self:
+        """Return the templates of linear combinations of the sums, with `matrix` of shape (n_sum, n_sum)."""
+        return replace(
+            self,
+            weights=matrix @ self.weights,
+            directions=self.directions @ matrix.T,
+            noise=np.einsum("kl,tlm,nm->tkn", matrix, self.noise, matrix),
+        )
+
+    @cached_property
+    def chosen(self) -> tuple[int, ...]:
+        """Rows of `directions` for a bank, spaced by at most about `ANGLE`."""
+        unit = self.directions / np.linalg.norm(self.directions, axis=1, keepdims=True)
+        steps = np.arccos(np.clip(np.sum(unit[1:] * unit[:-1], axis=1), -1.0, 1.0))
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        # The outermost directions may be half a step from the ends.
+        n = max(1, int(np.ceil(along[-1] / ANGLE)))
+        angles = (np.arange(n) + 0.5) / n * along[-1]
+        return tuple(dict.fromkeys(int(np.argmin(np.abs(along - angle))) for angle in angles))
+
+    @property
+    def coloured(self) -> bool:
+        """True if the sums of a flare depend on its temperature by more than a factor."""
+        return len(self.temperatures_k) > 1 and self.directions.shape[1] > 1
+
+    @property
+    def loss(self) -> Float:
+        """Share of the S/N that is lost by reducing frames to sums, shape (n_temperature,)."""
+        return np.asarray(1.0 - np.linalg.norm(self.directions, axis=1) / self.best)
+
+    def nearest(self, kelvin: float) -> int:
+        """Return the row of the temperature that is nearest to another one."""
+        return int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))
+
+
+def frame_nuisances(quiet: Expectation, stare: Stare, more: Mapping[str, float] | None = None) -> Nuisances | None:
+    """Return the nuisance parameters of each frame: the stare's jitters, and `more`.
+
+    Standard deviations by name in `more` replace jitters of the same kind; an infinite one is projected out.
+    """
+    jitters: dict[str, float] = {CHANGED_PART[of]: sd for of, sd in stare.jitters.items() if sd > 0}
+    # Drifts and re-acquisitions change all light alike, by any amount and at any time.
+    drifting = {} if stare.pointing is None else {"light": np.inf}
+    spreads = jitters | drifting | dict(more or {}) | drifting
+    return Nuisances.of(quiet, spreads) if spreads else None
+
 
 #: Approximate number of values in an array of a batch of stares.
 BATCH = 2**21
@@ -68,11 +259,12 @@ class Search:
                 "curves and level.cycle must be given both or not at all, but only one is given", key="curves"
             )
         self.bank, self.stare = bank, stare
+        # The grid has every frame from the first to the last, those in gaps included, with a weight of zero.
         self._first = int(stare.numbers[0])
-        self._at = stare.numbers - self._first
-        self.n_grid = int(self._at[-1]) + 1
+        self._places = stare.numbers - self._first
+        self.n_grid = int(self._places[-1]) + 1
         self._weight = np.zeros(self.n_grid)
-        self._weight[self._at] = 1.0 if variance is None else 1.0 / variance
+        self._weight[self._places] = 1.0 if variance is None else 1.0 / variance
         series = [np.ones(stare.n_frames)]
         for curve in np.zeros((0, stare.n_frames)) if curves is None else curves:
             scale = float(np.std(curve))
@@ -82,7 +274,7 @@ class Search:
         # Terms of the baseline: a power of time in the window, and the index of a series in the stare.
         self._terms = [(power, 0) for power in bank.baseline.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
         self._series = np.zeros((len(series), self.n_grid))
-        self._series[:, self._at] = series
+        self._series[:, self._places] = series
         # Only the part of a long template within a stare's length of the onset overlaps data.
         reach = min(max(t.shapes.shape[1] for t in bank.templates), self.n_grid)
         self._size = int(scipy.fft.next_fast_len(self.n_grid + reach, real=True))
@@ -151,8 +343,8 @@ class Search:
         templates = np.zeros((onsets.size, self.stare.n_frames))
         if not onsets.size:
             return templates
-        reached = slice(*np.searchsorted(self._at, [first.min(), first.max() + size]))
-        grid = self._at[reached]
+        reached = slice(*np.searchsorted(self._places, [first.min(), first.max() + size]))
+        grid = self._places[reached]
         at = grid - first[:, None]
         inside = (at >= 0) & (at < size)
         at = np.where(inside, at, 0)
@@ -171,7 +363,7 @@ class Search:
     @property
     def variance(self) -> Float:
         """Variance of each frame's sums, shape (n_frame,)."""
-        return np.asarray(1.0 / self._weight[self._at])
+        return np.asarray(1.0 / self._weight[self._places])
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
@@ -180,14 +372,14 @@ class Search:
         if self._terms:
             # The baseline fitted to the whole stare does not change rho, and without it rho is more precise.
             levelled = levelled - (levelled @ self._level_span) @ self._level_span.T
-        weighted[:, :, self._at] = levelled * self._weight[self._at]
+        weighted[:, :, self._places] = levelled * self._weight[self._places]
         return [scipy.fft.rfft(weighted * series.astype(sums.dtype), self._size) for series in self._series]
 
     @cached_property
     def _level_span(self) -> Float:
         """Orthonormal columns that span all baselines of the stare, (n_frame, n)."""
-        time = (self._at - self._at.mean()) / max(self.n_grid, 1)
-        columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
+        time = (self._places - self._places.mean()) / max(self.n_grid, 1)
+        columns = np.array([time**power * self._series[series][self._places] for power, series in self._terms])
         return np.asarray(scipy.linalg.orth(columns.T, rcond=1e-12))
 
     def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
@@ -230,7 +422,8 @@ class Search:
             power = over(0, 0, shape**2) - 2 * np.sum(solved * shared, axis=1)
             power += np.einsum("ni,nij,nj->n", solved, gram, solved)
             without_gaps = template.detrended(phase, self.bank.baseline.powers)
-            tried = power >= LEAST_SHARE * float(without_gaps @ without_gaps) * float(np.median(self._weight[self._at]))
+            least = LEAST_SHARE * float(without_gaps @ without_gaps)
+            tried = power >= least * float(np.median(self._weight[self._places]))
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, power, 0.0)), solved.T)
 
 
@@ -245,232 +438,3 @@ def largest_values(
         for _, rho in values(sums[part]):
             best[part] = np.maximum(best[part], rho.max(axis=(1, 2)))
     return best
-
-
-#: Averaging time of the fit, s; the curvature within it is neglected.
-BLOCK_S = 30.0
-#: Residual in standard deviations above which a mean has less weight.
-HUBER = 3.0
-#: Number of Gauss-Newton steps, and difference of amplitudes from which derivatives follow.
-STEPS, DIFFERENCE = 6, 1e-6
-#: Standard deviations of an unknown at which its effect is evaluated, and smallest significant S/N of the effect.
-REACH, LEAST = 4.0, 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Trend:
-    """Effect of a stare's unknowns on the sums of its frames."""
-
-    of: tuple[Changing, ...]  # quantity that each unknown changes
-    curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
-    means: Float  # means of the components in `STEADY`, shape (4, n_frame, n_sum)
-    slope_per_c: float  # relative change of the dark current per deg C
-
-    @cached_property
-    def extremes(self) -> Float:
-        """Amplitudes of `REACH` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
-        rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
-        return np.asarray(REACH * np.vstack([rows, -rows]))
-
-    def factors(self, amplitudes: Float) -> Float:
-        """Return the factors on the components in `STEADY`, shape (4, n_stare, n_frame).
-
-        Amplitudes of unknowns are in standard deviations, (n_stare, n_unknown).
-        """
-        of, names = np.array(self.of), ("star", "sky", "light", "temperature")
-        star, sky, light, warmer = (amplitudes[:, of == name] @ self.curves[of == name] for name in names)
-        light = 1 + light
-        return np.stack([light * (1 + star), light * (1 + sky), np.exp(self.slope_per_c * warmer), light])
-
-    def effect(self, amplitudes: Float) -> Float:
-        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum), for amplitudes as of `factors`."""
-        return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.means, optimize=True))
-
-    def nonlinear_effect(self, amplitudes: Float) -> Float:
-        """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
-        star, sky, dark, near = self.means.mean(axis=1)
-        slopes = {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
-        linear = np.reshape([slopes[of] for of in self.of], (len(self.of), star.size))
-        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
-        return np.asarray(self.effect(amplitudes) - first)
-
-
-#: Norm of curves of unit norm less their straight lines, below which they are linear combinations of others.
-MIN_CURVE = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class SearchedFrames:
-    """Frames of a stare, and the mean, noise and unknown changes that their search assumes."""
-
-    stare: Stare
-    mean: NDArray[Any]  # of each frame's sums without a flare, shape (n_frame, n_sum)
-    variance: Float  # of each frame's sums, shape (n_frame,)
-    curves: Float  # of unknown amplitude, shape (n_curve, n_frame)
-    trend: Trend | None  # effect of the stare's unknowns if it is significant beyond first order
-
-    def part(self, window: slice) -> SearchedFrames:
-        """Return consecutive frames of these."""
-        stare, trend = select_frames(self.stare, window), self.trend
-        if trend is not None:
-            trend = replace(trend, curves=trend.curves[:, window], means=trend.means[:, window])
-        return SearchedFrames(stare, self.mean[window], self.variance[window], self.curves[:, window], trend)
-
-    def search(self, bank: Bank) -> Search:
-        """Return the search of the frames with a bank."""
-        return Search(bank, self.stare, self.curves, self.variance)
-
-    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
-        """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
-        return np.asarray(self.subtracted(sums - self.mean), np.float32)
-
-    def subtracted(self, sums: NDArray[Any]) -> NDArray[Any]:
-        """Fit the trend, if there is one, to sums less their known mean, and subtract it beyond first order."""
-        if (trend := self.trend) is None:
-            return sums
-        return np.array([stare - trend.nonlinear_effect(self._fitted(trend, stare))[0] for stare in sums.astype(float)])
-
-    def _fitted(self, trend: Trend, sums: Float) -> Float:
-        """Return the most likely amplitudes for the sums of a stare, in standard deviations, shape (1, n_unknown)."""
-        first, weight, means = self._blocks
-        y, n = np.add.reduceat(sums / self.variance[:, None], first) / weight[:, None], len(trend.of)
-        amplitudes, steps = np.zeros((1, n)), DIFFERENCE * np.eye(n + 1, n, -1)
-        for _ in range(STEPS):
-            effect = means.effect(amplitudes + steps)
-            residuals, gradient = y - effect[0], (effect[1:] - effect[0]) / DIFFERENCE
-            size = np.sqrt(np.sum(residuals**2, axis=1) * weight)
-            trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
-            weighted = (gradient * trusted[:, None]).reshape(n, -1)
-            information = weighted @ gradient.reshape(n, -1).T + np.eye(n)
-            amplitudes = amplitudes + np.linalg.solve(information, weighted @ residuals.ravel() - amplitudes[0])
-        return amplitudes
-
-    @cached_property
-    def _blocks(self) -> tuple[NDArray[np.intp], Float, Trend]:
-        """The first frame of each block, its weight, and the trend of the blocks' means."""
-        assert self.trend is not None
-        number = self.stare.numbers // max(1, round(BLOCK_S / self.stare.frame_s))
-        first = np.flatnonzero(np.diff(number, prepend=-1))
-        weight = np.add.reduceat(1.0 / self.variance, first)
-        curves = np.add.reduceat(self.trend.curves / self.variance, first, axis=1) / weight
-        means = np.add.reduceat(self.trend.means / self.variance[:, None], first, axis=1) / weight[:, None]
-        return first, weight, replace(self.trend, curves=curves, means=means)
-
-
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """Stare at a star and its search."""
-
-    components: Components  # with the weights of the templates
-    stare: Stare
-    bank: Bank
-    templates: Templates  # from which bank and components are made
-
-    @cached_property
-    def coefficients(self) -> Float:
-        """Known coefficients of each frame's components without a flare, shape (n_frame, 4 + n_flare)."""
-        return self.components.coefficients(self.stare)
-
-    @cached_property
-    def response(self) -> Float:
-        """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
-        return np.asarray(self.components.component_means[len(STEADY)])
-
-    @cached_property
-    def mean_sums(self) -> MeanSums:
-        """Mean sums of a flare of unit amplitude over log temperature; of the first component if they tell none."""
-        log_k, values = np.log(self.templates.temperatures_k), self.templates.directions
-        if not self.templates.coloured:
-            values = np.tile(self.response, (log_k.size, 1))
-        return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
-
-    @cached_property
-    def response_noise(self) -> Float:
-        """Covariance that the first flare component adds to a frame's sums at unit amplitude, (n_sum, n_sum)."""
-        return np.asarray(self.components.sum_cumulants(2)[1][len(STEADY)])
-
-    def photon_noise(self, log_k: float) -> Float:
-        """Return the covariance of a frame's sums that a flare of unit amplitude adds, (n_sum, n_sum)."""
-        if self.templates.coloured:
-            return np.asarray(self.templates.noise[self.templates.nearest(float(np.exp(log_k)))])
-        return self.response_noise
-
-    @property
-    def unit_snr(self) -> float:
-        """S/N of one frame for the first flare component at constant unit amplitude and known baseline."""
-        return float(np.linalg.norm(self.response))
-
-    @cached_property
-    def covariance(self) -> Float:
-        """Covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
-        return self.components.jittered_covariance(self.coefficients, self.stare)
-
-    @cached_property
-    def variance(self) -> Float:
-        """Variance of each frame's sums that the search assumes, averaged over sums, shape (n_frame,)."""
-        return np.asarray(np.einsum("tkk->t", self.covariance) / self.covariance.shape[1])
-
-    @cached_property
-    def curves(self) -> Float:
-        """Independent curves of the baseline: the unknowns less straight lines, shape (n_curve, n_frame)."""
-        if not self.bank.baseline.cycle:
-            return np.zeros((0, self.stare.n_frames))
-        of_unit_norm = [unknown.curve / (np.linalg.norm(unknown.curve) or 1.0) for unknown in self.stare.unknowns]
-        rows = np.reshape(of_unit_norm, (len(of_unit_norm), self.stare.n_frames))
-        line = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
-        curves, size, _ = np.linalg.svd((rows - rows @ line @ line.T).T, full_matrices=False)
-        return np.asarray(curves[:, size > MIN_CURVE].T)
-
-    @cached_property
-    def frames(self) -> SearchedFrames:
-        """Frames of the stare, and what the search assumes of them."""
-        mean, trend = self.components.means(self.coefficients), None
-        if self.stare.unknowns:
-            effect = self.unknowns.nonlinear_effect(self.unknowns.extremes)
-            power = np.sum(effect**2 / self.variance[:, None], axis=(1, 2))
-            trend = self.unknowns if (power > LEAST**2).any() else None
-        return SearchedFrames(self.stare, mean, self.variance, self.curves, trend)
-
-    @cached_property
-    def search(self) -> Search:
-        """Search of the stare's frames."""
-        return self.frames.search(self.bank)
-
-    @cached_property
-    def unknowns(self) -> Trend:
-        """Effect of the stare's unknowns."""
-        steady = len(STEADY)
-        means = self.coefficients.T[:steady, :, None] * self.components.component_means[:steady, None]
-        unknowns, slope = self.stare.unknowns, self.components.quiet.conditions["dark_slope_per_c"]
-        curves = np.reshape([unknown.sd * unknown.curve for unknown in unknowns], (len(unknowns), self.stare.n_frames))
-        return Trend(tuple(unknown.of for unknown in unknowns), curves, means, slope)
-
-    def unsubtracted(self, amplitudes: Float) -> Float:
-        """Return the `effect` of unknowns on the sums that is not subtracted before the search."""
-        return self.frames.subtracted(self.unknowns.effect(amplitudes))
-
-    def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
-        """Return the request for the largest values of stares without a flare."""
-        method, largest = method_for(self.components, self.stare, processes), LargestValues(self.bank, self.frames)
-        return StaresRequest(
-            self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class LargestValues:
-    """Reduction of simulated stares to their largest values."""
-
-    adds: ClassVar[bool] = False
-
-    bank: Bank
-    frames: SearchedFrames
-
-    @cached_property
-    def search(self) -> Search:
-        """Search of the frames, made once for all launches."""
-        return self.frames.search(self.bank)
-
-    def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
-        """Return the largest values as ``maximum``, shape (n_stare,)."""
-        return {"maximum": self.search.largest(self.frames.net(values))}

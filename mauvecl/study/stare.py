@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mauvecl.flares.stare import Event, Stare
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.noise.unknowns import Processes
-    from mauvecl.search.templates import Bank, Baseline
+    from mauvecl.search.search import Bank, Baseline
     from mauvecl.study.plan import OrbitQuestion, PlanQuestion
     from mauvecl.study.star import Flare
 
@@ -219,14 +219,14 @@ class SearchChoice(Section):
     def white_bank(self, frame_s: float) -> Bank:
         """Return the template bank of the closed form: one sum per frame and no cycle."""
         from mauvecl.flares.shapes import shape_of
-        from mauvecl.search.templates import Baseline, white_bank
+        from mauvecl.search.search import Baseline, white_bank
 
         level = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
         return white_bank(self.half_widths_s, shape_of(self.shape), frame_s, level)
 
     def level(self, stare: Stare, orbit_s: float) -> Baseline:
         """Return the baseline model for a stare."""
-        from mauvecl.search.templates import Baseline
+        from mauvecl.search.search import Baseline
 
         cycle = self.cycle if self.cycle is not None else any("cosine" in u.name for u in stare.unknowns)
         window = self.window_s if self.window_s is not None else CYCLE_ORBITS * orbit_s if cycle else WINDOW_S

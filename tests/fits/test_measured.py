@@ -143,6 +143,8 @@ def test_intervals_of_an_open_cooling_contain_their_estimates() -> None:
     assert min(ends) < 3010.0
     steady = fit_cooling(recorded(STEADY, Stare.of(150.0)), x, model(), levels=(0.95,), **START)
     assert np.isinf(steady.high[0, 0, steady.column("cooling time")])
+    assert steady.errors[0, steady.column("cooling time")] > 1e4
+    assert np.isnan(fit_cooling(0.0 * raw, x, model(), levels=(), **START).errors).all()
 
 
 def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:

@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.special import erfc
 
-from mauvecl import SHAPES, EnergyScale, Event, Source, Study, TableShape, plan
+from mauvecl import SHAPES, Cooling, EnergyScale, Event, Source, Study, TableShape, plan
 from mauvecl.search import completeness
 
 #: A shape whose height and length follow from its equivalent duration.
@@ -95,6 +95,16 @@ def test_frames_sum_to_the_fluence_and_conserve_light_of_any_flare(shape):
         peak, half = rng.uniform(-2000.0, 8000.0), 10 ** rng.uniform(-2.0, 6.0)
         with np.errstate(all="raise", under="ignore"):
             assert (shape.mean_over(np.arange(1201) * 5.0, peak, half) >= 0).all(), (peak, half)
+
+
+@pytest.mark.parametrize("start", [0.0, -4.0])
+def test_cooling_flare_of_a_table_has_all_of_its_energy_in_any_unit_of_time(start: float) -> None:
+    energies = []
+    for unit_s in (100.0, 0.1):
+        shape = TableShape((TABLE.tau + start) * 100.0 / unit_s, TABLE.values)
+        event = Event(0.0, unit_s, 0.1, Cooling(12_000.0, 6000.0, 150.0), shape)
+        energies.append(event.total_energy(lambda kelvin: EnergyScale("Kepler", "bolometric", kelvin, "any star")))
+    assert energies[1] == pytest.approx(energies[0], rel=1e-5)
 
 
 SUN_CM, NM = 6.957e10, np.linspace(200.0, 1200.0, 40_001)

@@ -116,7 +116,7 @@ def test_largest_value_of_a_day():
 def test_repeated_estimates_scatter_by_their_errors():
     """Compare the scatter of eight seeds with their errors, and with drawn noise; fails by chance once in 10^3 runs."""
     search = Search(Study().search.white_bank(5.0), Stare.of(2500.0))
-    repeats = [false_alarms.sample_rate(search, seed=seed) for seed in range(8)]
+    repeats = [false_alarms.normal_noise_rate(search, seed=seed) for seed in range(8)]
     for u in (4.25, 5.0, 6.5):
         k = list(repeats[0].thresholds).index(u)
         p, error = (np.array([getattr(tail, name)[k] for tail in repeats]) for name in ("probability", "error"))
@@ -135,7 +135,7 @@ def test_repeated_estimates_scatter_by_their_errors():
 def test_rate_of_one_filter_equals_the_closed_form():
     """Compare independent frames with P = 1 - (1 - Q)^n."""
     alone = bank_of([0.02], **KNOWN)
-    tail = false_alarms.sample_rate(Search(alone, Stare.of(500.0)), seed=1, draws=50)
+    tail = false_alarms.normal_noise_rate(Search(alone, Stare.of(500.0)), seed=1, draws=50)
     # Both phases of a template see its one frame: they are the same filter.
     exact = -np.expm1(100 * np.log1p(-special.ndtr(-tail.thresholds)))
     kept = tail.thresholds >= 4.5
@@ -149,7 +149,7 @@ def test_closed_form_of_the_rate_agrees_with_importance_sampling(widths):
     """An upper bound, up to a tenth above, for one alarm a day to one in 10^10 days; fails once in 10^4 runs."""
     directions = ONE if widths is HALF_WIDTHS_S else COLOURS
     bank = bank_of(widths, directions, window_s=900.0)
-    tail = false_alarms.sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
+    tail = false_alarms.normal_noise_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120)
     for asked in (1.0, 1e-2, 1e-4, 1e-7, 1e-10):
         log_rate, error = tail.log_rate(completeness.search_threshold(asked, bank))
         assert -0.1 - 4 * error < log_rate - np.log(asked) < 4 * error

@@ -1,12 +1,16 @@
-"""Fits of overlapping flares in stares.
+"""Survey of a star: what the search of its stare assumes of the frames, and fits of flares to their sums.
 
-Overlapping flares are fitted together by non-linear least squares, with intervals from the profile likelihood. A block
-is the unit of a fit: overlapping flares, over the union of their windows. The baseline is marginalised as in the
-search: a straight line over the window of the widest flare, or a continuous piecewise line in longer blocks. Flux of
-flares outside the block is subtracted. The noise of a frame includes the photon noise of the flares. Standard errors
-are from the inverse of the information.
+*Beyond first order.* What unknowns do to the sums beyond first order, such as the bend of the dark current by a
+drifting temperature, is fitted to the whole stare and subtracted before the search (docs/completeness.md, "Beyond first
+order"): by the Gauss-Newton method on means over half a minute, with the distribution of the unknowns as prior, and
+less weight for means with flares (Huber 1964, doi 10.1214/aoms/1177703732).
 
-Amplitudes near the threshold are biased high, because noise contributes to detection; fits do not correct for that.
+*Fits.* Overlapping flares are fitted together by non-linear least squares, with intervals from the profile likelihood.
+A block is the unit of a fit: overlapping flares, over the union of their windows. The baseline is marginalised as in
+the search: a straight line over the window of the widest flare, or a continuous piecewise line in longer blocks. Flux
+of flares outside the block is subtracted. The noise of a frame includes the photon noise of the flares. Standard errors
+are from the inverse of the information. Amplitudes near the threshold are biased high, because noise contributes to
+detection; fits do not correct for that.
 """
 
 from __future__ import annotations
@@ -14,19 +18,249 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.fits.least_squares import interval_end, least_squares
+from mauvecl.fits.flare_model import MeanSums
+from mauvecl.fits.least_squares import interval_end, least_squares, parameter_covariance
+from mauvecl.flares.frames import STEADY, Components
 from mauvecl.flares.shapes import between, sides
+from mauvecl.flares.stare import Stare, select_frames
+from mauvecl.flares.stare_scene import StaresRequest, method_for
 from mauvecl.host.arrays import Float
-from mauvecl.search.templates import REACH
+from mauvecl.noise.unknowns import NONE, Changing, Processes
+from mauvecl.search.search import REACH, Bank, Search, Templates
 
-if TYPE_CHECKING:
-    from mauvecl.search.search import Survey
+#: Averaging time of the fit, s; the curvature within it is neglected.
+BLOCK_S = 30.0
+#: Residual in standard deviations above which a mean has less weight.
+HUBER = 3.0
+#: Number of Gauss-Newton steps, and difference of amplitudes from which derivatives follow.
+STEPS, DIFFERENCE = 6, 1e-6
+#: Standard deviations of an unknown at which its effect is evaluated, and smallest significant S/N of the effect.
+FARTHEST, LEAST_SNR = 4.0, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Effect of a stare's unknowns on the sums of its frames."""
+
+    of: tuple[Changing, ...]  # quantity that each unknown changes
+    curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
+    means: Float  # means of the components in `STEADY`, shape (4, n_frame, n_sum)
+    slope_per_c: float  # relative change of the dark current per deg C
+
+    @cached_property
+    def extremes(self) -> Float:
+        """Amplitudes of `FARTHEST` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
+        rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
+        return np.asarray(FARTHEST * np.vstack([rows, -rows]))
+
+    def factors(self, amplitudes: Float) -> Float:
+        """Return the factors on the components in `STEADY`, shape (4, n_stare, n_frame).
+
+        Amplitudes of unknowns are in standard deviations, (n_stare, n_unknown).
+        """
+        of, names = np.array(self.of), ("star", "sky", "light", "temperature")
+        star, sky, light, warmer = (amplitudes[:, of == name] @ self.curves[of == name] for name in names)
+        light = 1 + light
+        return np.stack([light * (1 + star), light * (1 + sky), np.exp(self.slope_per_c * warmer), light])
+
+    def effect(self, amplitudes: Float) -> Float:
+        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum), for amplitudes as of `factors`."""
+        return np.asarray(np.einsum("cnt,ctk->ntk", self.factors(amplitudes) - 1, self.means, optimize=True))
+
+    def nonlinear_effect(self, amplitudes: Float) -> Float:
+        """Return the `effect` of unknowns less its linear part, (n_stare, n_frame, n_sum)."""
+        star, sky, dark, neighbours = self.means.mean(axis=1)
+        slopes = {"star": star, "light": star + sky + neighbours, "sky": sky, "temperature": self.slope_per_c * dark}
+        linear = np.reshape([slopes[of] for of in self.of], (len(self.of), star.size))
+        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
+        return np.asarray(self.effect(amplitudes) - first)
+
+
+#: Norm of curves of unit norm less their straight lines, below which they are linear combinations of others.
+MIN_CURVE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class SearchedFrames:
+    """Frames of a stare, and the mean, noise and unknown changes that their search assumes."""
+
+    stare: Stare
+    mean: NDArray[Any]  # of each frame's sums without a flare, shape (n_frame, n_sum)
+    variance: Float  # of each frame's sums, shape (n_frame,)
+    curves: Float  # of unknown amplitude, shape (n_curve, n_frame)
+    trend: Trend | None  # effect of the stare's unknowns if it is significant beyond first order
+
+    def part(self, window: slice) -> SearchedFrames:
+        """Return consecutive frames of these."""
+        stare, trend = select_frames(self.stare, window), self.trend
+        if trend is not None:
+            trend = replace(trend, curves=trend.curves[:, window], means=trend.means[:, window])
+        return SearchedFrames(stare, self.mean[window], self.variance[window], self.curves[:, window], trend)
+
+    def search(self, bank: Bank) -> Search:
+        """Return the search of the frames with a bank."""
+        return Search(bank, self.stare, self.curves, self.variance)
+
+    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
+        """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
+        return np.asarray(self.subtracted(sums - self.mean), np.float32)
+
+    def subtracted(self, sums: NDArray[Any]) -> NDArray[Any]:
+        """Fit the trend, if there is one, to sums less their known mean, and subtract it beyond first order."""
+        if (trend := self.trend) is None:
+            return sums
+        return np.array([stare - trend.nonlinear_effect(self._fitted(stare))[0] for stare in sums.astype(float)])
+
+    def _fitted(self, sums: Float) -> Float:
+        """Return the most likely amplitudes for the sums of a stare, in standard deviations, shape (1, n_unknown)."""
+        first, weight, means = self._blocks
+        y, n = np.add.reduceat(sums / self.variance[:, None], first) / weight[:, None], len(means.of)
+        amplitudes, steps = np.zeros((1, n)), DIFFERENCE * np.eye(n + 1, n, -1)
+        for _ in range(STEPS):
+            effect = means.effect(amplitudes + steps)
+            residuals, gradient = y - effect[0], (effect[1:] - effect[0]) / DIFFERENCE
+            size = np.sqrt(np.sum(residuals**2, axis=1) * weight)
+            trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
+            weighted = (gradient * trusted[:, None]).reshape(n, -1)
+            information = weighted @ gradient.reshape(n, -1).T + np.eye(n)
+            amplitudes = amplitudes + np.linalg.solve(information, weighted @ residuals.ravel() - amplitudes[0])
+        return amplitudes
+
+    @cached_property
+    def _blocks(self) -> tuple[NDArray[np.intp], Float, Trend]:
+        """The first frame of each block, its weight, and the trend of the blocks' means."""
+        assert self.trend is not None
+        number = self.stare.numbers // max(1, round(BLOCK_S / self.stare.frame_s))
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        weight = np.add.reduceat(1.0 / self.variance, first)
+        curves = np.add.reduceat(self.trend.curves / self.variance, first, axis=1) / weight
+        means = np.add.reduceat(self.trend.means / self.variance[:, None], first, axis=1) / weight[:, None]
+        return first, weight, replace(self.trend, curves=curves, means=means)
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Stare at a star and its search."""
+
+    components: Components  # with the weights of the templates
+    stare: Stare
+    bank: Bank
+    templates: Templates  # from which bank and components are made
+
+    @cached_property
+    def coefficients(self) -> Float:
+        """Known coefficients of each frame's components without a flare, shape (n_frame, 4 + n_flare)."""
+        return self.components.coefficients(self.stare)
+
+    @cached_property
+    def response(self) -> Float:
+        """Mean sums of a frame for the first flare component at unit amplitude, shape (n_sum,)."""
+        return np.asarray(self.components.component_means[len(STEADY)])
+
+    @cached_property
+    def mean_sums(self) -> MeanSums:
+        """Mean sums of a flare of unit amplitude over log temperature; of the first component if they tell none."""
+        log_k, values = np.log(self.templates.temperatures_k), self.templates.directions
+        if not self.templates.coloured:
+            values = np.tile(self.response, (log_k.size, 1))
+        return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
+
+    @cached_property
+    def response_noise(self) -> Float:
+        """Covariance that the first flare component adds to a frame's sums at unit amplitude, (n_sum, n_sum)."""
+        return np.asarray(self.components.sum_cumulants(2)[1][len(STEADY)])
+
+    def photon_noise(self, log_k: float) -> Float:
+        """Return the covariance of a frame's sums that a flare of unit amplitude adds, (n_sum, n_sum)."""
+        if self.templates.coloured:
+            return np.asarray(self.templates.noise[self.templates.nearest(float(np.exp(log_k)))])
+        return self.response_noise
+
+    @property
+    def unit_snr(self) -> float:
+        """S/N of one frame for the first flare component at constant unit amplitude and known baseline."""
+        return float(np.linalg.norm(self.response))
+
+    @cached_property
+    def covariance(self) -> Float:
+        """Covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+        return self.components.jittered_covariance(self.coefficients, self.stare)
+
+    @cached_property
+    def variance(self) -> Float:
+        """Variance of each frame's sums that the search assumes, averaged over sums, shape (n_frame,)."""
+        return np.asarray(np.einsum("tkk->t", self.covariance) / self.covariance.shape[1])
+
+    @cached_property
+    def curves(self) -> Float:
+        """Independent curves of the baseline: the unknowns less straight lines, shape (n_curve, n_frame)."""
+        if not self.bank.baseline.cycle:
+            return np.zeros((0, self.stare.n_frames))
+        of_unit_norm = [unknown.curve / (np.linalg.norm(unknown.curve) or 1.0) for unknown in self.stare.unknowns]
+        rows = np.reshape(of_unit_norm, (len(of_unit_norm), self.stare.n_frames))
+        line = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
+        curves, size, _ = np.linalg.svd((rows - rows @ line @ line.T).T, full_matrices=False)
+        return np.asarray(curves[:, size > MIN_CURVE].T)
+
+    @cached_property
+    def frames(self) -> SearchedFrames:
+        """Frames of the stare, and what the search assumes of them."""
+        mean, trend = self.components.means(self.coefficients), None
+        if self.stare.unknowns:
+            effect = self.unknowns.nonlinear_effect(self.unknowns.extremes)
+            power = np.sum(effect**2 / self.variance[:, None], axis=(1, 2))
+            trend = self.unknowns if (power > LEAST_SNR**2).any() else None
+        return SearchedFrames(self.stare, mean, self.variance, self.curves, trend)
+
+    @cached_property
+    def search(self) -> Search:
+        """Search of the stare's frames."""
+        return self.frames.search(self.bank)
+
+    @cached_property
+    def unknowns(self) -> Trend:
+        """Effect of the stare's unknowns."""
+        steady = len(STEADY)
+        means = self.coefficients.T[:steady, :, None] * self.components.component_means[:steady, None]
+        unknowns, slope = self.stare.unknowns, self.components.quiet.conditions["dark_slope_per_c"]
+        curves = np.reshape([unknown.sd * unknown.curve for unknown in unknowns], (len(unknowns), self.stare.n_frames))
+        return Trend(tuple(unknown.of for unknown in unknowns), curves, means, slope)
+
+    def unsubtracted(self, amplitudes: Float) -> Float:
+        """Return the `effect` of unknowns that is not subtracted before the search, (n_stare, n_frame, n_sum)."""
+        return self.frames.subtracted(self.unknowns.effect(amplitudes))
+
+    def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
+        """Return the request for the largest values of stares without a flare."""
+        method, largest = method_for(self.components, self.stare, processes), LargestValues(self.bank, self.frames)
+        return StaresRequest(
+            self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LargestValues:
+    """Reduction of simulated stares to their largest values."""
+
+    adds: ClassVar[bool] = False
+
+    bank: Bank
+    frames: SearchedFrames
+
+    @cached_property
+    def search(self) -> Search:
+        """Search of the frames, made once for all launches."""
+        return self.frames.search(self.bank)
+
+    def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
+        """Return the largest values as ``maximum``, shape (n_stare,)."""
+        return {"maximum": self.search.largest(self.frames.net(values))}
 
 
 #: Share of the rise of chi-squared that the ends of a closed interval reach.
@@ -126,7 +360,7 @@ class SummedStare:
         return total
 
     def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
-        """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
+        """Yield the flares that contribute to some frames, the affected frames, and their mean amplitudes."""
         first, last, _ = frames.indices(len(self.net))
         shape = self.survey.bank.shape
         peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
@@ -251,11 +485,7 @@ class Block:
 
     def covariance(self, theta: Float) -> Float:
         """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
-        _, rows = self.residuals(theta.ravel())
-        scale = np.linalg.norm(rows, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
-        inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), hermitian=True) / np.outer(scale, scale)
-        return np.asarray(inverse.reshape(theta.shape * 2))
+        return parameter_covariance(self.residuals(theta.ravel())[1]).reshape(theta.shape * 2)
 
     def interval(self, best: BlendFit, j: int, quantity: ProfiledQuantity, rise: float) -> tuple[float, float, bool]:
         """Return the interval of a flare's quantity from the profile likelihood, and whether the fit ends it.
