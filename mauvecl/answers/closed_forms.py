@@ -21,7 +21,7 @@ from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting, Statistic
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, unknown_values_of
-from mauvecl.schema.columns import Column, FirstItems, chance_text, number
+from mauvecl.schema.columns import Column, chance_text, first_items, number
 from mauvecl.schema.errors import InputError, Message
 from mauvecl.study.cases import Case
 from mauvecl.study.observation import KNOWN, NuisanceChoice
@@ -278,6 +278,5 @@ def describe_shares(shares: Mapping[str, float]) -> str:
     """Return the largest shares of a scatter in words, and how many there are."""
     if any(math.isnan(share) for share in shares.values()):
         return "sources that only more draws tell apart"
-    first = FirstItems(shares.items(), MAX_NAMED, "unknowns")
-    note = f" ({first.note})" if first.note else ""
-    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
+    first, note = first_items(shares.items(), MAX_NAMED, "unknowns")
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + (f" ({note})" if note else "")

@@ -16,7 +16,7 @@ from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Chart, Dots, Levels, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, cell_edges, picture_of
 from mauvecl.host.arrays import Bool, Float
-from mauvecl.schema.columns import FirstItems, part_note
+from mauvecl.schema.columns import first_items, part_note
 
 if TYPE_CHECKING:
     from mauvecl.answers.analyse import AnalyseAnswer
@@ -43,13 +43,13 @@ HALF_WIDTH = PlotAxis("half-width (s)", log=True)
 
 def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, below: bool = False) -> Picture:
     """Return a picture with a panel per star, the first ones if there are many."""
-    stars, study = FirstItems(answer.stars, MOST_MAPS, "stars"), answer.study
+    (stars, note), study = first_items(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), figures.MAX_COLUMNS)
     rows = figures.in_rows([panel(star) for star in stars], columns)
     light = "swept temperature" if "flare_temperature" in stars[0].at else study.flare.light().describe()
     title = f"Flares of {light}, {study.search.rate_text}"
-    notes = chart.throughput_of(answer.inputs), stars.note, *notes
-    return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, notes, below)
+    all_notes = chart.throughput_of(answer.inputs), note, *notes
+    return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, all_notes, below)
 
 
 @picture_of("InjectAnswer", "completeness")

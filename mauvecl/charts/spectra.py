@@ -11,7 +11,7 @@ import numpy as np
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of
-from mauvecl.schema.columns import FirstItems, with_error
+from mauvecl.schema.columns import first_items, with_error
 
 if TYPE_CHECKING:
     from mauvecl.answers.calibrate import CalibrateAnswer
@@ -186,8 +186,8 @@ def shown_name(change: str) -> str:
 @picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
 def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
-    titles = FirstItems(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
-    (title,), magnitude, row = titles, answer.changes[0].magnitude, []
+    (title,), note = first_items(dict.fromkeys(row.title for row in answer.changes), 1, "stars")
+    magnitude, row = answer.changes[0].magnitude, []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
         rules = [] if magnitude is None else [Rule("this star", dash="dotted", at=magnitude)]
@@ -199,13 +199,13 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
         y = PlotAxis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
         row.append(Panel(PlotAxis(f"magnitude ({answer.study.star[0].band})"), y, [chart.Targets(at=lines), *rules]))
     title = f"{title}: smallest change between {answer.visits}"
-    return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
+    return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (note,))
 
 
 @picture_of("ChangeAnswer", "periods", when=lambda answer: bool(answer.periods))
 def recovered_periods(answer: ChangeAnswer) -> Picture:
     """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
-    first, row = FirstItems(answer.periods, MOST_CHANGES, "changes"), []
+    (first, note), row = first_items(answer.periods, MOST_CHANGES, "changes"), []
     for row_of_change in first:
         r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
         shares = 100 * row_of_change.shares("value")
@@ -215,7 +215,7 @@ def recovered_periods(answer: ChangeAnswer) -> Picture:
         row.append(Panel(PlotAxis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
     time = first[0].recovery.time_d
     title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
-    return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (first.note,))
+    return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (note,))
 
 
 @picture_of("ChangeAnswer", "indices", when=lambda answer: bool(answer.indices))
@@ -241,7 +241,7 @@ def fits(answer: MeasureAnswer) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     from mauvecl.fits.flare_model import usable_variance
 
-    flares, above, below = FirstItems(answer.flares, MOST_FLARES, "flares"), list[Panel](), list[Panel]()
+    (flares, note), above, below = first_items(answer.flares, MOST_FLARES, "flares"), list[Panel](), list[Panel]()
     for flare in flares:
         quiet, measurement = flare.quiet, flare.found
         mean, unknown = flare.fitted_dn()
@@ -261,14 +261,14 @@ def fits(answer: MeasureAnswer) -> Picture:
         residuals = Dots("", "star", size=4, at=(nm, (data - fit) / noise))
         below.append(Panel(x, PlotAxis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
     size = 3.6 * len(flares), 4.6
-    return Picture([above, below], size, notes=(flares.note,), share_x=True, heights=(2, 1))
+    return Picture([above, below], size, notes=(note,), share_x=True, heights=(2, 1))
 
 
 def _panel_per_flare(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
     """Return a picture with a panel for each of the first flares."""
-    first = FirstItems(flares, MOST_FLARES, "flares")
+    first, note = first_items(flares, MOST_FLARES, "flares")
     row = [panel(flare) for flare in first]
-    return Picture([row], (3.4 * len(first), 3.6), notes=(first.note,), below=True)
+    return Picture([row], (3.4 * len(first), 3.6), notes=(note,), below=True)
 
 
 def _of_single_temperature(answer: MeasureAnswer) -> list[MeasuredFlare]:

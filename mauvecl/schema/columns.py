@@ -156,31 +156,26 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
 def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **meta: object) -> QTable:
     """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`.
 
-    Columns that a table lacks are masked, or NaN if they have a unit.
+    A first column has one value for its table, or one for each of the table's rows. Columns that a table lacks are
+    masked, or NaN if they have a unit.
     """
     import numpy as np
 
-    pairs = list(parts)
-    tables = [table for _, table in pairs]
+    rows, tables = zip(*parts, strict=True)
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-
-    def values(pair: tuple[object, Table], name: str) -> Any:
-        if name not in pair[1].colnames:
-            return None
-        cells = getattr(pair[1][name], "value", pair[1][name])
-        return np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
-
-    def column_of(name: str) -> Column:
-        columns = [table[name] for table in tables if name in table.colnames]
-        (unit,) = {str(column.unit or "") for column in columns}
-        kind = np.result_type(*(column.dtype for column in columns)).type
-        text = columns[0].info.description or ""
-        return Column(name, lambda pair: values(pair, name), unit, text, kind=kind)
-
-    # A first column may have one value for each row of its table, with which it is broadcast.
-    names = dict.fromkeys(name for table in tables for name in table.colnames)
-    columns = [*(column.of(itemgetter(0)) for column in first), *map(column_of, names)]
-    return table_of(columns, pairs, **shared | meta)
+    # The row of a table is kept under the empty name, which no column of a table has.
+    blocks: list[dict[str, Any]] = [{"": row} for row in rows]
+    columns = [column.of(itemgetter("")) for column in first]
+    for name in dict.fromkeys(name for table in tables for name in table.colnames):
+        present = [table[name] if name in table.colnames else None for table in tables]
+        values = [column for column in present if column is not None]
+        (unit,) = {str(column.unit or "") for column in values}
+        kind = np.result_type(*(column.dtype for column in values)).type
+        columns.append(Column(name, "", unit, values[0].info.description or "", kind=kind))
+        for block, column in zip(blocks, present, strict=True):
+            cells = getattr(column, "value", column)
+            block[name] = np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
+    return table_of(columns, blocks, **shared | meta)
 
 
 def records(table: Table) -> list[dict[str, Any]]:
@@ -243,22 +238,15 @@ def with_error(value: float, error: float) -> str:
 T = TypeVar("T")
 
 
-class FirstItems(list[T]):
-    """The first items of a list, with a `note` such as "6 of 9 stars shown" if it has more."""
-
-    def __init__(self, items: Collection[T], most: int, name: str) -> None:
-        super().__init__(islice(items, most))
-        self.note = part_note(len(self), len(items), name)
+def first_items(items: Collection[T], most: int, name: str) -> tuple[list[T], str]:
+    """Return the first items of a collection, with a note such as "6 of 9 stars shown", empty if these are all."""
+    first = list(islice(items, most))
+    return first, part_note(len(first), len(items), name)
 
 
 def part_note(shown: int, total: int, name: str) -> str:
-    """Return the note on a part of a list, as in "6 of 9 stars shown", or nothing for all of it."""
+    """Return the note on a part of a collection, as in "6 of 9 stars shown", or nothing for all of it."""
     return f"{shown} of {total} {name} shown" if shown < total else ""
-
-
-def note_of(items: Iterable[object]) -> str:
-    """Return the note of items that are a part of a list, or nothing."""
-    return items.note if isinstance(items, FirstItems) else ""
 
 
 class Drawable:
