@@ -376,17 +376,17 @@ class AnalyseAnswer(Answer):
     white: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
 
     #: One row per event, in order of time.
-    events = TableOf("events", EVENTS, "rows", key="events", about=lambda answer: {
+    events = TableOf("events", EVENTS, "rows", key="events", meta=lambda answer: {
         **answer_metadata(answer, "study"), **answer.analysis.frames.time_keywords, "star": answer.analysis.frames.name,
         **answer_metadata(answer, "analysis.frames.unit", "analysis.threshold")})  # fmt: skip
     #: One row per frame: flux, level, noise, and why it is not searched.
-    frames = TableOf("frames", FRAMES, "analysis", about=lambda answer: {
+    frames = TableOf("frames", FRAMES, "analysis", meta=lambda answer: {
         "star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit,
         **answer.analysis.frames.time_keywords})  # fmt: skip
     #: One row per event and measured quantity, with intervals.
     measured = TableOf(
         "measured", MEASURED, lambda answer: [row for row in answer.rows if not isinstance(row.measured, str)],
-        when="analysis.spectra", about=(),
+        when="analysis.spectra", meta=(),
         title=lambda answer: "Measured in the summed spectra of each event" if len(answer.measured) else "",
     )  # fmt: skip
     #: One row per event and star in the fibre: the flare of that star which would look like the event.
@@ -398,25 +398,25 @@ class AnalyseAnswer(Answer):
     )  # fmt: skip
     #: One row per half-width and size of injected flares.
     completeness = TableOf("completeness", COMPLETENESS, "analysis", when="_has_level",
-                           about=("analysis.threshold",))  # fmt: skip
+                           meta=("analysis.threshold",))  # fmt: skip
     #: One row per half-width: the smallest flare that the search detects with a probability of 90 %.
-    limits = TableOf("limits", LIMITS, "analysis", key="limits", when="_has_level", about=(),
+    limits = TableOf("limits", LIMITS, "analysis", key="limits", when="_has_level", meta=(),
                      title="Smallest flares that would have been detected, by injecting into these frames")  # fmt: skip
     #: One row per number of frames: scatter of their means.
-    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", about=(),
+    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", meta=(),
                     title="Noise of quiescent frames, less the fitted process")  # fmt: skip
     #: One row per combination of terms that was tried for the quiescent light, with its criterion.
     process = TableOf(
-        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), about=(),
+        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), meta=(),
         title="What was tried for the quiescent light",
     )  # fmt: skip
     #: One row per pixel of spectra: noise as stated and as measured.
     pixels = TableOf("noise-per-pixel", PIXELS, "analysis.spectra.noise", when="analysis.spectra",
-                     about=("analysis.frames.unit",))  # fmt: skip
+                     meta=("analysis.frames.unit",))  # fmt: skip
     #: One row per sudden change of the light that all pixels of spectra share.
     throughput = TableOf("throughput", THROUGHPUT, lambda answer: [
         (answer.analysis.spectra.cleaned.frames, change) for change in answer.analysis.spectra.changes
-    ], when="analysis.spectra", about=())  # fmt: skip
+    ], when="analysis.spectra", meta=())  # fmt: skip
 
     @property
     def _has_level(self) -> bool:

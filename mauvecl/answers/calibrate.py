@@ -129,7 +129,7 @@ class CalibrateAnswer(Answer):
 
     #: One row per value of the instrument.
     values_table = TableOf(
-        "calibrate", COLUMNS, "values", key="rows", about=("dark.reference_c", "transfer.dark_unit", "study"),
+        "calibrate", COLUMNS, "values", key="rows", meta=("dark.reference_c", "transfer.dark_unit", "study"),
         title=lambda answer: f"{answer.nominal.name} fitted to {counted(len(answer.stars), 'observation')} of "
         f"standard stars; dark current at {answer.dark.reference_c:.1f} C",
     )  # fmt: skip
@@ -143,11 +143,11 @@ class CalibrateAnswer(Answer):
         (name, fit) for name, fit in (
             ("throughput", answer.throughput), ("dark current", answer.dark), ("photon transfer", answer.transfer)
         ) if fit.dof > 0
-    ], title="Goodness of fit", key="fits", about=())  # fmt: skip
+    ], title="Goodness of fit", key="fits", meta=())  # fmt: skip
     #: One row per pixel: dark current and bias.
-    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=("dark.reference_c",))
+    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, meta=("dark.reference_c",))
     #: One row per observation and usable pixel: the variance of frames.
-    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, about=())
+    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, meta=())
 
     @property
     def stars(self) -> list[detector.CalibrationFrames]:

@@ -99,25 +99,25 @@ class DetectAnswer(Answer):
 
     #: One row per star, cell, flare and statistic.
     table = TableOf(
-        "detection", _detection_columns, "stars", place=True, key="rows",
-        of=lambda answer, star: _rows_of(star, answer.study.run.fap),
+        "detection", _detection_columns, "stars", by_star=True, key="rows",
+        row_table=lambda answer, star: _rows_of(star, answer.study.run.fap),
     )  # fmt: skip
     #: One row per star, cell and statistic, and per flare for shaped statistics; see `Departure`. The table is empty if
     #: thresholds are not counted.
     departures = TableOf(
-        "departures", DEPARTURE_COLUMNS, "stars", place=True, key="departures",
-        of=lambda answer, star: departure_table(star.detection, star.amplitudes, answer.study.run.fap),
+        "departures", DEPARTURE_COLUMNS, "stars", by_star=True, key="departures",
+        row_table=lambda answer, star: departure_table(star.detection, star.amplitudes, answer.study.run.fap),
     )  # fmt: skip
     #: All receiver operating characteristics with their areas; see `Roc`. Many flares share `MOST_ROWS` rows, so that
     #: each curve has fewer than its 200.
     roc = TableOf(
         "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of(itemgetter("roc")) for column in AREA_COLUMNS)), "_curves",
-        place=True, about=("study.run.realisations", "study"),
+        by_star=True, meta=("study.run.realisations", "study"),
     )  # fmt: skip
     #: The extremes of every null (amplitude 0) and flare, with their realisations. Many flares share `MOST_ROWS` rows,
     #: so that each distribution has fewer than its 1000.
-    tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", of=lambda _, row: row["tail"], place=True,
-                    about=("study.run.seed", "study"))  # fmt: skip
+    tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", row_table=lambda _, row: row["tail"],
+                    by_star=True, meta=("study.run.seed", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -407,7 +407,7 @@ class UnknownAnswer(Answer):
     table = TableOf(
         "unknowns", UNKNOWN_COLUMNS, "rows",
         title="What unknowns cost: S/N of the matched statistic, by closed forms",
-        about=("study.run.fap", "study.limit.power", "study"),
+        meta=("study.run.fap", "study.limit.power", "study"),
     )  # fmt: skip
 
 

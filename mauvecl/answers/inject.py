@@ -255,11 +255,12 @@ class InjectAnswer(Answer):
     messages: list[str]
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
-    table = TableOf("limits", (SHARE,), "stars", of=lambda _, star: star.limits, place=True, about=_search)
+    table = TableOf("limits", (SHARE,), "stars", row_table=lambda _, star: star.limits, by_star=True, meta=_search)
     #: One row per star, cell of the sweep, half-width and size.
-    completeness = TableOf("completeness", (SHARE,), "stars", of=lambda _, star: star.cells, place=True, about=_search)
+    completeness = TableOf("completeness", (SHARE,), "stars", row_table=lambda _, star: star.cells, by_star=True,
+                           meta=_search)  # fmt: skip
     #: One row per star and cell of the sweep: thresholds, false alarms.
-    search = TableOf("search", SEARCH_COLUMNS, "stars", place=True, about=_search)
+    search = TableOf("search", SEARCH_COLUMNS, "stars", by_star=True, meta=_search)
 
     @property
     def headline(self) -> str:

@@ -483,15 +483,15 @@ class LimitAnswer(Answer):
     assumptions: QTable | None = None  # change of the limits with assumptions about the instrument; see `what_matters`
 
     #: One row per star, flare and statistic.
-    table = TableOf("limit", _limit_columns, "limits", place=True, key="rows",
-                    about=("study.limit.power", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
+    table = TableOf("limit", _limit_columns, "limits", by_star=True, key="rows",
+                    meta=("study.limit.power", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
     #: One row per limit and draw of the unknown: its values and the closed-form limit.
-    draws = TableOf("unknowns", _draw_columns, "limits", place=True, when="study.unknowns.draws")
+    draws = TableOf("unknowns", _draw_columns, "limits", by_star=True, when="study.unknowns.draws")
     _assumptions = TableOf(
         "assumptions", lambda answer: limit_assumption_columns(answer.study.limit.of), "assumptions", key="assumptions",
         title=lambda answer: f"What is assumed, and how far it moves the closed-form limit of {answer.study.limit.of}, "
         "the largest first",
-        when=lambda answer: answer.assumptions is not None,
+        when="assumptions",
     )  # fmt: skip
 
     @property
@@ -529,7 +529,7 @@ class LimitAnswer(Answer):
         if draws:
             heading = "matters most, share of the variance"
             column = Column("shares", lambda row: forms.describe_shares(row.unknown.shares), heading=heading)
-            shown = (*self.placed(self.flare_columns), *_unknown_columns(of)[:2], column)
+            shown = (*self.with_star(self.flare_columns), *_unknown_columns(of)[:2], column)
             unknown = "what is unknown of the instrument: the limits of each, and what explains their scatter"
             views.append(View(f"Averaged over {draws} draws of {unknown}", shown, table_of(shown, self.limits)))
         return [*views, *super().views]

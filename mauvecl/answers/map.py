@@ -87,7 +87,7 @@ class MapAnswer(Answer):
 
     #: One row per cell and statistic.
     table = TableOf("map", _cell_columns, lambda answer: answer,
-                    about=("star", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
+                    meta=("star", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:

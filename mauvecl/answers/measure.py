@@ -447,7 +447,7 @@ class MeasureAnswer(Answer):
 
     #: Errors, bias and coverage; one row per star, cell, flare, model and quantity.
     table = TableOf(
-        "measure", (amplitude_column(), MODEL_COLUMN, *COLUMNS), "flares", place=True, key="rows",
+        "measure", (amplitude_column(), MODEL_COLUMN, *COLUMNS), "flares", by_star=True, key="rows",
         title=lambda answer: f"Measured in one exposure; {answer.study.measure.fits} simulated fits of each flare",
         shown=lambda table: table[table["unit"] != "erg / s"],
     )  # fmt: skip
@@ -455,19 +455,19 @@ class MeasureAnswer(Answer):
     temperatures = TableOf(
         "temperatures",
         lambda answer: [replace(MODEL_COLUMN, heading=""), *chain(*map(_bin_columns, answer.binned[:1]))],
-        lambda answer: answer.binned or QTable(), place=True, key="temperatures", when="study.measure.snr_per_bin",
-        of=lambda _, stare: table_of(_bin_columns(stare), [stare]),
+        lambda answer: answer.binned or QTable(), by_star=True, key="temperatures", when="study.measure.snr_per_bin",
+        row_table=lambda _, stare: table_of(_bin_columns(stare), [stare]),
         title=lambda answer: answer.binned and f"Measured along the stare, in bins of S/N "
         f"{answer.study.measure.snr_per_bin:g}",
     )  # fmt: skip
     #: Joint fits of shape and spectrum; one row per star, cell and quantity.
     joint = TableOf(
-        "joint", JOINT_COLUMNS, "stares", place=True, key="joint", when="study.measure.joint_fit",
+        "joint", JOINT_COLUMNS, "stares", by_star=True, key="joint", when="study.measure.joint_fit",
         title="One stare: shape and spectrum of the flare, fitted to all frames together",
         shown=lambda table: table[table["unit"] != "erg / cm2"],
     )  # fmt: skip
     #: Goodness of fit and detection; one row per star, cell, flare and model.
-    fits = TableOf("fits", (amplitude_column(), MODEL_COLUMN, *FIT_COLUMNS), "flares", place=True, key="fits",
+    fits = TableOf("fits", (amplitude_column(), MODEL_COLUMN, *FIT_COLUMNS), "flares", by_star=True, key="fits",
                    title="Goodness of fit")  # fmt: skip
 
     @property

@@ -382,7 +382,7 @@ class PlanAnswer(Answer):
     planned: tuple[PlannedTarget, ...]
 
     #: One row per target.
-    table = TableOf("plan", COLUMNS, "planned", title=lambda answer: answer.heading, about=lambda answer: {
+    table = TableOf("plan", COLUMNS, "planned", title=lambda answer: answer.heading, meta=lambda answer: {
         "start": answer.seen.times.iso(0.0), "days": answer.seen.times.days,
         "false_alarms_per_day": answer.study.search.rate, "study": answer.study.text()})  # fmt: skip
     #: Inputs, one row per target.
@@ -392,7 +392,7 @@ class PlanAnswer(Answer):
     months = TableOf("months", (), "seen.months")
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
-    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", about=())
+    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", meta=())
 
     @property
     def headline(self) -> str:

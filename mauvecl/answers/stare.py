@@ -289,21 +289,21 @@ class StareAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
-    table = TableOf("stare", COLUMNS, "stares", place=True, title="One stare each", key="stares", about=SEED)
+    table = TableOf("stare", COLUMNS, "stares", by_star=True, title="One stare each", key="stares", meta=SEED)
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
-        place=True, title="Flares in them; S/N if everything but the presence of the flare is known",
-        key="events", about=SEED,
+        by_star=True, title="Flares in them; S/N if everything but the presence of the flare is known",
+        key="events", meta=SEED,
     )  # fmt: skip
     #: One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
     #: Values are NaN where the fit does not measure the flare: `note` says why.
     found = TableOf(
-        "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares), place=True,
-        key="found", when="study.stare.search", about=SEED,
+        "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares),
+        by_star=True, key="found", when="study.stare.search", meta=SEED,
     )  # fmt: skip
 
-    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+    def with_star(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of all swept quantities; the amplitude is that of each flare."""
         return (*place_columns(self.study.sweep), *columns)
 

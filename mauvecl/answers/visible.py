@@ -130,7 +130,7 @@ class VisibleAnswer(Answer):
     table = TableOf(
         "visible", _target_columns, lambda answer: [answer._row(k) for k in range(len(answer.targets))],
         title=lambda answer: f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
-        about=lambda answer: {"start": answer.times.iso(0.0), **answer_metadata(answer, "times.days", "study")},
+        meta=lambda answer: {"start": answer.times.iso(0.0), **answer_metadata(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
     months = TableOf("months", lambda answer: (
@@ -141,9 +141,9 @@ class VisibleAnswer(Answer):
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
     window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when="writes_windows",
-                           about=("study", "times.step_s"))  # fmt: skip
+                           meta=("study", "times.step_s"))  # fmt: skip
     #: Active limits with their values and the sources of their defaults.
-    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions", about=())
+    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions", meta=())
 
     @property
     def headline(self) -> str:

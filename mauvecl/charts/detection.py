@@ -26,10 +26,9 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.answers.detect import DetectAnswer, UnknownAnswer
-    from mauvecl.answers.gaussian import GaussianAnswer
     from mauvecl.answers.limit import LimitAnswer
     from mauvecl.answers.map import MapAnswer
-    from mauvecl.answers.signal import ExposureAnswer, SnrAnswer
+    from mauvecl.answers.signal import ExposureAnswer, GaussianAnswer, SnrAnswer
     from mauvecl.detection.detection import Detection, Roc
     from mauvecl.detection.snr import SnrResult
     from mauvecl.host.exposure.expectation import Expectation

@@ -173,7 +173,7 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
         kind = np.result_type(*(column.dtype for column in values)).type
         columns.append(Column(name, "", unit, values[0].info.description or "", kind=kind))
         for block, column in zip(blocks, present, strict=True):
-            cells = getattr(column, "value", column)
+            cells: Any = getattr(column, "value", column)
             block[name] = np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
     return table_of(columns, blocks, **shared | meta)
 
