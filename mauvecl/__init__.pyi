@@ -3,8 +3,8 @@
 from mauvecl.answers.analyse import analyse as analyse
 from mauvecl.answers.calibrate import calibrate as calibrate
 from mauvecl.answers.change import change as change
+from mauvecl.answers.closed_forms import unknown_table as unknown_table
 from mauvecl.answers.detect import detect as detect
-from mauvecl.answers.detect import unknown_table as unknown_table
 from mauvecl.answers.inject import inject as inject
 from mauvecl.answers.limit import limit as limit
 from mauvecl.answers.limit import shortest_exposure as shortest_exposure

@@ -14,21 +14,24 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import special
 
+from mauvecl.answers.answer import Answer, TableOf
 from mauvecl.detection import MIN_IN_TAIL
 from mauvecl.detection.distributions import CONFIDENCE_SD
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting, Statistic
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, unknown_values_of
-from mauvecl.schema.columns import Column, chance_text, first_items, number
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, chance_text, first_items, number, percent
 from mauvecl.schema.errors import InputError, Message
-from mauvecl.study.cases import Case
+from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
 from mauvecl.study.observation import KNOWN, NuisanceChoice
+from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.study import Study
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,78 @@ def _size(sd: float | str, unit: str) -> str:
     if sd in ("free", float("inf")):
         return "free"
     return f"+-{100 * float(sd) if unit == '%' else float(sd):g} {unit}".rstrip()
+
+
+#: Unknowns of `unknown_table` by their text.
+TABULATED: dict[str, NuisanceChoice] = {
+    spoken(choice): choice
+    for choice in (
+        NuisanceChoice(usual=False, dark=0.1),
+        NuisanceChoice(usual=False, light=0.01),
+        NuisanceChoice(usual=False, dark="free", light="free"),
+        NuisanceChoice(usual=False, sky=0.1),
+        NuisanceChoice(usual=False, tilt=0.01),
+    )
+}
+
+UNKNOWN_COLUMNS = (
+    star_column(),
+    amplitude_column(),
+    Column("unknown", description="what is unknown", heading="unknown"),
+    Column("known", "", "", "S/N of the matched statistic with everything known", "S/N, all known", ".3g"),
+    Column("plain", description="the same where it is unknown and the statistic does not know of it",
+           heading="S/N, not looked for", format=".3g"),
+    Column("marginalised", "marginal", "", "the same, marginalised", "S/N, marginalised", ".3g"),
+    Column("detected", description="detection probability of the marginalised statistic at the header's false alarms",
+           heading="then detected", format=percent(".3g")),
+    Column("smallest", description="flare amplitude that is detected, marginalised, at the header's power and false "
+           "alarms", heading="smallest flare", format=percent(".3g")),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownAnswer(Answer):
+    """Answer of `unknown_table`."""
+
+    USES = ("instrument", "sky", "flare", "nuisances", "seed")
+
+    study: Study
+    rows: list[dict[str, Any]]  # S/N of each flare under each unknown, by the names of columns
+    messages: list[str]
+    inputs: list[Expectation]  # the stars without a flare
+
+    #: One row per star, flare and unknown.
+    table = TableOf(
+        "unknowns", UNKNOWN_COLUMNS, "rows",
+        title="What unknowns cost: S/N of the matched statistic, by closed forms",
+        meta=("study.run.fap", "study.limit.power", "study"),
+    )  # fmt: skip
+
+
+@validated
+def unknown_table(study: Study) -> UnknownAnswer:
+    """Compute the S/N of a study's flares under each of the unknowns of `TABULATED`.
+
+    S/N grows with the amplitude; the photon noise of the smallest flare is left out.
+    """
+    prepared, run, rows = cases(study, swept=False), study.run, list[dict[str, Any]]()
+    needed = special.ndtri(study.limit.power) - special.ndtri(run.fap)
+    for case in prepared:
+        flares = zip(case.amplitudes, case.flares, strict=True)
+        for (amplitude, flare), (unknown, choice) in itertools.product(flares, TABULATED.items()):
+            cost = unknown_cost(case.label, case.quiet, flare, choice, run.comparison())
+            rows.append(vars(cost) | {
+                "star": case.label, "amplitude": amplitude, "unknown": unknown,
+                "detected": float(power(cost.marginal, run.fap)),
+                "smallest": float(amplitude * needed / cost.marginal) if cost.marginal > 0 else float("inf"),
+            })  # fmt: skip
+    quiet = [case.quiet for case in prepared]
+    return UnknownAnswer(study, rows, collect_messages(quiet), quiet)
+
+
+def power(snr: float | Float, fap: float) -> Float:
+    """Return the detection probability of a normal statistic with some S/N, shape of the S/N."""
+    return np.asarray(special.ndtr(snr + special.ndtri(fap)))
 
 
 #: Column of the answer with everything but the noise known, the bound of the realistic answer next to it.

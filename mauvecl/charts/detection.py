@@ -25,7 +25,8 @@ from mauvecl.study.questions import QUANTITIES
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.answers.detect import DetectAnswer, UnknownAnswer
+    from mauvecl.answers.closed_forms import UnknownAnswer
+    from mauvecl.answers.detect import DetectAnswer
     from mauvecl.answers.limit import LimitAnswer
     from mauvecl.answers.map import MapAnswer
     from mauvecl.answers.signal import ExposureAnswer, GaussianAnswer, SnrAnswer
@@ -237,7 +238,7 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     """Plot closed-form power per star (dashed plain, solid marginalised), and the smallest amplitudes."""
     from scipy.special import ndtri
 
-    from mauvecl.answers.detect import power
+    from mauvecl.answers.closed_forms import power
 
     stars, fap = list(dict.fromkeys(row["star"] for row in answer.rows)), answer.study.run.fap
     needed, above, below = ndtri(answer.study.limit.power) - ndtri(fap), list[Panel](), list[Panel]()
