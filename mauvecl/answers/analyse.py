@@ -373,7 +373,7 @@ class AnalyseAnswer(Answer):
 
     study: Study
     analysis: Analysis
-    white: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
+    why_summed: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
 
     #: One row per event, in order of time.
     events = TableOf("events", EVENTS, "rows", key="events", meta=lambda answer: {
@@ -437,7 +437,7 @@ class AnalyseAnswer(Answer):
         near = list[str]()
         for case in self.observed if self.study.has_neighbours else ():
             near += case.neighbours.messages(case.label, case.instrument) if case.neighbours is not None else []
-        return [*near, *filter(None, [self.white]), *self.analysis.messages]
+        return [*near, *filter(None, [self.why_summed]), *self.analysis.messages]
 
     @property
     def uses(self) -> tuple[Use, ...]:

@@ -247,7 +247,7 @@ class DrawnStudies:
     studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
 
 
-def drawn(study: Study) -> DrawnStudies:
+def draw_studies(study: Study) -> DrawnStudies:
     """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed.
 
     Raises InputError if a prior includes values that the instrument cannot have, or nothing is unknown.

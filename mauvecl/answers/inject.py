@@ -270,13 +270,13 @@ class InjectAnswer(Answer):
         scale, unit = (100, "%") if star.size == "amplitude" else (1, unit)
         of = star.size.replace("_", " ")
         ideal = "" if np.isnan(star.ideal_share) else f"; {scale * half.value * star.ideal_share:.3g} {IF_KNOWN}"
-        least = first_of_several(len(self.stars), "cases")
+        of_several = first_of_several(len(self.stars), "cases")
         if not np.isfinite(half.value):
-            return f"Fewer than half of the injected flares on {star.title} are found at any {of}{least}."
+            return f"Fewer than half of the injected flares on {star.title} are found at any {of}{of_several}."
         return (
             f"A search of {self.instrument_name}'s frames of {star.title} would find half of the flares of "
             f"{of} {scale * half.value:.3g} {unit} ({scale * half.low:.3g} to {scale * half.high:.3g}{ideal}), "
-            f"with {self.study.search.rate_text}{least}."
+            f"with {self.study.search.rate_text}{of_several}."
         )
 
     @property

@@ -508,11 +508,11 @@ class LimitAnswer(Answer):
         flare = "flares" if question.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
         within = "" if question.of == "exposure" else f" in {limit.quiet.exposure_s:g} s"
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
-        least = first_of_several(len(self.limits), "limits")
+        of_several = first_of_several(len(self.limits), "limits")
         return (
             f"{self.instrument_name} would see {flare} on {limit.subject}{within} with a "
             f"chance of {100 * question.power:g} % {before} {number(limit.value.value)} "
-            f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
+            f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){of_several}."
         )
 
     @property
@@ -557,7 +557,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     """
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    draws = forms.drawn(study) if study.unknowns.draws else None
+    draws = forms.draw_studies(study) if study.unknowns.draws else None
     searches = [LimitSearch(replace(case, study=drawn), statistic, engine) for drawn in draws.studies] if draws else []
     question = LimitSearch(case, statistic, engine, report, searches)
     # The root of the nominal instrument is near and found quickly.

@@ -142,7 +142,7 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     if study.map.x is None:
         study = study.model_copy(update={"map": study.map.model_copy(update={"x": magnitudes_of(case)})})
         case = case.with_sections(map=study.map)
-    unknown = forms.drawn(case.study) if study.unknowns.draws else None
+    unknown = forms.draw_studies(case.study) if study.unknowns.draws else None
     draws = [case] if unknown is None else [replace(case, study=draw) for draw in unknown.studies]
     x, y = study.map.axes
     total = len(draws) * len(x.points()) * len(y.points())

@@ -97,14 +97,14 @@ class ExposureAnswer(Answer):
     @property
     def headline(self) -> str:
         """The exposure of the first star."""
-        first, least = self.exposures[0], first_of_several(len(self.exposures), "stars")
+        first, of_several = self.exposures[0], first_of_several(len(self.exposures), "stars")
         return (
             f"{first.star} reaches an S/N of {first.wanted:g} per {first.per} at {first.wavelength_nm:g} nm in "
-            f"{first.exposure_s:g} s, {counted(first.frames, 'frame')}{least}."
+            f"{first.exposure_s:g} s, {counted(first.frames, 'frame')}{of_several}."
         )
 
 
-def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
+def index_at(x: Expectation, wavelength_nm: float, per: Per) -> int:
     """Return the index of the pixel or element at a wavelength; raises InputError outside the spectrum."""
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
     if not first <= wavelength_nm <= last:
@@ -159,7 +159,7 @@ def exposure_for(
 def _shortest_exposure(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
     """Return the fewest frames for an S/N, and the expectation of as many."""
     frame = case.one_frame.quiet
-    place = place_of(frame, wavelength_nm, per)
+    place = index_at(frame, wavelength_nm, per)
 
     def after(frames: int) -> float:
         """Return the closed-form S/N of some frames, which may exceed one exposure."""
@@ -340,7 +340,7 @@ class SnrAnswer(Answer):
 
     def shown_indices(self, star: StarSnr, per: Per) -> list[int]:
         """Return the indices of the pixels or elements of a star at the shown wavelengths."""
-        return [place_of(star.result.expectation, nm, per) for nm in self.shown_nm]
+        return [index_at(star.result.expectation, nm, per) for nm in self.shown_nm]
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -359,7 +359,7 @@ def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     if wavelength_nm is not None:
         # Invalid input raises an error before anything is drawn.
         for x in quiet:
-            place_of(x, wavelength_nm, "element")
+            index_at(x, wavelength_nm, "element")
 
     def answered(case: Case) -> StarSnr:
         result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)
@@ -443,7 +443,7 @@ def coverage(result: SnrResult) -> Float:
     return shares
 
 
-def beyond(x: Expectation, sigmas: float) -> Float:
+def tail_probability(x: Expectation, sigmas: float) -> Float:
     """Return the probability that a pixel is more than `sigmas` standard deviations above or (negative) below its mean.
 
     By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
@@ -550,8 +550,8 @@ class GaussianAnswer(Answer):
                 "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
                 "coverage_low": float(elements["coverage"].min()),
                 "coverage_high": float(elements["coverage"].max()),
-                "five_sigma_above": float((beyond(star.result.expectation, 5.0) / rare).max()),
-                "five_sigma_below": float((beyond(star.result.expectation, -5.0) / rare).min()),
+                "five_sigma_above": float((tail_probability(star.result.expectation, 5.0) / rare).max()),
+                "five_sigma_below": float((tail_probability(star.result.expectation, -5.0) / rare).min()),
                 "fap_ratio": float(wrong["ratio"]), "statistic": str(wrong["statistic"]), "why": str(wrong["why"]),
                 "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
             }  # fmt: skip

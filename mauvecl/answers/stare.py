@@ -312,15 +312,15 @@ class StareAnswer(Answer):
         """The number of flares that the search of the first stare finds, or what is drawn."""
         stare = self.stares[0]
         frames, flares = stare.staring.stare.n_frames, len(stare.flares)
-        least = first_of_several(len(self.stares), "stares")
+        of_several = first_of_several(len(self.stares), "stares")
         drawn = f"{counted(flares, 'flare')} in {counted(frames, 'frame')} of {stare.title}"
         if np.isnan(stare.threshold):
-            return f"The stare has {drawn}, which {'is' if flares == 1 else 'are'} not searched for{least}."
+            return f"The stare has {drawn}, which {'is' if flares == 1 else 'are'} not searched for{of_several}."
         events = [flare.event for flare in stare.found]
         number_found, false, unknown = len({*events} - {0, -1}), events.count(0), events.count(-1)
         alarms = counted(false, "false alarm") if false else "no false alarms"
         rest = f"; {counted(unknown, 'alarm')} {'is' if unknown == 1 else 'are'} not measured" if unknown else ""
-        return f"The search finds {number_found} of {drawn} and raises {alarms}{least}{rest}."
+        return f"The search finds {number_found} of {drawn} and raises {alarms}{of_several}{rest}."
 
     @property
     def views(self) -> list[View]:

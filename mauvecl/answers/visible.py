@@ -149,13 +149,14 @@ class VisibleAnswer(Answer):
     def headline(self) -> str:
         """The hours in which the first target is seen."""
         row, duty_cycle = self._row(0), self.visibility.limits.duty_cycle
-        least = first_of_several(len(self.targets), "targets")
+        days = f"{self.times.days:g} days from {self.times.iso(0.0)[:10]}"
+        of_several = first_of_several(len(self.targets), "targets")
         if not row["hours"]:
-            return f"{row['target']} is not seen in {self.times.days:g} days from {self.times.iso(0.0)[:10]}{least}."
+            return f"{row['target']} is not seen in {days}{of_several}."
         exposed = "" if duty_cycle == 1 else f" and exposed for {row['hours']:.0f} h"
         return (
-            f"{row['target']} is seen for {row['hours'] / duty_cycle:.0f} h ({100 * row['share']:.1f} % of "
-            f"{self.times.days:g} days from {self.times.iso(0.0)[:10]}){exposed}, most in {row['best_month']}{least}."
+            f"{row['target']} is seen for {row['hours'] / duty_cycle:.0f} h ({100 * row['share']:.1f} % of {days})"
+            f"{exposed}, most in {row['best_month']}{of_several}."
         )
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, cell_edges, in_rows, picture_of, written
+from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, cell_edges, in_rows, numeral, picture_of
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.requests import statistic_label
@@ -119,7 +119,7 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
         series.append(Rule("threshold", colour, listed=len(thresholded) == 1, at=cut))
     above = f"{title}: a threshold per flare" if len(thresholded) > 1 else title
     if len(thresholded) == len(cuts) == 1:
-        above = f"{title}: threshold {written(float(f'{cuts[0]:.3g}'))}"
+        above = f"{title}: threshold {numeral(cuts[0], 3)}"
     low, high = min(ends + cuts), max(ends + cuts)
     x, y = PlotAxis(statistic_label(statistic)), PlotAxis("realisations / peak", limits=(0, 1.05))
     if linear:
@@ -139,7 +139,7 @@ def _asinh(axis: Any, ends: tuple[float, float]) -> None:
     few = range(-10, 10, 2) if high - low < WIDE else (-10, -4, 0, 4)
     axis.xaxis.set_major_locator(FixedLocator([*few, 10, 30, *decades[1:]]))
     axis.xaxis.set_minor_locator(FixedLocator([*range(-10, 10), *np.outer(decades, range(1, 10)).ravel()]))
-    axis.xaxis.set_major_formatter(lambda value, _: written(value))
+    axis.xaxis.set_major_formatter(lambda value, _: numeral(value))
 
 
 def roc_columns(curve: Roc) -> tuple[Any, ...]:
@@ -313,7 +313,7 @@ def limits(answer: LimitAnswer) -> Picture:
         p, low, high = np.array([(q.value, q.low, q.high) for q in (point.probability for point in points)]).T
         flare = "" if np.isnan(limit.amplitude) else f", flare {100 * limit.amplitude:g} %"
         statistic = f", {limit.statistic}" if several else ""
-        value = f"{limit.value.value:.2f}" if of == "magnitude" else written(float(f"{limit.value.value:.3g}"))
+        value = f"{limit.value.value:.2f}" if of == "magnitude" else numeral(limit.value.value, 3)
         text = f"{limit.title}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
         at = [point.value for point in points], p, (p - low, high - p)
         series += [
@@ -379,7 +379,7 @@ def noise_budgets(answer: SnrAnswer) -> Picture:
 @picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
 def snr_sweep(answer: SnrAnswer) -> Picture:
     """Plot the S/N of some elements against the first swept quantity, a line per value of the others."""
-    from mauvecl.answers.signal import place_of
+    from mauvecl.answers.signal import index_at
 
     first, row = answer.study.sweep.axes[0].quantity, []
     # The axis names the band, unless stars have different ones.
@@ -390,7 +390,7 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
         for star in answer.stars:
             name = star.label.replace(f"{band} = {star.at[first]:g}", "") if first == "magnitude" else star.label
             name_of_line = full_label(name, {k: v for k, v in star.at.items() if k != first})
-            element = star.result.element[place_of(star.result.expectation, wavelength, "element")]
+            element = star.result.element[index_at(star.result.expectation, wavelength, "element")]
             ends = (max(element[q], 1e-3) for q in ("q2.5", "q97.5"))
             lines.setdefault(name_of_line, []).append((star.at[first], element["expected"], *ends))
         series: list[Series] = []
@@ -447,7 +447,7 @@ def exposures(answer: ExposureAnswer) -> Picture:
     first, series = answer.exposures[0], list[Series]()
     for e, colour in zip(answer.exposures, cycle(COLOURS), strict=False):
         x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
-        text = f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s"
+        text = f"{e.star}: {numeral(e.exposure_s, 4)} s"
         series.append(Line(text, colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))))
         series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
     series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))

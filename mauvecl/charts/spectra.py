@@ -10,7 +10,7 @@ import numpy as np
 
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of
+from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, picture_of, unit_label
 from mauvecl.schema.columns import first_items, with_error
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
         if lines:
             # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
             limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
-        y = PlotAxis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
+        y = PlotAxis(f"smallest change ({unit_label(unit) if unit else '%'})", log=bool(lines), limits=limits)
         row.append(Panel(PlotAxis(f"magnitude ({answer.study.star[0].band})"), y, [chart.Targets(at=lines), *rules]))
     title = f"{title}: smallest change between {answer.visits}"
     return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (note,))
@@ -211,7 +211,7 @@ def recovered_periods(answer: ChangeAnswer) -> Picture:
         shares = 100 * row_of_change.shares("value")
         mesh = chart.Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
         unit = row_of_change.change.unit
-        y = PlotAxis(f"semi-amplitude ({in_figure(unit) if unit else '%'})", log=True)
+        y = PlotAxis(f"semi-amplitude ({unit_label(unit) if unit else '%'})", log=True)
         row.append(Panel(PlotAxis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
     time = first[0].recovery.time_d
     title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
@@ -230,7 +230,7 @@ def line_indices(answer: ChangeAnswer) -> Picture:
         line = Line("mean spectrum", "star", at=(nm[near], index_row.flux[near]))
         band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T
         series = [line, Strips("band", "read", at=band), Strips("continuum", alpha=0.2, at=continua)]
-        y = PlotAxis(f"flux ({in_figure('erg / (s cm2 nm)')})")
+        y = PlotAxis(f"flux ({unit_label('erg / (s cm2 nm)')})")
         row.append(Panel(PlotAxis("wavelength (nm)"), y, series, index.name))
     title = f"{title}: bands and continua of the line indices in the mean spectrum"
     return Picture([row], (1.0 + 2.3 * len(row), 3.1), title, below=True)
@@ -360,7 +360,7 @@ def temperatures(star: MeasuredStare) -> Picture:
         if limits.any():
             series.append(Dots("lower limit", "star", size=10, marker="^", at=(middle[limits], low[limits])))
         positive = [value for value in (*estimate, *true) if value > 0]
-        unit = f" ({in_figure(measurement.units[q])})" if measurement.units[q] else ""
+        unit = f" ({unit_label(measurement.units[q])})" if measurement.units[q] else ""
         label = " ".join(name.split(" ")[::-1]) + unit
         y = PlotAxis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(PlotAxis("time from the start of the stare (s)"), y, series)])
