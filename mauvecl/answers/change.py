@@ -35,9 +35,8 @@ class ChangeRow(StarInCell):
     """One change of one star."""
 
     change: visits.Change
-    # error, error_known: standard error of one visit, with unknowns marginalised over and with everything known.
-    error: float
-    error_known: float
+    error: float  # standard error of one visit, unknowns marginalised over
+    error_known: float  # the same with everything known
     smallest: visits.SmallestChanges  # in the unit of the change
     ideal: float  # smallest difference of one visit if everything but the noise is known
     magnitude: float | None  # of the star

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
 
 #: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
 SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (0.0, 1e6)}
@@ -173,10 +174,9 @@ class LimitSearch:
             values = np.arange(first, easiest - 0.1, -0.5).tolist()
         else:
             values = (first * 2.0 ** np.arange(np.ceil(np.log2(easiest / first)) + 1)).tolist()
-        exceeds = self.theory(first) >= self.power
-        if exceeds and self.of == "exposure":
-            return first
-        if exceeds:
+        if self.theory(first) >= self.power:
+            if self.of == "exposure":
+                return first
             raise self._beyond(first, "already exceeds")
         for before, value in pairwise(values):
             if self.theory(value) < self.power:
@@ -298,31 +298,32 @@ def what_matters(study: Study) -> QTable:
     """
     rows = list[dict[str, Any]]()
     for case, statistic in product(_single_flares(cases(study, swept=False)), study.run.statistics):
-        payload, nominal, moves = case.instrument, LimitSearch(case, statistic).root(), list[dict[str, Any]]()
-        values, changes = unknown_values_of(payload), dict[str, dict[str, Mapping[str, Any]]]()
-        for name, prior in Unknowns().priors(payload).items():
-            if isinstance(prior, Uniform):
-                ends = (prior.low, prior.high)
-            else:
-                ends = (prior.mean - prior.sd, prior.mean + prior.sd)
-            value = values[name]
-            changes[value.label] = {f"{end:g}": value.changes(payload, float(f"{end:.12g}")) for end in ends}
-        changes["dark counts are Poisson in"] = {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
-        for label, of_ends in changes.items():
-            changed = (replace(case, study=case.study.with_instrument(change)) for change in of_ends.values())
+        nominal, rows_of_case = LimitSearch(case, statistic).root(), list[dict[str, Any]]()
+        for label, changes in _changes_at_ends(case.instrument).items():
+            changed = (replace(case, study=case.study.with_instrument(change)) for change in changes.values())
             low, high = (LimitSearch(moved, statistic).root(near=nominal) for moved in changed)
-            low_end, high_end = of_ends
-            moves.append({
+            low_end, high_end = changes
+            rows_of_case.append({
                 "star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0],
                 "statistic": statistic, "assumption": label, "low_end": low_end, "high_end": high_end,
                 "nominal": nominal, "at_low_end": low, "at_high_end": high, "span": abs(high - low),
             })  # fmt: skip
-        rows += sorted(moves, key=lambda row: -row["span"])
+        rows += sorted(rows_of_case, key=lambda row: -row["span"])
     columns = limit_assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
     for name in (study.limit.of, "at_low_end", "at_high_end", "span"):
         table[name].info.format = LIMIT
     return table
+
+
+def _changes_at_ends(instrument: Instrument) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """Return the changes of an instrument at both ends of each assumption's range, by assumption and by end."""
+    values, changes = unknown_values_of(instrument), dict[str, dict[str, Mapping[str, Any]]]()
+    for name, prior in Unknowns().priors(instrument).items():
+        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
+        value = values[name]
+        changes[value.label] = {f"{end:g}": value.changes(instrument, float(f"{end:.12g}")) for end in ends}
+    return changes | {"dark counts are Poisson in": {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}}
 
 
 def _single_flares(prepared: Sequence[Case]) -> list[Case]:

@@ -174,15 +174,15 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
         text = f"SATURATED: every pixel that counts saturates in {lost.sum()} of {lost.size} cells: no number there."
         messages.append(Message(text, SATURATED))
     missing = np.isnan(probability) & ~np.isnan(closed_form)
-    for statistic, there in zip(run.statistics, missing, strict=True):
-        if there.any():
+    for statistic, cells_without in zip(run.statistics, missing, strict=True):
+        if cells_without.any():
             messages.append(Message(
-                f"NO THRESHOLD: in {there.sum()} of {there.size} cells no threshold of {statistic} has a false-alarm "
-                f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
+                f"NO THRESHOLD: in {cells_without.sum()} of {cells_without.size} cells no threshold of {statistic} has "
+                f"a false-alarm probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
                 "number there; `mauvecl detect` names the probabilities that thresholds have.", "no threshold",
             ))  # fmt: skip
-    for why, there in cells.failed.items():
-        messages.append(Message(f"NO ANSWER in {len(there)} of {number_of_cells} cells: {why}.", "no answer"))
+    for reason, failed in cells.failed.items():
+        messages.append(Message(f"NO ANSWER in {len(failed)} of {number_of_cells} cells: {reason}.", "no answer"))
     marginalised = "" if study.nuisances.none else "marginalised over unknowns, "
     lowered = Counter(statistic for statistic, *_ in cells.lowered)
     for statistic in (name for name in run.statistics if lowered[name]):
@@ -194,10 +194,10 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
     # What unknowns cost in the middle of the map.
     middle = cells.x[len(cells.x) // 2], cells.y[len(cells.y) // 2]
-    there, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
-    at = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
-    comparison = study.run.comparison()
-    cost = forms.unknown_cost(f"the cell of {at}", there.quiet, there.flares[0], study.nuisances, comparison)
+    cell, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
+    values_of_axes = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
+    name, comparison = f"the cell of {values_of_axes}", study.run.comparison()
+    cost = forms.unknown_cost(name, cell.quiet, cell.flares[0], study.nuisances, comparison)
     return [*messages, *forms.unknown_lines([cost], study.nuisances)]
 
 

@@ -8,6 +8,7 @@ QUALITY, CADENCENO.
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -217,7 +218,8 @@ def _fitted(
     name: str, key: str, unit: str, text: str, heading: str = "", form: Any = "", *more: str, detail: bool = False
 ) -> list[Column]:
     """Return the columns of a fitted quantity: value, standard error, and ends of its 68 % interval."""
-    error = key.replace("_s", "_error_s").replace("_k", "_error_k") if key[-2:] in ("_s", "_k") else f"{key}_error"
+    # The unit of a value is the end of its name, as in `peak_s` and `peak_error_s`.
+    error = re.sub("(_[sk])?$", r"_error\1", key, count=1)
     return [
         Column(name, lambda row: float(getattr(row.alarm.recovered, key)[0]), unit, text, heading, form, more,
                detail=detail),
