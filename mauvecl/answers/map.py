@@ -178,8 +178,9 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
         if cells_without.any():
             messages.append(Message(
                 f"NO THRESHOLD: in {cells_without.sum()} of {cells_without.size} cells no threshold of {statistic} has "
-                f"a false-alarm probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
-                "number there; `mauvecl detect` names the probabilities that thresholds have.", "no threshold",
+                f"a false-alarm probability of {run.fap:g}, because one value is more probable, as saturated pixels "
+                "give it: no number there; `mauvecl detect` names the probabilities that thresholds have.",
+                "no threshold",
             ))  # fmt: skip
     for reason, failed in cells.failed.items():
         messages.append(Message(f"NO ANSWER in {len(failed)} of {number_of_cells} cells: {reason}.", "no answer"))
