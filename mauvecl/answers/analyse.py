@@ -367,7 +367,7 @@ NOISE = (
 
 @dataclass(frozen=True, eq=False)
 class AnalyseAnswer(Answer):
-    """Answer of `analyse`."""
+    """Answer of `analyse`: events in observed frames, what is measured of them, noise and limits of the search."""
 
     USES = ("templates", "seed")
 

@@ -227,7 +227,7 @@ class Answer(Drawable, ContentEquality):
 
     @cached_property
     def neighbours(self) -> QTable | None:
-        """Neighbours of the stars that the answer observes, or None."""
+        """Table of the neighbours of the stars that the answer observes, or None if there are none."""
         if not self.study.has_neighbours or "instrument" not in self.uses:
             return None
         rows, shares = list[dict[str, Any]](), set[float]()
@@ -523,7 +523,7 @@ def _devices(devices: Sequence[DeviceRecord], kernels: str) -> dict[str, Any]:
 
 
 def _left_by_another(folder: Path) -> list[Path]:
-    """Return the files of the record in a folder that are unchanged."""
+    """Return the unchanged files of the run record in a folder."""
     try:
         named = json.loads(read_text(folder / RECORD, "run record")).get("files", {})
         files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]

@@ -115,7 +115,7 @@ TRANSFER_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class CalibrateAnswer(Answer):
-    """Answer of `calibrate`."""
+    """Answer of `calibrate`: fits of throughput, dark current and photon transfer, and the instrument with them."""
 
     USES = ("instrument", "sky")
 
@@ -176,7 +176,7 @@ class CalibrateAnswer(Answer):
 
     @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:
-        """Throughput at each pixel."""
+        """Throughput at each pixel, electrons per photon, shape (n_pixel,)."""
         fit = self.throughput
         return np.asarray(np.exp(fit.log_factor) * self.nominal.throughput(fit.wavelength_nm))
 
@@ -267,7 +267,7 @@ class CalibrateAnswer(Answer):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Plain values of the fitted instrument by name."""
+        """Fitted values of the instrument by the names in its file; values that are not determined are left out."""
         n, d, t, f = self.nominal, self.dark, self.transfer, self.throughput
         values: dict[str, Any] = {}
         if "dark current" not in d.assumed:

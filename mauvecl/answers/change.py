@@ -151,7 +151,7 @@ PERIOD_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class ChangeAnswer(Answer):
-    """Answer of `change`."""
+    """Answer of `change`: smallest detected changes, line indices, and periods that are recovered."""
 
     USES = ("instrument", "sky", "nuisances", "sweep")
 

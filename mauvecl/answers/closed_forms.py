@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cost:
-    """S/N of a flare by the matched statistic."""
+    """S/N of a flare by the matched statistic, with and without unknowns."""
 
     of: str  # star and flare
     known: float  # with everything known
@@ -132,7 +132,7 @@ UNKNOWN_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class UnknownAnswer(Answer):
-    """Answer of `unknown_table`."""
+    """Answer of `unknown_table`: S/N of each flare under each unknown."""
 
     USES = ("instrument", "sky", "flare", "nuisances", "seed")
 
@@ -239,7 +239,7 @@ REST = "the rest"
 
 @dataclass(frozen=True, eq=False)
 class DrawnStudies:
-    """Draws of unknown instrument values."""
+    """Draws of unknown instrument values, with the study of each."""
 
     names: tuple[str, ...]
     labels: tuple[str, ...]

@@ -41,7 +41,7 @@ MOST_ROWS = 100_000
 
 @dataclass(frozen=True, eq=False)
 class StarDetection(StarInCell):
-    """A star in a cell of the sweep."""
+    """Detection of the flares of a star in a cell of the sweep."""
 
     amplitudes: tuple[float, ...]
     detection: Detection
@@ -50,13 +50,14 @@ class StarDetection(StarInCell):
 
 
 def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
+    """Return the columns of `DetectAnswer.table`, with the ideal probability next to the detection probability."""
     amplitude = amplitude_column(
         lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
-    place = [column.name for column in COLUMNS].index("high") + 1
+    after_interval = [column.name for column in COLUMNS].index("high") + 1
     share = share_column("detection.quiet.target_share")
-    return (share, amplitude, *COLUMNS[1:place], forms.IDEAL, *COLUMNS[place:])
+    return (share, amplitude, *COLUMNS[1:after_interval], forms.IDEAL, *COLUMNS[after_interval:])
 
 
 def _rows_of(star: StarDetection, fap: float) -> QTable:
@@ -85,7 +86,7 @@ def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectatio
 
 @dataclass(eq=False)
 class DetectAnswer(Answer):
-    """Answer of `detect`."""
+    """Answer of `detect`: thresholds and probabilities, departures from closed forms, ROC curves and extreme values."""
 
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 
@@ -128,8 +129,8 @@ class DetectAnswer(Answer):
             never = f"no threshold has a false-alarm probability of {self.study.run.fap:g}"
             why = never if np.isnan(rows["threshold"]).any() else "every pixel saturates"
             return f"{self.instrument_name} would see none of these flares: {why}."
-        place = int(np.nanargmin(np.abs(chances - 0.5)))
-        row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
+        index = int(np.nanargmin(np.abs(chances - 0.5)))
+        row, star = rows[index], self.stars[index // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
         least = f", the least certain of {known} flares" if known > 1 else ""
         chance = f"{chance_text(row['probability'])} ({chance_range(row['low'], row['high'])}{ideal})"
@@ -199,6 +200,9 @@ class DetectAnswer(Answer):
 @by_keywords("stars")
 def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> DetectAnswer:
     """Simulate the detection of every flare of a study, for every star and sweep value.
+
+    The study's ``run`` gives statistics, false-alarm probability and realisations. Raises InputError if these are too
+    few to count the thresholds, unless ``run.tails`` allows for importance sampling.
 
     Examples
     --------

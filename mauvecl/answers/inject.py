@@ -235,7 +235,8 @@ class StarCompleteness(StarInCell):
         return messages
 
 
-def _search(answer: InjectAnswer) -> dict[str, object]:
+def _metadata(answer: InjectAnswer) -> dict[str, object]:
+    """Return the metadata of the tables: what is searched for."""
     choice, flare = answer.study.search, answer.study.flare
     return {
         "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
@@ -246,7 +247,7 @@ def _search(answer: InjectAnswer) -> dict[str, object]:
 
 @dataclass(eq=False)
 class InjectAnswer(Answer):
-    """Answer of `inject`."""
+    """Answer of `inject`: completeness by half-width and size, recovered values, thresholds and false alarms."""
 
     USES = ("instrument", "sky", "flare", "processes", "stare", "seed", "sweep")
 
@@ -255,12 +256,12 @@ class InjectAnswer(Answer):
     messages: list[str]
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
-    table = TableOf("limits", (SHARE,), "stars", row_table=lambda _, star: star.limits, by_star=True, meta=_search)
+    table = TableOf("limits", (SHARE,), "stars", row_table=lambda _, star: star.limits, by_star=True, meta=_metadata)
     #: One row per star, cell of the sweep, half-width and size.
     completeness = TableOf("completeness", (SHARE,), "stars", row_table=lambda _, star: star.cells, by_star=True,
-                           meta=_search)  # fmt: skip
+                           meta=_metadata)  # fmt: skip
     #: One row per star and cell of the sweep: thresholds, false alarms.
-    search = TableOf("search", SEARCH_COLUMNS, "stars", by_star=True, meta=_search)
+    search = TableOf("search", SEARCH_COLUMNS, "stars", by_star=True, meta=_metadata)
 
     @property
     def headline(self) -> str:
@@ -295,7 +296,11 @@ class InjectAnswer(Answer):
 
 @by_keywords("injections")
 def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress = None) -> InjectAnswer:
-    """Compute the completeness of a study's search for every star and sweep value."""
+    """Compute the completeness of a study's search for every star and sweep value.
+
+    The study's ``search`` defines templates and false alarms, its ``injections`` the flares. Raises InputError for
+    sweeps of amplitude or exposure, which injections do not have, and if only some stars have a known size.
+    """
     idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
     if idle is not None:
         raise InputError(f"the sweep needs quantities that injections have, but has {idle!r}", key="sweep")

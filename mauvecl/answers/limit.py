@@ -474,7 +474,7 @@ def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
 
 @dataclass(eq=False)
 class LimitAnswer(Answer):
-    """Answer of `limit`."""
+    """Answer of `limit`: limits with their closed forms and simulations, and what unknowns and assumptions change."""
 
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed", "sweep")
 

@@ -52,6 +52,7 @@ NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
 
 
 def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
+    """Return the columns of `MapAnswer.table`, whose values are broadcast to (n_statistic, n_y, n_x)."""
     x, y = (axis.quantity for axis in answer.study.map.axes)
     return (
         quantity_column(x, lambda answer: np.array(answer.x)),

@@ -144,9 +144,10 @@ class ExpectedMeasurement(StarInCell):
         return ahead
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
-        """Return temperatures of the expected confidence region, with the smallest and largest amplitude at each.
+        """Return temperatures (K) of the expected confidence region, with the smallest and largest amplitude at each.
 
-        A `rise` of chi-squared bounds the region; everything else is profiled. Only for models of one temperature.
+        A `rise` of chi-squared bounds the region; everything else is profiled. The arrays have the shape (n,). Only for
+        models of one temperature.
         """
         assert isinstance(self.fitted, FlareModel)
         best, linear = self.perfect.log_k, self.perfect.factor[0] * self.perfect.amplitudes[0]
@@ -245,9 +246,10 @@ def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | Non
 def matched_filter(
     quiet: Expectation, flare: Expectation, unknown: Nuisances | None, added_dn: Float | None, skipped_nm: Ranges
 ) -> tuple[Float, float]:
-    """Return the weights of a matched filter of variance one, and its mean with the flare.
+    """Return the weights of a matched filter of variance one, per DN, shape (n_pixel,), and its mean with the flare.
 
-    The variance is that of the quiescent star, or of one with some light added.
+    The variance is that of the quiescent star, or of one with some light added (DN). The mean is 0 if the used pixels
+    have no light of the flare that unknowns leave.
     """
     variance, used = usable_variance(quiet, added_dn, skipped_nm)
     delta = (flare.recorded_dn - quiet.recorded_dn) * used
@@ -435,7 +437,7 @@ def _bin_columns(stare: MeasuredStare) -> list[Column]:
 
 @dataclass(eq=False)
 class MeasureAnswer(Answer):
-    """Answer of `measure`."""
+    """Answer of `measure`: forecast errors, simulated fits and their coverage, and measurements along stares."""
 
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 
@@ -500,7 +502,11 @@ class MeasureAnswer(Answer):
 
 @by_keywords("flares")
 def measure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MeasureAnswer:
-    """Forecast and simulate the measurement of a study's flares in one exposure."""
+    """Forecast and simulate the measurement of a study's flares in one exposure.
+
+    The study's ``measure`` gives the models, the number of fits, and whether flares of a stare are measured as well.
+    Raises InputError for flares that replace photosphere, and for amplitudes of 0.
+    """
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added', since fits take light for added")
     if study.measure.along_stare:

@@ -373,7 +373,7 @@ ENERGY_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
-    """Answer of `plan`."""
+    """Answer of `plan`: hours, recovered flares and false alarms of each target, and everything that is assumed."""
 
     USES = ("instrument", "flare", "orbit", "processes", "stare", "seed")
 

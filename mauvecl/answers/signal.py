@@ -78,7 +78,7 @@ EXPOSURE_COLUMNS = (
 
 @dataclass(frozen=True)
 class ExposureAnswer(Answer):
-    """Answer of `exposure`."""
+    """Answer of `exposure`: the shortest exposure of each star."""
 
     USES = ("instrument", "sky")
 
@@ -285,7 +285,7 @@ SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
 
 @dataclass(frozen=True, eq=False)
 class StarSnr(StarInCell):
-    """A star in a cell of the sweep."""
+    """S/N of a star in a cell of the sweep."""
 
     result: SnrResult
 
@@ -296,7 +296,7 @@ REALISATIONS = ("study.run.realisations", "study")
 
 @dataclass(eq=False)
 class SnrAnswer(Answer):
-    """Answer of `snr`."""
+    """Answer of `snr`: S/N of pixels and resolution elements, closed form and simulated, and noise by origin."""
 
     USES = ("instrument", "sky", "processes", "seed", "sweep")
 
@@ -419,7 +419,7 @@ WORST_COLUMNS = (
 
 
 def coverage(result: SnrResult) -> Float:
-    """Return the coverage of intervals of one estimated standard deviation about the observed signal, for each pixel.
+    """Return the coverage of intervals of one estimated standard deviation about the observed signal, shape (n_pixel,).
 
     The standard deviation is estimated from the observed photons and the known dark and read noise. Values are
     interpolated within the bins of the histogram of counts, 1/64 of a standard deviation or less.
@@ -446,8 +446,9 @@ def coverage(result: SnrResult) -> Float:
 def tail_probability(x: Expectation, sigmas: float) -> Float:
     """Return the probability that a pixel is more than `sigmas` standard deviations above or (negative) below its mean.
 
-    By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
-    3e-3 of the probability. For normal noise it would be the same in every pixel.
+    The result has the shape (n_pixel,); for normal noise it would be the same in every pixel. It is the saddle-point
+    approximation (Lugannani & Rice 1980, doi 10.2307/1426607) for Gaussian and Poisson parts together, right to 3e-3
+    of the probability.
     """
     c = Cumulants.of(x, x.n_frames)
     photons = np.where(c.photon_step > 0, c.photons, 0.0)
@@ -485,7 +486,7 @@ def _promises(result: SnrResult) -> QTable:
 
 @dataclass(eq=False)
 class GaussianAnswer(Answer):
-    """Answer of `gaussian`."""
+    """Answer of `gaussian`: errors of the predicted S/N, intervals and false alarms."""
 
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 

@@ -282,7 +282,7 @@ SEED = ("study", "study.run.seed")
 
 @dataclass(eq=False)
 class StareAnswer(Answer):
-    """Answer of `stare`."""
+    """Answer of `stare`: light curves and spectra of each stare, its flares, and those that a search finds."""
 
     USES = ("instrument", "sky", "flare", "processes", "stare", "seed", "sweep")
 

@@ -118,7 +118,7 @@ def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
 
 @dataclass(frozen=True, eq=False)
 class VisibleAnswer(Answer):
-    """Answer of `visible`."""
+    """Answer of `visible`: hours, windows and sky of each target, by day and month, and the assumed limits."""
 
     USES = ("orbit",)
 

@@ -51,6 +51,7 @@ DetectedStar = tuple[str, "Detection", Sequence[str]]
 
 
 def _detected_stars(answer: DetectAnswer) -> list[DetectedStar]:
+    """Return the stars of an answer as pictures need them."""
     return [
         (star.title, star.detection, [f"flare {100 * amplitude:g} %" for amplitude in star.amplitudes])
         for star in answer.stars

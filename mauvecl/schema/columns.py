@@ -85,14 +85,11 @@ def interval_columns(
 
 @dataclass(frozen=True)
 class View:
-    """A table as people read it: a title and some of its columns. Without a table, the title is a sentence.
+    """Table as people read it, with a title and some of its columns, or a sentence alone."""
 
-    The table may also be a list of records: values by the columns' names.
-    """
-
-    title: str
+    title: str  # the sentence if there is no table
     columns: Sequence[Column] = ()
-    table: Table | Sequence[Mapping[str, Any]] | None = None
+    table: Table | Sequence[Mapping[str, Any]] | None = None  # a table, or its rows: values by the columns' names
 
     def texts(self, hidden: Collection[str] = (), *, empty: bool = True) -> tuple[list[str], list[list[str]]]:
         """Return headings and cells, without `hidden` columns and, unless `empty`, those whose cells are all empty."""
@@ -128,7 +125,10 @@ class View:
 
 
 def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) -> QTable:
-    """Return the table of rows for files and JSON, with units and descriptions; missing quantities are NaN."""
+    """Return the table of rows for files and JSON, with units, descriptions and `meta` as metadata.
+
+    Values of None are missing: NaN in columns with a unit, and masked in others.
+    """
     import astropy.units as u
     import numpy as np
     from astropy.table import QTable
@@ -179,7 +179,7 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
 
 def records(table: Table) -> list[dict[str, Any]]:
-    """Return the rows of a table as plain values by column, None where a value is missing."""
+    """Return the rows of a table as Python values by column, without units; None where a value is missing."""
     columns = [getattr(table[name], "value", table[name]).tolist() for name in table.colnames]
     return [dict(zip(table.colnames, values, strict=True)) for values in zip(*columns, strict=True)]
 
