@@ -50,23 +50,22 @@ def unknown_cost(
     """Return the S/N of a flare, named by `of`, with and without unknowns, or the documented ones if none are given."""
     chosen, used, matched = NuisanceChoice() if nuisances.none else nuisances, ~quiet.saturated, Matched()
     unknown = chosen.marginalised(quiet)
-    plain = Setting(quiet, used, comparison)
     delta = np.where(used, flare.recorded_light_dn - quiet.recorded_light_dn, 0.0)
     if unknown is None or not delta.any():
         return Cost(of, 0.0, 0.0, 0.0)
-    weights = matched.plain_weights(plain, flare)
+    weights = matched.plain_weights(Setting(quiet, used, comparison), flare)
     known_snr = float(weights @ delta)
     # Amplitudes have the standard deviations that are drawn by default, or else those of the prior.
     drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if chosen.usual}
-    spreads = zip(unknown.names, unknown.sd, strict=True)
-    sd = np.array([drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in spreads])
-    spread = sd * np.abs(unknown.spectra @ weights)
+    priors = zip(unknown.names, unknown.sd, strict=True)
+    sd = np.array([drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in priors])
+    scatter = sd * (unknown.spectra @ weights)
     try:
         marginal = matched.weights_per_dn(Setting(quiet, used, comparison, nuisances=unknown), flare)
     except InputError:
         # The flare has the spectrum of an unknown.
         marginal = np.zeros_like(weights)
-    return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
+    return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(scatter**2))), float(marginal @ delta))
 
 
 def unknown_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:

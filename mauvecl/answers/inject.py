@@ -387,12 +387,13 @@ def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any
         nothing = Interval(np.nan, np.nan, np.nan)
         return values | {"simulated": nothing, "sampled": np.nan, "alarmed": 0, "expected": np.nan}
     # Drawn stares may be longer than those of importance sampling.
-    longer = days / tail.days
-    none = (1 - likely) ** longer
-    reach = DIFFERS * np.hypot(np.sqrt(none * (1 - none) / n), longer * none / (1 - likely) * error)
-    p = float(np.mean(maxima >= checked))
+    ratio = days / tail.days
+    p_no_alarm = (1 - likely) ** ratio
+    errors = np.sqrt(p_no_alarm * (1 - p_no_alarm) / n), ratio * p_no_alarm / (1 - likely) * error
+    alarmed_share, half_width = float(np.mean(maxima >= checked)), DIFFERS * np.hypot(*errors)
     with np.errstate(divide="ignore"):
-        ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / days for x in (p, p - reach, p + reach)]
-        sampled = float(-np.log(none) / days)
+        shares = (alarmed_share, alarmed_share - half_width, alarmed_share + half_width)
+        ends = [-np.log1p(-np.clip(share, 0.0, 1.0)) / days for share in shares]
+        sampled = float(-np.log(p_no_alarm) / days)
     alarms = {"alarmed": int(np.sum(maxima >= threshold.value)), "expected": float(n * -np.expm1(-choice.rate * days))}
     return values | {"simulated": Interval(*map(float, ends)), "sampled": sampled} | alarms

@@ -570,18 +570,18 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     *points, check = question.points
     quiet, flare = question.pair(value.value)
     is_ideal, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
-    named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
-    rise = value.value if question.of == "amplitude" else case.amplitudes[0]
-    there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
-    where = f"{star_label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
+    star = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
+    label, rise = star_label(star, quiet), value.value if question.of == "amplitude" else case.amplitudes[0]
+    limit_text = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
+    flare_text = f"{label} at {limit_text}, flare of {100 * rise:.4g} %"
     amplitude = float("nan") if question.of == "amplitude" else case.amplitudes[0]
     return Limit(
-        star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
+        label, case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if is_ideal else LimitSearch(ideal, statistic).root_or_nan(theory),
         check=check, points=tuple(points), curve=question.curve(value.value),
         unknown=UnknownEffect(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
-        cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
+        cost=forms.unknown_cost(flare_text, quiet, flare, study.nuisances, study.run.comparison()),
     )  # fmt: skip
 
 

@@ -536,15 +536,15 @@ class GaussianAnswer(Answer):
                 table[k * len(table) // len(stars) : (k + 1) * len(table) // len(stars)]
                 for table in (self.elements, self.thresholds, self.detection.table)
             )
-            sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
-            worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
-            off = tested[tested["differs"]]
+            wrong = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
+            worst = wrong[np.argmax(np.abs(wrong["mean"] - wrong["expected"]))] if len(wrong) else None
+            differing = tested[tested["differs"]]
             right = {"ratio": 1.0 if len(tested) else np.nan, "statistic": "", "why": ""}
-            wrong: Any = off[_most_wrong(off["ratio"])] if len(off) else right
-            missed = flares["probability"] - flares["closed_form_probability"]
+            threshold: Any = differing[_most_wrong(differing["ratio"])] if len(differing) else right
+            error = flares["probability"] - flares["closed_form_probability"]
             # The interval includes the error of the threshold.
-            is_sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
-            missed = np.where(is_sure, missed, 0.0)
+            is_sure = np.abs(error) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
+            error = np.where(is_sure, error, 0.0)
             yield vars(star) | {
                 "best_snr": float(elements["expected"].max()),
                 "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
@@ -553,8 +553,8 @@ class GaussianAnswer(Answer):
                 "coverage_high": float(elements["coverage"].max()),
                 "five_sigma_above": float((tail_probability(star.result.expectation, 5.0) / rare).max()),
                 "five_sigma_below": float((tail_probability(star.result.expectation, -5.0) / rare).min()),
-                "fap_ratio": float(wrong["ratio"]), "statistic": str(wrong["statistic"]), "why": str(wrong["why"]),
-                "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
+                "fap_ratio": float(threshold["ratio"]), "statistic": str(threshold["statistic"]),
+                "why": str(threshold["why"]), "probability_off_by": float(error[np.argmax(np.abs(error))]),
             }  # fmt: skip
 
 

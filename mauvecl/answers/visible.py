@@ -250,13 +250,13 @@ class VisibleAnswer(Answer):
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Calendar of windows or, if these are not known, of the days on which a target is visible."""
         times, entries = self.times, list[tuple[str, str, str, str]]()
-        single = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
+        by_window = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
         for k, target in enumerate(self.targets):
             windows, hours = self.windows[k], self.visibility.by_day(k)
-            for a, b in zip(windows.start_s, windows.stop_s, strict=True) if single else ():
-                length = f"{(b - a) / 60 * self.visibility.limits.duty_cycle:.0f} min of exposure"
-                entries.append((times.iso(float(a)), times.iso(float(b)), target.name, length))
-            for first, last in true_runs(hours >= SEEN_H) if not single else ():
+            for start_s, stop_s in zip(windows.start_s, windows.stop_s, strict=True) if by_window else ():
+                length = f"{(stop_s - start_s) / 60 * self.visibility.limits.duty_cycle:.0f} min of exposure"
+                entries.append((times.iso(float(start_s)), times.iso(float(stop_s)), target.name, length))
+            for first, last in true_runs(hours >= SEEN_H) if not by_window else ():
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
                 entries.append((self.days[first], self.days[last - 1], target.name, mean))
         return {"visible.ics": partial(calendar_bytes, entries)}
