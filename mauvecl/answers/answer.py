@@ -529,5 +529,5 @@ def _left_by_another(folder: Path) -> list[Path]:
         files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]
         return [path for path, digest in files if path.is_file() and digest_of(path) == digest]
     except (InputError, OSError, ValueError, AttributeError, RecursionError):
-        # No record, or not one of mauvecl's.
+        # There is no record, or mauvecl has not written it.
         return []

@@ -286,7 +286,7 @@ class CalibrateAnswer(Answer):
             values["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + stretch / half)
             first = n.pixel_zero_nm - f.wavelength_nm.mean()
             values["pixel_zero_nm"] = n.pixel_zero_nm + shift + stretch * first / half
-            # The pixels that were observed stay those that are read.
+            # The instrument still reads the pixels that were observed.
             step, read = values["dispersion_nm_per_pixel"], n.read_pixels
             lowest, highest = (values["pixel_zero_nm"] + step * end for end in (read.start - 0.5, read.stop - 0.5))
             values["output_min_nm"] = max(n.output_min_nm, float(lowest))
@@ -300,7 +300,7 @@ class CalibrateAnswer(Answer):
         """Tables that the instrument file names: factor and errors of the throughput, and the pixels."""
         nm = self.throughput.wavelength_nm
         knots = np.unique(np.concatenate([nm[:1], np.arange(np.ceil(nm[0]), nm[-1], KNOT_NM), nm[-1:]]))
-        # The throughput of a pixel stays; its wavelength, and with it the nominal throughput, is another one.
+        # A pixel keeps its throughput, but its wavelength, and with it the nominal throughput, changes.
         names = ("pixel_zero_nm", "dispersion_nm_per_pixel")
         moved = self.nominal.with_(**{name: self.changes[name] for name in names if name in self.changes})
         pixels = np.arange(moved.pixels)[self.nominal.read_pixels]
@@ -308,7 +308,7 @@ class CalibrateAnswer(Answer):
         nominal = self.nominal.throughput(np.clip(centres_nm, *self.nominal.curves_nm))
         factor = np.interp(knots, centres_nm, self.fitted_throughput / nominal)
         at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
-        # The light of these pixels in each of some bands.
+        # Light of the pixels at the knots in each band, shape (n_band, n_knot).
         band = at * MODE_BANDS // nm.size
         light = np.asarray(self.fitted_throughput[at] * (band == np.arange(MODE_BANDS)[:, None]))
         errors = ThroughputErrors.of_covariance(

@@ -63,7 +63,7 @@ def unknown_cost(
     try:
         marginal = matched.weights_per_dn(Setting(quiet, used, comparison, nuisances=unknown), flare)
     except InputError:
-        # The flare has the spectrum of an unknown.
+        # The spectrum of the flare is that of an unknown.
         marginal = np.zeros_like(weights)
     return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(scatter**2))), float(marginal @ delta))
 
@@ -190,9 +190,9 @@ def ideal_chances(case: Case, flares: Sequence[Expectation], statistics: Sequenc
     return np.array([[_chance(setting, statistic, flare, fap) for statistic in statistics] for flare in flares])
 
 
-#: Kind of the message.
+#: Kind of the message of `chance_with_unknowns`.
 BOTH_CHANCES = "chance with unknowns"
-#: Largest number of flares of which the most uncertain is looked for.
+#: Largest number of flares among which the least certain one is sought.
 MAX_FLARES = 100
 
 
@@ -344,7 +344,7 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     return {names[k]: max(float(share[k]), 0.0) for k in np.argsort(-share)} | {REST: 1.0 - explained[tuple(indices)]}
 
 
-#: Unknowns whose shares of a scatter are named, at most.
+#: Largest number of unknowns whose shares of a scatter are named.
 MAX_NAMED = 3
 
 

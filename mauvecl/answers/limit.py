@@ -253,7 +253,7 @@ def _settle(question: LimitSearch, start: float) -> Interval:
         clipped = (min(max(q, 0.5 / n), 1 - 0.5 / n) for q in (p.value, p.low, p.high))
         probit, low, high = (float(special.ndtri(q)) for q in clipped)
         move = (goal - probit) / slope
-        # Half the interval's width away the slope's own error no longer counts.
+        # Within half the width of the interval, the error of the slope does not matter.
         if abs(goal - probit) <= max(0.5 * (high - low), 0.02):
             ends = [question.easier(at, (goal - q) / slope) for q in (low, high)]
             return Interval(question.easier(at, move), min(ends), max(ends))

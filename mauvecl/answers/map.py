@@ -47,7 +47,7 @@ COLUMNS = (
     Column("closed_form", description="the same for Gaussian noise"),
     forms.IDEAL,
 )
-#: Arrays of the answer: chances and both ends of their interval, those of the closed form, and with everything known.
+#: Fields of `MapAnswer` with arrays: the probability, the ends of its interval, the closed form, and the ideal one.
 NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
 
 

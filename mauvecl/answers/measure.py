@@ -73,7 +73,7 @@ def true_values(case: Case, amplitude: float, names: Iterable[str]) -> dict[str,
         hot = scale * photons(at, body.flux(at), band)
         values |= {"temperature": kelvin, "amplitude": hot / photons(at, quiet.flux_flam, band)}
     if kelvin is not None and two is not None:
-        # The first is the cooler one.
+        # The first temperature is the lower one.
         (low, first), (high, second) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
         values |= {"temperature": low, "second temperature": high, "second area": second / first}
     if continuum.surface:
@@ -555,7 +555,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     batches: list[Arrays] = []
     for start in range(0, study.measure.fits, BATCH):
         count = min(BATCH, study.measure.fits - start)
-        # The number changes with the arrays that a fit keeps.
+        # Another number than 2 is needed if fits keep other arrays, so that older checkpoints are not read.
         depends_on = ("measure", 2, quiet, flare, unknown, models, study.text(), start, count)
         batches.append(checkpointed(checkpoint, depends_on, partial(fitted, start, count)))
     selected = np.concatenate([arrays["detected"] for arrays in batches])

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from mauvecl.search.flare_fits import Factor
     from mauvecl.study.observation import SkyLight
 
-#: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
+#: Start of a stare whose study names no time: 2026-01-01, MJD. The choice is arbitrary.
 NO_TIME_MJD = 61_041.0
 
 
@@ -139,7 +139,7 @@ class StareFlare(StarInCell):
 
     event: Event
     band_erg: float  # NaN if the star's size is unknown
-    bolometric_erg: float  # likewise
+    bolometric_erg: float  # NaN if the star's size is unknown
     snr: float  # of the matched filter for this flare
 
 
@@ -394,7 +394,7 @@ def stare(
             f"a stare with a spectrum for each frame must have at most {MOST_SHOWN} frames, not {frames}",
             key="stare.duration_s",
         )
-    # Bad input is refused before anything is drawn.
+    # Invalid input raises an error before anything is drawn.
     quiet = [case.stare_expectation.quiet for case in prepared]
     engine = engine or Stares()
     drawn = [_draw(case, engine, checkpoint) for case in reported(prepared, len(prepared), progress)]

@@ -198,7 +198,7 @@ class VisibleAnswer(Answer):
         """Return the row of a target, by the names of columns."""
         visibility, windows, target = self.visibility, self.windows[k], self.targets[k]
         hours, away, sky = self.by_month[1][:, k], self.elongation_deg(k), self.zodiacal[k]
-        # The least and the largest value of no values is none.
+        # Without a finite value, a NaN stands for all of them.
         sky = sky[np.isfinite(sky)] if np.isfinite(sky).any() else sky[:1]
         length, end_s = windows.length_s, self.times.n * self.times.step_s
         exposed, orbit_min = visibility.share[k] * visibility.limits.duty_cycle, visibility.orbit.elements.period_s / 60

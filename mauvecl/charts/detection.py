@@ -244,7 +244,7 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     stars, fap = list(dict.fromkeys(row["star"] for row in answer.rows)), answer.study.run.fap
     needed, above, below = ndtri(answer.study.limit.power) - ndtri(fap), list[Panel](), list[Panel]()
     for star in stars:
-        # Those of its first flare.
+        # The curves are those of the star's first flare.
         of_star = [row for row in answer.rows if row["star"] == star]
         snr, amplitude = of_star[0]["known"], of_star[0]["amplitude"]
         least = amplitude * needed / snr if snr > 0 else float("inf")

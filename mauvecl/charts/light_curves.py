@@ -36,7 +36,7 @@ MOST_CURVES, MOST_MAPS = 6, 6
 MOST_POINTS, MOST_ROWS = 4000, 600
 LONG_GAP = 0.005  # shortest gap in which the level is not drawn, as a share of the whole time
 BRIGHT = 30.0  # flux, in standard deviations, above which the light curve has a second panel near the level
-#: Units of time: longest duration that is shown in it, its length, s, and its name.
+#: Units of time: the longest duration that is shown in the unit (s), its length (s), and its name.
 TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 HALF_WIDTH = PlotAxis("half-width (s)", log=True)
 

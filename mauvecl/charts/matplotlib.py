@@ -32,10 +32,10 @@ MAX_COLUMNS = 3  # largest number of panels side by side
 COLUMN = 3.5  # width of one column of a journal, inches
 UNBROKEN, MINUS = "\N{NO-BREAK SPACE}", "\N{MINUS SIGN}"
 SMALL = 8  # size of the labels of ticks that are names
-#: Largest fractions of a figure's width for legends, and for titles, of whose letters the mean width is known.
+#: Largest fractions of a figure's width that legends and titles take.
 INSIDE, TITLE = 0.97, 0.93
-#: The same for titles of panels, of the width that matplotlib gives a panel before the layout, which leaves less room
-#: between panels.
+#: Largest width of a panel's title, as a fraction of the width that matplotlib gives the panel before the layout, which
+#: leaves less room between panels.
 PANEL_TITLE = 1.2
 
 STYLE = {

@@ -254,7 +254,7 @@ def fits(answer: MeasureAnswer) -> Picture:
         data, fit, variance = (np.where(complete, values, np.nan) for values in sums)
         nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
         x = PlotAxis("wavelength (nm)")
-        # Elements differ in their number of pixels, means hardly.
+        # Means are shown, since elements differ in their number of pixels.
         dots = Dots("exposure less star and fitted unknowns", size=4, at=(nm, data / pixels, noise / pixels))
         line = Line(f"fit: {kelvin}", "star", at=(nm, fit / pixels))
         above.append(Panel(x, PlotAxis("mean of an element (DN per pixel)"), [dots, line], flare.name))
