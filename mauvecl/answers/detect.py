@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from operator import attrgetter, itemgetter, methodcaller
+from operator import attrgetter, methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -109,7 +109,7 @@ class DetectAnswer(Answer):
     #: All receiver operating characteristics with their areas; see `Roc`. Many flares share `MOST_ROWS` rows, so that
     #: each curve has fewer than its 200.
     roc = TableOf(
-        "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of(itemgetter("roc")) for column in AREA_COLUMNS)), "_curves",
+        "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of_part("roc") for column in AREA_COLUMNS)), "_curves",
         by_star=True, meta=("study.run.realisations", "study"),
     )  # fmt: skip
     #: The extremes of every null (amplitude 0) and flare, with their realisations. Many flares share `MOST_ROWS` rows,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -171,7 +170,7 @@ class StarCompleteness(StarInCell):
         for name, power in POWERS.items():
             limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
             around = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=power != 0.5)
-            columns += [column.of(itemgetter(name)) for column in (limit, *around)]
+            columns += [column.of_part(name) for column in (limit, *around)]
         text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
         ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
         return (
@@ -204,9 +203,9 @@ class StarCompleteness(StarInCell):
             *interval_columns("completeness_{}"),
             Column("injections", "count", "", "number of injected flares"),
         )
-        columns = [column.of(attrgetter("injected")) for column in cell_columns]
+        columns = [column.of_part("injected") for column in cell_columns]
         if self.fitted is not None:
-            columns += [column.of(attrgetter("fitted")) for column in ACCURACY_COLUMNS]
+            columns += [column.of_part("fitted") for column in ACCURACY_COLUMNS]
         return table_of(columns, [self])
 
     @property

@@ -465,7 +465,7 @@ def _drawn(answer: LimitAnswer) -> forms.DrawnStudies:
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
     draws = _drawn(answer)
     values = (
-        Column(name, itemgetter(k), description=f"drawn {label}").of(lambda row: row.unknown.draws.values.T)
+        Column(name, itemgetter(k), description=f"drawn {label}").of_part("unknown.draws.values.T")
         for k, (name, label) in enumerate(zip(draws.names, draws.labels, strict=True))
     )
     of = answer.study.limit.of

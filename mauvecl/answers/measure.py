@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, product
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -428,7 +427,7 @@ JOINT_COLUMNS = (
 def _bin_columns(stare: MeasuredStare) -> list[Column]:
     """Return the columns of measurements along a stare."""
     assert stare.drawn is not None
-    columns = [column.of(attrgetter("drawn")) for column in stare.drawn.columns]
+    columns = [column.of_part("drawn") for column in stare.drawn.columns]
     exact = Column("temperature_without_noise", lambda row: row.perfect.found.estimates[:, 0], "K",
                    "temperature fitted to the means of these frames", "without noise", ".0f")  # fmt: skip
     place = [column.name for column in columns].index("temperature") + 1

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, product
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -340,7 +340,7 @@ class StareAnswer(Answer):
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
         for (k, band), (kind, (attribute, text)) in product(enumerate(star.light.bands), LIGHT.items()):
             column = Column(kind + band_suffix(band, k), itemgetter(k), "DN / s", f"{band}: {text}")
-            columns.append(column.of(attrgetter(f"light.{attribute}.T")))
+            columns.append(column.of_part(f"light.{attribute}.T"))
         return table_of(columns, [star], star=star.label, **answer_metadata(self, *SEED), **star.at)
 
     @property

@@ -10,7 +10,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from itertools import islice
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -43,19 +43,21 @@ class Column:
 
     def value(self, row: object) -> Any:
         """Return the value or values of a row."""
-        if callable(self.get):
-            return self.get(row)
-        key = self.get or self.name
-        return row[key] if isinstance(row, Mapping) else attrgetter(key)(row)
+        return self.get(row) if callable(self.get) else _part(row, self.get or self.name)
 
-    def of(self, part: Callable[[Any], Any]) -> Column:
-        """Return the column for rows of which only a part has its value."""
-        return replace(self, get=lambda row: self.value(part(row)))
+    def of_part(self, name: str) -> Column:
+        """Return the column for rows whose part of a name, an attribute or a key, has the value."""
+        return replace(self, get=lambda row: self.value(_part(row, name)))
 
     def text(self, record: Mapping[str, Any]) -> str:
         """Return a cell as people read it, from the values of its row by column."""
         values = [record[name] for name in (self.name, *self.others) if name]
         return self.format(*values) if callable(self.format) else formatted(values[0], self.format)
+
+
+def _part(row: object, name: str) -> Any:
+    """Return the value of a key of a row, or an attribute by its path."""
+    return row[name] if isinstance(row, Mapping) else attrgetter(name)(row)
 
 
 def interval_columns(
@@ -165,7 +167,7 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
     # The row of a table is kept under the empty name, which no column of a table has.
     blocks: list[dict[str, Any]] = [{"": row} for row in rows]
-    columns = [column.of(itemgetter("")) for column in first]
+    columns = [column.of_part("") for column in first]
     for name in dict.fromkeys(name for table in tables for name in table.colnames):
         present = [table[name] if name in table.colnames else None for table in tables]
         values = [column for column in present if column is not None]
