@@ -87,8 +87,8 @@ class TableOf:
     columns: Sequence[Column] | Callable[[Any], Sequence[Column]]
     rows: str | Callable[[Any], object]  # attribute with the rows, a single row, or the whole table
     _: KW_ONLY
-    # Returns the table of a row, for the answer and the row; declared columns that it lacks then precede it.
-    row_table: Callable[[Any, Any], Table] | None = None
+    # Table of a row: attribute of the row, or function of answer and row. Declared columns that it lacks precede it.
+    row_table: str | Callable[[Any, Any], Table] | None = None
     by_star: bool = False  # whether columns of the star and of swept quantities precede the declared ones
     title: str | Callable[[Any], str] = ""  # of the printed view, which tables without a title do not have
     shown: Callable[[Any], Any] = lambda table: table  # returns the rows of the table that are printed
@@ -114,6 +114,7 @@ class TableOf:
         return table
 
     def _table(self, answer: Answer) -> QTable:
+        """Compute the table of an answer."""
         rows: Any = self.rows(answer) if callable(self.rows) else attrgetter(self.rows)(answer)
         if hasattr(rows, "colnames"):
             return rows
@@ -121,7 +122,8 @@ class TableOf:
         meta = self.meta(answer) if callable(self.meta) else answer_metadata(answer, *self.meta)
         if self.row_table is None:
             return table_of(self.columns_of(answer), rows, **meta)
-        tables = [(row, self.row_table(answer, row)) for row in rows]
+        get = attrgetter(self.row_table) if isinstance(self.row_table, str) else partial(self.row_table, answer)
+        tables = [(row, get(row)) for row in rows]
         names = {name for _, table in tables for name in table.colnames}
         return stacked([column for column in self.columns_of(answer) if column.name not in names], tables, **meta)
 

@@ -255,10 +255,9 @@ class InjectAnswer(Answer):
     messages: list[str]
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
-    table = TableOf("limits", (SHARE,), "stars", row_table=lambda _, star: star.limits, by_star=True, meta=_metadata)
+    table = TableOf("limits", (SHARE,), "stars", row_table="limits", by_star=True, meta=_metadata)
     #: One row per star, cell of the sweep, half-width and size.
-    completeness = TableOf("completeness", (SHARE,), "stars", row_table=lambda _, star: star.cells, by_star=True,
-                           meta=_metadata)  # fmt: skip
+    completeness = TableOf("completeness", (SHARE,), "stars", row_table="cells", by_star=True, meta=_metadata)
     #: One row per star and cell of the sweep: thresholds, false alarms.
     search = TableOf("search", SEARCH_COLUMNS, "stars", by_star=True, meta=_metadata)
 

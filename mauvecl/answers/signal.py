@@ -305,11 +305,10 @@ class SnrAnswer(Answer):
     messages: list[str]
 
     #: S/N per resolution element, one row per star, cell and element.
-    element = TableOf("snr-element", (), "stars", row_table=lambda _, star: star.result.element, by_star=True,
-                      key="snr-element", meta=REALISATIONS)  # fmt: skip
+    element = TableOf("snr-element", (), "stars", row_table="result.element", by_star=True, key="snr-element",
+                      meta=REALISATIONS)  # fmt: skip
     #: S/N per pixel, one row per star, cell and pixel.
-    pixel = TableOf("snr-pixel", (), "stars", row_table=lambda _, star: star.result.pixel, by_star=True,
-                    meta=REALISATIONS)  # fmt: skip
+    pixel = TableOf("snr-pixel", (), "stars", row_table="result.pixel", by_star=True, meta=REALISATIONS)
     #: Noise by origin, DN rms per pixel, one row per star, cell and pixel.
     noise_budget = TableOf(
         "noise-budget", (), "stars", row_table=lambda _, star: star.result.expectation.noise_budget(), by_star=True,
