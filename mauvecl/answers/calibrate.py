@@ -314,33 +314,38 @@ class CalibrateAnswer(Answer):
         errors = ThroughputErrors.of_covariance(
             knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=light
         )
-        origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
-        # Pixels that are not read have the mean of the others.
-        level, bias, read = self.dark.level_dn_per_s, self.dark.bias_dn, self.nominal.read_pixels
-        level = level / (self.nominal.dark_dn_per_s if "dark current" in self.dark.assumed else level.mean())
-        dark, every_bias = np.full(moved.pixels, level.mean()), np.full(moved.pixels, bias.mean())
-        dark[read], every_bias[read] = level, bias
-        by_pixel: dict[str, Any] = {"pixel": np.arange(moved.pixels), "dark": dark}
-        for name in ("response", "gain", "read_noise_dn"):
-            if (column := getattr(self.nominal.pixel_map, name, None)) is not None:
-                by_pixel[name] = column
-        if "read_noise_dn" in by_pixel:
-            # The fit determines the mean variance of the pixels that are read.
-            noise_dn = by_pixel["read_noise_dn"]
-            rms_dn = np.sqrt(np.mean(noise_dn[read] ** 2))
-            fitted_dn = self.changes.get("read_noise_dn", rms_dn)
-            # A nominal map of zeros does not tell how pixels differ.
-            noise_dn = noise_dn * fitted_dn / rms_dn if rms_dn > 0 else np.full(moved.pixels, fitted_dn)
-            by_pixel["read_noise_dn"] = noise_dn * u.DN
-        if np.ptp(bias) > 0:
-            by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
         values = {name: list(steps) for name, steps in errors.values.items()}
+        origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
         return {
             "throughput-factor": QTable(step_nm | {"factor": factor}, meta=origin),
             "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
-            "pixel-map": QTable(by_pixel, meta=origin, descriptions={"dark": "factor on the dark current"}),
+            "pixel-map": QTable(self._pixel_map, meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
+
+    @property
+    def _pixel_map(self) -> dict[str, Any]:
+        """Columns of the map of pixels; those that are not read have the mean dark current and bias of the others."""
+        level, bias, read = self.dark.level_dn_per_s, self.dark.bias_dn, self.nominal.read_pixels
+        level = level / (self.nominal.dark_dn_per_s if "dark current" in self.dark.assumed else level.mean())
+        n_pixel = self.nominal.pixels
+        dark, every_bias = np.full(n_pixel, level.mean()), np.full(n_pixel, bias.mean())
+        dark[read], every_bias[read] = level, bias
+        columns: dict[str, Any] = {"pixel": np.arange(n_pixel), "dark": dark}
+        for name in ("response", "gain", "read_noise_dn"):
+            if (column := getattr(self.nominal.pixel_map, name, None)) is not None:
+                columns[name] = column
+        if "read_noise_dn" in columns:
+            # The fit determines the mean variance of the pixels that are read.
+            noise_dn = columns["read_noise_dn"]
+            rms_dn = np.sqrt(np.mean(noise_dn[read] ** 2))
+            fitted_dn = self.changes.get("read_noise_dn", rms_dn)
+            # A nominal map of zeros does not tell how pixels differ.
+            noise_dn = noise_dn * fitted_dn / rms_dn if rms_dn > 0 else np.full(n_pixel, fitted_dn)
+            columns["read_noise_dn"] = noise_dn * u.DN
+        if np.ptp(bias) > 0:
+            columns["bias_dn"] = every_bias * u.DN
+        return columns
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.

@@ -300,7 +300,7 @@ def _campaign(case: Case) -> list[str]:
     question, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
     if question.frames is None:
         return []
-    many = campaign(run.fap, question.frames, stack, step=question.step, seed=run.seed)
+    chances = campaign(run.fap, question.frames, stack, step=question.step, seed=run.seed)
 
     def overlap(interval: Interval | None, before: str, after: str = "") -> str:
         if interval is None:
@@ -308,19 +308,18 @@ def _campaign(case: Case) -> list[str]:
         ends = f"[{interval.low:.3g}, {interval.high:.3g}]"
         return f"{before} with the overlap of its stacks {interval.value:.3g} {ends}{after}"
 
-    lines, tests = list[str](), many.tests
-    frames, count = counted(question.frames, "frame"), counted(tests, "test")
-    lines.append(
-        f"A campaign of {frames} makes {count}: at {run.fap:g} per test {tests * run.fap:.3g} "
-        f"false alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
-        f"{many.bound:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
-    )
+    tests, count = chances.tests, counted(chances.tests, "test")
+    lines = [
+        f"A campaign of {counted(question.frames, 'frame')} makes {count}: at {run.fap:g} per test "
+        f"{tests * run.fap:.3g} false alarms are expected, and the chance of any is {chances.independent:.3g} if tests "
+        f"are independent, at most {chances.bound:.3g}{overlap(chances.overlapping, ';', ' for a linear statistic')}."
+    ]
     if question.fap is not None:
-        rate = per_test(question.fap, question.frames, stack, step=question.step, seed=run.seed)
+        needed = per_test(question.fap, question.frames, stack, step=question.step, seed=run.seed)
         lines.append(
             f"For a chance of {question.fap:g} of any false alarm in the campaign each of its {count} may have "
-            f"{rate.independent:.4g} if they are independent, {rate.bound:.4g} in any case"
-            f"{overlap(rate.overlapping, ', and')}: `fap={rate.bound:.4g}`."
+            f"{needed.independent:.4g} if they are independent, {needed.bound:.4g} in any case"
+            f"{overlap(needed.overlapping, ', and')}: `fap={needed.bound:.4g}`."
         )
     if question.alarms is not None:
         if not question.alarms < tests:
