@@ -457,13 +457,13 @@ def _unknown_columns(of: str) -> tuple[Column, ...]:
     )  # fmt: skip
 
 
-def _drawn(answer: LimitAnswer) -> forms.DrawnStudies:
+def _draws(answer: LimitAnswer) -> forms.DrawnStudies:
     """Return the draws of what is unknown of the instrument, which are the same for all limits."""
     return next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
 
 
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
-    draws = _drawn(answer)
+    draws = _draws(answer)
     values = (
         Column(name, itemgetter(k), description=f"drawn {label}").of_part("unknown.draws.values.T")
         for k, (name, label) in enumerate(zip(draws.names, draws.labels, strict=True))
@@ -521,7 +521,7 @@ class LimitAnswer(Answer):
         of, run, draws = self.study.limit.of, self.study.run, self.study.unknowns.draws
         columns = LimitAnswer.table.columns_of(self)
         shown = (*(column for column in columns if column.name != "unknown_low"), Column("verdict", heading="verdict"))
-        run = _drawn(self).studies[0].run if draws else run
+        run = _draws(self).studies[0].run if draws else run
         title = (
             f"Limit of {of} at a detection probability of {self.study.limit.power:g}, false-alarm probability "
             f"{run.fap:g} per test, {run.realisations:,} realisations{' of each draw' if draws else ''}"
