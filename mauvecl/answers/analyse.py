@@ -420,10 +420,12 @@ class AnalyseAnswer(Answer):
 
     @property
     def _has_level(self) -> bool:
+        """True if the level of the summed light is known, to which equivalent durations are relative."""
         return bool(np.isfinite(self.analysis.level_ratio))
 
     @property
     def _flares_of_stars(self) -> Iterator[dict[str, object]]:
+        """Rows of `neighbour_flares`."""
         stars = blended_stars(cases(self.study, swept=False))
         for row, (name, separation_arcsec, rise) in product(self.rows, stars):
             amplitude, times = row.in_white_light(row.event.amplitude), 1.0 / rise if rise else float("inf")

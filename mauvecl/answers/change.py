@@ -96,6 +96,7 @@ def _lost_pixels(lost: int, total: int) -> str:
 
 
 def _amount(value: float, unit: str) -> str:
+    """Format a change or its error with the unit, or as a percentage if it is relative."""
     if not np.isfinite(value):
         return "" if np.isnan(value) else "hidden"
     return f"{value:.3g} {unit}" if unit else f"{formatted(100 * value, '.3g')} %"

@@ -97,6 +97,7 @@ def spoken(choice: NuisanceChoice) -> str:
 
 
 def _size(sd: float | str, unit: str) -> str:
+    """Format the standard deviation of an unknown."""
     if sd in ("free", float("inf")):
         return "free"
     return f"+-{100 * float(sd) if unit == '%' else float(sd):g} {unit}".rstrip()
@@ -221,6 +222,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
 
 
 def _matched_chance(case: Case, flare: int) -> float:
+    """Return the closed-form chance of a flare of a case by the matched statistic."""
     peak = case.flares[flare]
     return _chance(case.setting(case.quiet, peak), Matched(), peak, case.study.run.fap)
 

@@ -160,6 +160,7 @@ class DetectAnswer(Answer):
 
     @property
     def _curves(self) -> Iterator[dict[str, Any]]:
+        """Rows of `roc`, each with all points of a curve."""
         n_points = min(ROC_ROWS, self._row_limit(1))
         for star in self.stars:
             for statistic, (flare, amplitude) in product(star.detection.statistics, enumerate(star.amplitudes)):
@@ -168,6 +169,7 @@ class DetectAnswer(Answer):
 
     @property
     def _extremes(self) -> Iterator[dict[str, Any]]:
+        """Rows of `tails`, each with the extremes of a distribution."""
         n_values = self._row_limit(2)
         for star in self.stars:
             detection = star.detection

@@ -420,6 +420,7 @@ STATISTIC_COLUMN = Column("statistic", description="detection statistic", headin
 
 
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
+    """Return the columns of `LimitAnswer.table`."""
     of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], QUANTITIES[answer.study.limit.of].unit
     unknown = _unknown_columns(of) if answer.study.unknowns.draws else ()
     return (
@@ -463,6 +464,7 @@ def _draws(answer: LimitAnswer) -> forms.DrawnStudies:
 
 
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
+    """Return the columns of `LimitAnswer.draws`, with one for each unknown value."""
     draws = _draws(answer)
     values = (
         Column(name, itemgetter(k), description=f"drawn {label}").of_part("unknown.draws.values.T")

@@ -239,6 +239,7 @@ def magnitudes_of(case: Case) -> Axis:
 
 
 def _shown(value: float | str) -> str:
+    """Format a value of an axis."""
     return value if isinstance(value, str) else f"{value:.4g}"
 
 

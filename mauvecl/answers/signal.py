@@ -528,6 +528,7 @@ class GaussianAnswer(Answer):
 
     @property
     def _largest_errors(self) -> Iterator[dict[str, Any]]:
+        """Rows of `cells`."""
         stars, rare = self.signal.stars, special.ndtr(-5.0)
         for k, star in enumerate(stars):
             # Each star has as many rows as the others.

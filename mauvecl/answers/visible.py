@@ -107,6 +107,7 @@ def assumption_columns(first: str) -> tuple[Column, ...]:
 
 
 def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
+    """Return the columns of `VisibleAnswer.table`."""
     limits = (
         Column(f"leaves_{name}", itemgetter(f"leaves_{name}"), "",
                f"share of the time that the limit of {name} alone leaves")
@@ -227,12 +228,14 @@ class VisibleAnswer(Answer):
 
     @property
     def _day_rows(self) -> Iterator[dict[str, Any]]:
+        """Rows of `by_day`, each with all days of a target."""
         for k, target in enumerate(self.targets):
             yield {"target": target.name, "day": self.days, "hours": self.visibility.by_day(k),
                    "elongation": self.elongation_deg(k), "zodiacal_light": self.zodiacal[k]}  # fmt: skip
 
     @property
     def _window_rows(self) -> Iterator[dict[str, Any]]:
+        """Rows of `window_table`, each with all windows of a target."""
         times, z = self.times, self.visibility.track.of_date_km[:, 2]
         nodes = times.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
         for target, windows in zip(self.targets, self.windows, strict=True):
