@@ -420,7 +420,7 @@ class AnalyseAnswer(Answer):
 
     @property
     def _has_level(self) -> bool:
-        """True if the level of the summed light is known, to which equivalent durations are relative."""
+        """True unless a changing dark current and an unknown star leave the level of the light unknown."""
         return bool(np.isfinite(self.analysis.level_ratio))
 
     @property
