@@ -3,9 +3,8 @@
 from mauvecl.answers.analyse import analyse as analyse
 from mauvecl.answers.calibrate import calibrate as calibrate
 from mauvecl.answers.change import change as change
+from mauvecl.answers.closed_forms import unknown_table as unknown_table
 from mauvecl.answers.detect import detect as detect
-from mauvecl.answers.detect import unknown_table as unknown_table
-from mauvecl.answers.gaussian import gaussian as gaussian
 from mauvecl.answers.inject import inject as inject
 from mauvecl.answers.limit import limit as limit
 from mauvecl.answers.limit import shortest_exposure as shortest_exposure
@@ -16,6 +15,7 @@ from mauvecl.answers.measure import measure as measure
 from mauvecl.answers.plan import plan as plan
 from mauvecl.answers.signal import exposure as exposure
 from mauvecl.answers.signal import exposure_for as exposure_for
+from mauvecl.answers.signal import gaussian as gaussian
 from mauvecl.answers.signal import simulate as simulate
 from mauvecl.answers.signal import snr as snr
 from mauvecl.answers.stare import stare as stare

@@ -367,26 +367,26 @@ NOISE = (
 
 @dataclass(frozen=True, eq=False)
 class AnalyseAnswer(Answer):
-    """Answer of `analyse`."""
+    """Answer of `analyse`: events in observed frames, what is measured of them, noise and limits of the search."""
 
     USES = ("templates", "seed")
 
     study: Study
     analysis: Analysis
-    white: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
+    why_summed: str = ""  # why spectra are searched as their sum over wavelength; empty if they are not
 
     #: One row per event, in order of time.
-    events = TableOf("events", EVENTS, "rows", key="events", about=lambda answer: {
+    events = TableOf("events", EVENTS, "rows", key="events", meta=lambda answer: {
         **answer_metadata(answer, "study"), **answer.analysis.frames.time_keywords, "star": answer.analysis.frames.name,
         **answer_metadata(answer, "analysis.frames.unit", "analysis.threshold")})  # fmt: skip
     #: One row per frame: flux, level, noise, and why it is not searched.
-    frames = TableOf("frames", FRAMES, "analysis", about=lambda answer: {
+    frames = TableOf("frames", FRAMES, "analysis", meta=lambda answer: {
         "star": answer.analysis.frames.name, "unit": answer.analysis.frames.unit,
         **answer.analysis.frames.time_keywords})  # fmt: skip
     #: One row per event and measured quantity, with intervals.
     measured = TableOf(
         "measured", MEASURED, lambda answer: [row for row in answer.rows if not isinstance(row.measured, str)],
-        when="analysis.spectra", about=(),
+        when="analysis.spectra", meta=(),
         title=lambda answer: "Measured in the summed spectra of each event" if len(answer.measured) else "",
     )  # fmt: skip
     #: One row per event and star in the fibre: the flare of that star which would look like the event.
@@ -398,32 +398,34 @@ class AnalyseAnswer(Answer):
     )  # fmt: skip
     #: One row per half-width and size of injected flares.
     completeness = TableOf("completeness", COMPLETENESS, "analysis", when="_has_level",
-                           about=("analysis.threshold",))  # fmt: skip
+                           meta=("analysis.threshold",))  # fmt: skip
     #: One row per half-width: the smallest flare that the search detects with a probability of 90 %.
-    limits = TableOf("limits", LIMITS, "analysis", key="limits", when="_has_level", about=(),
+    limits = TableOf("limits", LIMITS, "analysis", key="limits", when="_has_level", meta=(),
                      title="Smallest flares that would have been detected, by injecting into these frames")  # fmt: skip
     #: One row per number of frames: scatter of their means.
-    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", about=(),
+    noise = TableOf("noise", NOISE, "analysis.scatter", key="noise", meta=(),
                     title="Noise of quiescent frames, less the fitted process")  # fmt: skip
     #: One row per combination of terms that was tried for the quiescent light, with its criterion.
     process = TableOf(
-        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), about=(),
+        "process", PROCESS, lambda answer: sorted(answer.analysis.level.process.bic, key=itemgetter(1)), meta=(),
         title="What was tried for the quiescent light",
     )  # fmt: skip
     #: One row per pixel of spectra: noise as stated and as measured.
     pixels = TableOf("noise-per-pixel", PIXELS, "analysis.spectra.noise", when="analysis.spectra",
-                     about=("analysis.frames.unit",))  # fmt: skip
+                     meta=("analysis.frames.unit",))  # fmt: skip
     #: One row per sudden change of the light that all pixels of spectra share.
     throughput = TableOf("throughput", THROUGHPUT, lambda answer: [
         (answer.analysis.spectra.cleaned.frames, change) for change in answer.analysis.spectra.changes
-    ], when="analysis.spectra", about=())  # fmt: skip
+    ], when="analysis.spectra", meta=())  # fmt: skip
 
     @property
     def _has_level(self) -> bool:
+        """True unless a changing dark current and an unknown star leave the level of the light unknown."""
         return bool(np.isfinite(self.analysis.level_ratio))
 
     @property
     def _flares_of_stars(self) -> Iterator[dict[str, object]]:
+        """Rows of `neighbour_flares`."""
         stars = blended_stars(cases(self.study, swept=False))
         for row, (name, separation_arcsec, rise) in product(self.rows, stars):
             amplitude, times = row.in_white_light(row.event.amplitude), 1.0 / rise if rise else float("inf")
@@ -437,7 +439,7 @@ class AnalyseAnswer(Answer):
         near = list[str]()
         for case in self.observed if self.study.has_neighbours else ():
             near += case.neighbours.messages(case.label, case.instrument) if case.neighbours is not None else []
-        return [*near, *filter(None, [self.white]), *self.analysis.messages]
+        return [*near, *filter(None, [self.why_summed]), *self.analysis.messages]
 
     @property
     def uses(self) -> tuple[Use, ...]:

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 class StarInCell:
     """Star in a cell of the sweep."""
 
-    label: str
-    at: Mapping[str, float | str]
+    label: str  # of the star
+    at: Mapping[str, float | str]  # swept values by quantity
 
     @property
     def title(self) -> str:
@@ -76,26 +76,26 @@ IF_KNOWN = "if everything but the noise were known"
 
 @dataclass(eq=False)
 class TableOf:
-    """A table that an answer declares once: its file, its printed view and its part of the JSON.
+    """Declaration of a table of an answer: its file, its printed view and its part of the JSON.
 
-    It is an attribute of the answer that is computed when it is first read. Functions of the answer replace values that
-    depend on it.
+    An instance of the answer has the table itself as this attribute, which is computed when it is first read.
+    Attributes of the answer are named by paths such as "study.run.seed", and values that differ between answers are
+    given as functions of the answer.
     """
 
     file: str  # name of the file without its ending; empty for a table that is only printed or part of the JSON
     columns: Sequence[Column] | Callable[[Any], Sequence[Column]]
-    rows: str | Callable[[Any], object]  # attribute with the rows, the rows, a single one, or the whole table
+    rows: str | Callable[[Any], object]  # attribute with the rows, a single row, or the whole table
     _: KW_ONLY
-    # Table for the answer and a row, with those of the columns that are not the row's own.
-    of: Callable[[Any, Any], Table] | None = None
-    place: bool = False  # whether columns of the star and of swept quantities precede those that are given
-    title: str | Callable[[Any], str] = ""  # of the printed view; without one, or if it is empty, there is none
-    shown: Callable[[Any], Any] = lambda table: table  # rows of the table that the printed view has
+    # Table of a row: attribute of the row, or function of answer and row. Declared columns that it lacks precede it.
+    row_table: str | Callable[[Any, Any], Table] | None = None
+    by_star: bool = False  # whether columns of the star and of swept quantities precede the declared ones
+    title: str | Callable[[Any], str] = ""  # of the printed view, which tables without a title do not have
+    shown: Callable[[Any], Any] = lambda table: table  # returns the rows of the table that are printed
     key: str = ""  # in JSON
-    # Whether the answer has the table: an attribute, or a function of the answer; every answer has it by default.
-    when: str | Callable[[Any], object] = lambda answer: True
-    # Metadata: paths of attributes of the answer, whose last names are the keys, or a function of the answer.
-    about: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
+    when: str = ""  # attribute that is true if the answer has the table; without one, every answer has it
+    # Metadata of the table: attributes, whose last names are the keys.
+    meta: Sequence[str] | Callable[[Any], Mapping[str, object]] = ("study",)
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -114,33 +114,29 @@ class TableOf:
         return table
 
     def _table(self, answer: Answer) -> QTable:
-        rows: Any = _of_answer(self.rows, answer)
+        """Compute the table of an answer."""
+        rows: Any = self.rows(answer) if callable(self.rows) else attrgetter(self.rows)(answer)
         if hasattr(rows, "colnames"):
             return rows
-        if isinstance(rows, Mapping) or not isinstance(rows, Iterable):
-            rows = [rows]
-        about = self.about(answer) if callable(self.about) else answer_metadata(answer, *self.about)
-        if self.of is None:
-            return table_of(self.columns_of(answer), rows, **about)
-        tables = [(row, self.of(answer, row)) for row in rows]
+        rows = rows if isinstance(rows, Iterable) else [rows]
+        meta = self.meta(answer) if callable(self.meta) else answer_metadata(answer, *self.meta)
+        if self.row_table is None:
+            return table_of(self.columns_of(answer), rows, **meta)
+        get = attrgetter(self.row_table) if isinstance(self.row_table, str) else partial(self.row_table, answer)
+        tables = [(row, get(row)) for row in rows]
         names = {name for _, table in tables for name in table.colnames}
-        return stacked([column for column in self.columns_of(answer) if column.name not in names], tables, **about)
+        return stacked([column for column in self.columns_of(answer) if column.name not in names], tables, **meta)
 
     def columns_of(self, answer: Answer) -> tuple[Column, ...]:
         """Return the columns for an answer."""
         declared = self.columns(answer) if callable(self.columns) else self.columns
         columns = tuple(column for column in declared if column.when is None or column.when(answer))
-        return answer.placed(columns) if self.place else columns
+        return answer.with_star(columns) if self.by_star else columns
 
     def view(self, answer: Answer, title: str = "", table: Table | None = None) -> View:
         """Return the printed view for an answer, under another title or of other rows if they are given."""
         title = title or (self.title(answer) if callable(self.title) else self.title)
         return View(title, self.columns_of(answer), self.shown(getattr(answer, self.name)) if table is None else table)
-
-
-def _of_answer(get: str | Callable[[Any], Any], answer: Answer) -> Any:
-    """Return an attribute of an answer by its path, or the value of a function of the answer."""
-    return get(answer) if callable(get) else attrgetter(get)(answer)
 
 
 def answer_metadata(answer: Answer, *paths: str) -> dict[str, object]:
@@ -178,9 +174,8 @@ class Answer(Drawable, ContentEquality):
 
     def _declared(self) -> list[TableOf]:
         """Return the declarations of the tables that the answer has."""
-        return [
-            table for table in vars(type(self)).values() if isinstance(table, TableOf) and _of_answer(table.when, self)
-        ]
+        tables = [table for table in vars(type(self)).values() if isinstance(table, TableOf)]
+        return [table for table in tables if not table.when or attrgetter(table.when)(self)]
 
     def has_table(self, file: str) -> bool:
         """Return whether the answer has the table of a file, without making it."""
@@ -208,7 +203,7 @@ class Answer(Drawable, ContentEquality):
         """Name of the instrument in sentences."""
         return name_of_instrument(self.study)
 
-    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+    def with_star(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of swept quantities that are not among them."""
         return (*place_columns(self.study.sweep, *(column.name for column in columns)), *columns)
 
@@ -234,7 +229,7 @@ class Answer(Drawable, ContentEquality):
 
     @cached_property
     def neighbours(self) -> QTable | None:
-        """Neighbours of the stars that the answer observes, or None."""
+        """Table of the neighbours of the stars that the answer observes, or None if there are none."""
         if not self.study.has_neighbours or "instrument" not in self.uses:
             return None
         rows, shares = list[dict[str, Any]](), set[float]()
@@ -296,14 +291,14 @@ class Answer(Drawable, ContentEquality):
 
         Raises InputError if a file cannot be written; an earlier file of that name is then unchanged.
         """
-        place = make_folder(Path(folder))
-        return [write(place / name) for name, write in self.writers.items()]
+        path = make_folder(Path(folder))
+        return [write(path / name) for name, write in self.writers.items()]
 
     @property
     def writers(self) -> dict[str, Callable[[Path], Path]]:
         """Functions that write the tables, the documents and the study to a path, by full file name."""
-        documents, writers = self.documents | {"study.toml": self.study.toml().encode}, dict[str, Any]()
-        writers |= {name: partial(write_table, table) for name, table in self.files.items()}
+        documents = self.documents | {"study.toml": self.study.toml().encode}
+        writers: dict[str, Any] = {name: partial(write_table, table) for name, table in self.files.items()}
         return writers | {name: partial(write_document, content) for name, content in documents.items()}
 
     @property
@@ -530,11 +525,11 @@ def _devices(devices: Sequence[DeviceRecord], kernels: str) -> dict[str, Any]:
 
 
 def _left_by_another(folder: Path) -> list[Path]:
-    """Return the files of the record in a folder that are unchanged."""
+    """Return the unchanged files of the run record in a folder."""
     try:
         named = json.loads(read_text(folder / RECORD, "run record")).get("files", {})
         files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]
         return [path for path, digest in files if path.is_file() and digest_of(path) == digest]
     except (InputError, OSError, ValueError, AttributeError, RecursionError):
-        # No record, or not one of mauvecl's.
+        # There is no record, or mauvecl has not written it.
         return []

@@ -115,7 +115,7 @@ TRANSFER_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class CalibrateAnswer(Answer):
-    """Answer of `calibrate`."""
+    """Answer of `calibrate`: fits of throughput, dark current and photon transfer, and the instrument with them."""
 
     USES = ("instrument", "sky")
 
@@ -129,7 +129,7 @@ class CalibrateAnswer(Answer):
 
     #: One row per value of the instrument.
     values_table = TableOf(
-        "calibrate", COLUMNS, "values", key="rows", about=("dark.reference_c", "transfer.dark_unit", "study"),
+        "calibrate", COLUMNS, "values", key="rows", meta=("dark.reference_c", "transfer.dark_unit", "study"),
         title=lambda answer: f"{answer.nominal.name} fitted to {counted(len(answer.stars), 'observation')} of "
         f"standard stars; dark current at {answer.dark.reference_c:.1f} C",
     )  # fmt: skip
@@ -143,11 +143,11 @@ class CalibrateAnswer(Answer):
         (name, fit) for name, fit in (
             ("throughput", answer.throughput), ("dark current", answer.dark), ("photon transfer", answer.transfer)
         ) if fit.dof > 0
-    ], title="Goodness of fit", key="fits", about=())  # fmt: skip
+    ], title="Goodness of fit", key="fits", meta=())  # fmt: skip
     #: One row per pixel: dark current and bias.
-    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, about=("dark.reference_c",))
+    dark_table = TableOf("dark", DARK_COLUMNS, lambda answer: answer, meta=("dark.reference_c",))
     #: One row per observation and usable pixel: the variance of frames.
-    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, about=())
+    transfer_table = TableOf("photon-transfer", TRANSFER_COLUMNS, lambda answer: answer, meta=())
 
     @property
     def stars(self) -> list[detector.CalibrationFrames]:
@@ -176,7 +176,7 @@ class CalibrateAnswer(Answer):
 
     @cached_property
     def fitted_throughput(self) -> NDArray[np.float64]:
-        """Throughput at each pixel."""
+        """Throughput at each pixel, electrons per photon, shape (n_pixel,)."""
         fit = self.throughput
         return np.asarray(np.exp(fit.log_factor) * self.nominal.throughput(fit.wavelength_nm))
 
@@ -267,7 +267,7 @@ class CalibrateAnswer(Answer):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Plain values of the fitted instrument by name."""
+        """Fitted values of the instrument by the names in its file; values that are not determined are left out."""
         n, d, t, f = self.nominal, self.dark, self.transfer, self.throughput
         values: dict[str, Any] = {}
         if "dark current" not in d.assumed:
@@ -286,7 +286,7 @@ class CalibrateAnswer(Answer):
             values["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + stretch / half)
             first = n.pixel_zero_nm - f.wavelength_nm.mean()
             values["pixel_zero_nm"] = n.pixel_zero_nm + shift + stretch * first / half
-            # The pixels that were observed stay those that are read.
+            # The instrument still reads the pixels that were observed.
             step, read = values["dispersion_nm_per_pixel"], n.read_pixels
             lowest, highest = (values["pixel_zero_nm"] + step * end for end in (read.start - 0.5, read.stop - 0.5))
             values["output_min_nm"] = max(n.output_min_nm, float(lowest))
@@ -300,7 +300,7 @@ class CalibrateAnswer(Answer):
         """Tables that the instrument file names: factor and errors of the throughput, and the pixels."""
         nm = self.throughput.wavelength_nm
         knots = np.unique(np.concatenate([nm[:1], np.arange(np.ceil(nm[0]), nm[-1], KNOT_NM), nm[-1:]]))
-        # The throughput of a pixel stays; its wavelength, and with it the nominal throughput, is another one.
+        # A pixel keeps its throughput, but its wavelength, and with it the nominal throughput, changes.
         names = ("pixel_zero_nm", "dispersion_nm_per_pixel")
         moved = self.nominal.with_(**{name: self.changes[name] for name in names if name in self.changes})
         pixels = np.arange(moved.pixels)[self.nominal.read_pixels]
@@ -308,39 +308,44 @@ class CalibrateAnswer(Answer):
         nominal = self.nominal.throughput(np.clip(centres_nm, *self.nominal.curves_nm))
         factor = np.interp(knots, centres_nm, self.fitted_throughput / nominal)
         at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
-        # The light of these pixels in each of some bands.
+        # Light of the pixels at the knots in each band, shape (n_band, n_knot).
         band = at * MODE_BANDS // nm.size
         light = np.asarray(self.fitted_throughput[at] * (band == np.arange(MODE_BANDS)[:, None]))
         errors = ThroughputErrors.of_covariance(
             knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=light
         )
-        origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
-        # Pixels that are not read have the mean of the others.
-        level, bias, read = self.dark.level_dn_per_s, self.dark.bias_dn, self.nominal.read_pixels
-        level = level / (self.nominal.dark_dn_per_s if "dark current" in self.dark.assumed else level.mean())
-        dark, every_bias = np.full(moved.pixels, level.mean()), np.full(moved.pixels, bias.mean())
-        dark[read], every_bias[read] = level, bias
-        by_pixel: dict[str, Any] = {"pixel": np.arange(moved.pixels), "dark": dark}
-        for name in ("response", "gain", "read_noise_dn"):
-            if (column := getattr(self.nominal.pixel_map, name, None)) is not None:
-                by_pixel[name] = column
-        if "read_noise_dn" in by_pixel:
-            # The fit determines the mean variance of the pixels that are read.
-            noise_dn = by_pixel["read_noise_dn"]
-            rms_dn = np.sqrt(np.mean(noise_dn[read] ** 2))
-            fitted_dn = self.changes.get("read_noise_dn", rms_dn)
-            # A nominal map of zeros does not tell how pixels differ.
-            noise_dn = noise_dn * fitted_dn / rms_dn if rms_dn > 0 else np.full(moved.pixels, fitted_dn)
-            by_pixel["read_noise_dn"] = noise_dn * u.DN
-        if np.ptp(bias) > 0:
-            by_pixel["bias_dn"] = every_bias * u.DN
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
         values = {name: list(steps) for name, steps in errors.values.items()}
+        origin, step_nm = {"tag": "C", "source": self.source}, {"wavelength": knots * u.nm}
         return {
             "throughput-factor": QTable(step_nm | {"factor": factor}, meta=origin),
             "throughput-errors": QTable(step_nm | modes, meta=origin | {"values": values}),
-            "pixel-map": QTable(by_pixel, meta=origin, descriptions={"dark": "factor on the dark current"}),
+            "pixel-map": QTable(self._pixel_map, meta=origin, descriptions={"dark": "factor on the dark current"}),
         }
+
+    @property
+    def _pixel_map(self) -> dict[str, Any]:
+        """Columns of the map of pixels; those that are not read have the mean dark current and bias of the others."""
+        level, bias, read = self.dark.level_dn_per_s, self.dark.bias_dn, self.nominal.read_pixels
+        level = level / (self.nominal.dark_dn_per_s if "dark current" in self.dark.assumed else level.mean())
+        n_pixel = self.nominal.pixels
+        dark, every_bias = np.full(n_pixel, level.mean()), np.full(n_pixel, bias.mean())
+        dark[read], every_bias[read] = level, bias
+        columns: dict[str, Any] = {"pixel": np.arange(n_pixel), "dark": dark}
+        for name in ("response", "gain", "read_noise_dn"):
+            if (column := getattr(self.nominal.pixel_map, name, None)) is not None:
+                columns[name] = column
+        if "read_noise_dn" in columns:
+            # The fit determines the mean variance of the pixels that are read.
+            noise_dn = columns["read_noise_dn"]
+            rms_dn = np.sqrt(np.mean(noise_dn[read] ** 2))
+            fitted_dn = self.changes.get("read_noise_dn", rms_dn)
+            # A nominal map of zeros does not tell how pixels differ.
+            noise_dn = noise_dn * fitted_dn / rms_dn if rms_dn > 0 else np.full(n_pixel, fitted_dn)
+            columns["read_noise_dn"] = noise_dn * u.DN
+        if np.ptp(bias) > 0:
+            columns["bias_dn"] = every_bias * u.DN
+        return columns
 
     def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.

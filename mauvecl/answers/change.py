@@ -35,9 +35,8 @@ class ChangeRow(StarInCell):
     """One change of one star."""
 
     change: visits.Change
-    # error, error_known: standard error of one visit, with unknowns marginalised over and with everything known.
-    error: float
-    error_known: float
+    error: float  # standard error of one visit, unknowns marginalised over
+    error_known: float  # the same with everything known
     smallest: visits.SmallestChanges  # in the unit of the change
     ideal: float  # smallest difference of one visit if everything but the noise is known
     magnitude: float | None  # of the star
@@ -97,6 +96,7 @@ def _lost_pixels(lost: int, total: int) -> str:
 
 
 def _amount(value: float, unit: str) -> str:
+    """Format a change or its error with the unit, or as a percentage if it is relative."""
     if not np.isfinite(value):
         return "" if np.isnan(value) else "hidden"
     return f"{value:.3g} {unit}" if unit else f"{formatted(100 * value, '.3g')} %"
@@ -152,7 +152,7 @@ PERIOD_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class ChangeAnswer(Answer):
-    """Answer of `change`."""
+    """Answer of `change`: smallest detected changes, line indices, and periods that are recovered."""
 
     USES = ("instrument", "sky", "nuisances", "sweep")
 
@@ -165,23 +165,23 @@ class ChangeAnswer(Answer):
 
     #: One row per star, cell and change.
     table = TableOf(
-        "change", COLUMNS, "changes", place=True, key="rows",
+        "change", COLUMNS, "changes", by_star=True, key="rows",
         title=lambda answer: f"Smallest changes between {answer.visits}, at a false-alarm probability of "
         f"{answer.study.run.fap:g} and a power of {answer.study.limit.power:g}",
-        about=("study.change.visits", "study.run.fap", "study.limit.power", "study"),
+        meta=("study.change.visits", "study.run.fap", "study.limit.power", "study"),
     )  # fmt: skip
     #: One row per star, cell and line index.
     index_table = TableOf(
-        "indices", INDEX_COLUMNS, "indices", place=True, key="indices", about=(),
+        "indices", INDEX_COLUMNS, "indices", by_star=True, key="indices", meta=(),
         title=lambda answer: f"Line indices in {answer.exposure}" if answer.exposure else "Line indices",
     )  # fmt: skip
     #: One row per star, cell, change and magnitude.
-    magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", place=True, about=(),
+    magnitude_table = TableOf("magnitudes", MAGNITUDE_COLUMNS, "along", by_star=True, meta=(),
                               when="along")  # fmt: skip
     #: One row per star, cell, change, amplitude and period.
     period_table = TableOf(
-        "periods", PERIOD_COLUMNS, "periods", place=True, when="periods",
-        about=lambda answer: {"fap": answer.study.change.period_fap},
+        "periods", PERIOD_COLUMNS, "periods", by_star=True, when="periods",
+        meta=lambda answer: {"fap": answer.study.change.period_fap},
         title=lambda answer: f"Periods of {answer.periods[0].change.name} that {answer.study.change.visits} visits "
         "recover",
         shown=lambda table: table[table["change"] == table["change"][0]],

@@ -14,26 +14,29 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import special
 
+from mauvecl.answers.answer import Answer, TableOf
 from mauvecl.detection import MIN_IN_TAIL
 from mauvecl.detection.distributions import CONFIDENCE_SD
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.statistics import Matched, Setting, Statistic
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Comparison, unknown_values_of
-from mauvecl.schema.columns import Column, FirstItems, chance_text, number
+from mauvecl.schema.calls import validated
+from mauvecl.schema.columns import Column, chance_text, first_items, number, percent
 from mauvecl.schema.errors import InputError, Message
-from mauvecl.study.cases import Case
+from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
 from mauvecl.study.observation import KNOWN, NuisanceChoice
+from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
-    from mauvecl.study.study import Study
 
 
 @dataclass(frozen=True)
 class Cost:
-    """S/N of a flare by the matched statistic."""
+    """S/N of a flare by the matched statistic, with and without unknowns."""
 
     of: str  # star and flare
     known: float  # with everything known
@@ -47,23 +50,22 @@ def unknown_cost(
     """Return the S/N of a flare, named by `of`, with and without unknowns, or the documented ones if none are given."""
     chosen, used, matched = NuisanceChoice() if nuisances.none else nuisances, ~quiet.saturated, Matched()
     unknown = chosen.marginalised(quiet)
-    plain = Setting(quiet, used, comparison)
     delta = np.where(used, flare.recorded_light_dn - quiet.recorded_light_dn, 0.0)
     if unknown is None or not delta.any():
         return Cost(of, 0.0, 0.0, 0.0)
-    weights = matched.plain_weights(plain, flare)
+    weights = matched.plain_weights(Setting(quiet, used, comparison), flare)
     known_snr = float(weights @ delta)
     # Amplitudes have the standard deviations that are drawn by default, or else those of the prior.
     drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if chosen.usual}
-    spreads = zip(unknown.names, unknown.sd, strict=True)
-    sd = np.array([drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in spreads])
-    spread = sd * np.abs(unknown.spectra @ weights)
+    priors = zip(unknown.names, unknown.sd, strict=True)
+    sd = np.array([drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in priors])
+    scatter = sd * (unknown.spectra @ weights)
     try:
         marginal = matched.weights_per_dn(Setting(quiet, used, comparison, nuisances=unknown), flare)
     except InputError:
-        # The flare has the spectrum of an unknown.
+        # The spectrum of the flare is that of an unknown.
         marginal = np.zeros_like(weights)
-    return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
+    return Cost(of, known_snr, float(known_snr / np.sqrt(1.0 + np.sum(scatter**2))), float(marginal @ delta))
 
 
 def unknown_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
@@ -95,9 +97,82 @@ def spoken(choice: NuisanceChoice) -> str:
 
 
 def _size(sd: float | str, unit: str) -> str:
+    """Format the standard deviation of an unknown."""
     if sd in ("free", float("inf")):
         return "free"
     return f"+-{100 * float(sd) if unit == '%' else float(sd):g} {unit}".rstrip()
+
+
+#: Unknowns of `unknown_table` by their text.
+TABULATED: dict[str, NuisanceChoice] = {
+    spoken(choice): choice
+    for choice in (
+        NuisanceChoice(usual=False, dark=0.1),
+        NuisanceChoice(usual=False, light=0.01),
+        NuisanceChoice(usual=False, dark="free", light="free"),
+        NuisanceChoice(usual=False, sky=0.1),
+        NuisanceChoice(usual=False, tilt=0.01),
+    )
+}
+
+UNKNOWN_COLUMNS = (
+    star_column(),
+    amplitude_column(),
+    Column("unknown", description="what is unknown", heading="unknown"),
+    Column("known", "", "", "S/N of the matched statistic with everything known", "S/N, all known", ".3g"),
+    Column("plain", description="the same where it is unknown and the statistic does not know of it",
+           heading="S/N, not looked for", format=".3g"),
+    Column("marginalised", "marginal", "", "the same, marginalised", "S/N, marginalised", ".3g"),
+    Column("detected", description="detection probability of the marginalised statistic at the header's false alarms",
+           heading="then detected", format=percent(".3g")),
+    Column("smallest", description="flare amplitude that is detected, marginalised, at the header's power and false "
+           "alarms", heading="smallest flare", format=percent(".3g")),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownAnswer(Answer):
+    """Answer of `unknown_table`: S/N of each flare under each unknown."""
+
+    USES = ("instrument", "sky", "flare", "nuisances", "seed")
+
+    study: Study
+    rows: list[dict[str, Any]]  # S/N of each flare under each unknown, by the names of columns
+    messages: list[str]
+    inputs: list[Expectation]  # the stars without a flare
+
+    #: One row per star, flare and unknown.
+    table = TableOf(
+        "unknowns", UNKNOWN_COLUMNS, "rows",
+        title="What unknowns cost: S/N of the matched statistic, by closed forms",
+        meta=("study.run.fap", "study.limit.power", "study"),
+    )  # fmt: skip
+
+
+@validated
+def unknown_table(study: Study) -> UnknownAnswer:
+    """Compute the S/N of a study's flares under each of the unknowns of `TABULATED`.
+
+    S/N grows with the amplitude; the photon noise of the smallest flare is left out.
+    """
+    prepared, run, rows = cases(study, swept=False), study.run, list[dict[str, Any]]()
+    needed = special.ndtri(study.limit.power) - special.ndtri(run.fap)
+    for case in prepared:
+        flares = zip(case.amplitudes, case.flares, strict=True)
+        for (amplitude, flare), (unknown, choice) in itertools.product(flares, TABULATED.items()):
+            cost = unknown_cost(case.label, case.quiet, flare, choice, run.comparison())
+            rows.append(vars(cost) | {
+                "star": case.label, "amplitude": amplitude, "unknown": unknown,
+                "detected": float(power(cost.marginal, run.fap)),
+                "smallest": float(amplitude * needed / cost.marginal) if cost.marginal > 0 else float("inf"),
+            })  # fmt: skip
+    quiet = [case.quiet for case in prepared]
+    return UnknownAnswer(study, rows, collect_messages(quiet), quiet)
+
+
+def power(snr: float | Float, fap: float) -> Float:
+    """Return the detection probability of a normal statistic with some S/N, shape of the S/N."""
+    return np.asarray(special.ndtr(snr + special.ndtri(fap)))
 
 
 #: Column of the answer with everything but the noise known, the bound of the realistic answer next to it.
@@ -116,9 +191,9 @@ def ideal_chances(case: Case, flares: Sequence[Expectation], statistics: Sequenc
     return np.array([[_chance(setting, statistic, flare, fap) for statistic in statistics] for flare in flares])
 
 
-#: Kind of the message.
+#: Kind of the message of `chance_with_unknowns`.
 BOTH_CHANCES = "chance with unknowns"
-#: Largest number of flares of which the most uncertain is looked for.
+#: Largest number of flares among which the least certain one is sought.
 MAX_FLARES = 100
 
 
@@ -147,6 +222,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
 
 
 def _matched_chance(case: Case, flare: int) -> float:
+    """Return the closed-form chance of a flare of a case by the matched statistic."""
     peak = case.flares[flare]
     return _chance(case.setting(case.quiet, peak), Matched(), peak, case.study.run.fap)
 
@@ -164,7 +240,7 @@ REST = "the rest"
 
 @dataclass(frozen=True, eq=False)
 class DrawnStudies:
-    """Draws of unknown instrument values."""
+    """Draws of unknown instrument values, with the study of each."""
 
     names: tuple[str, ...]
     labels: tuple[str, ...]
@@ -172,7 +248,7 @@ class DrawnStudies:
     studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
 
 
-def drawn(study: Study) -> DrawnStudies:
+def draw_studies(study: Study) -> DrawnStudies:
     """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed.
 
     Raises InputError if a prior includes values that the instrument cannot have, or nothing is unknown.
@@ -270,7 +346,7 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     return {names[k]: max(float(share[k]), 0.0) for k in np.argsort(-share)} | {REST: 1.0 - explained[tuple(indices)]}
 
 
-#: Unknowns whose shares of a scatter are named, at most.
+#: Largest number of unknowns whose shares of a scatter are named.
 MAX_NAMED = 3
 
 
@@ -278,6 +354,5 @@ def describe_shares(shares: Mapping[str, float]) -> str:
     """Return the largest shares of a scatter in words, and how many there are."""
     if any(math.isnan(share) for share in shares.values()):
         return "sources that only more draws tell apart"
-    first = FirstItems(shares.items(), MAX_NAMED, "unknowns")
-    note = f" ({first.note})" if first.note else ""
-    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
+    first, note = first_items(shares.items(), MAX_NAMED, "unknowns")
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + (f" ({note})" if note else "")

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from operator import attrgetter, itemgetter, methodcaller
+from operator import attrgetter, methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import special
 
 from mauvecl.answers import closed_forms as forms
 from mauvecl.answers.answer import IF_KNOWN, Answer, StarInCell, TableOf, name_of_instrument, reported, share_column
@@ -25,11 +24,9 @@ from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
 from mauvecl.host.arrays import Float
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import validated
-from mauvecl.schema.columns import Column, View, chance_range, chance_text, percent
+from mauvecl.schema.columns import Column, View, chance_range, chance_text
 from mauvecl.schema.errors import InputError, Message, counted
-from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages, star_column
-from mauvecl.study.observation import NuisanceChoice
+from mauvecl.study.cases import Case, amplitude_column, cases, collect_messages
 from mauvecl.study.study import PAPER_STARS, Study
 
 if TYPE_CHECKING:
@@ -44,7 +41,7 @@ MOST_ROWS = 100_000
 
 @dataclass(frozen=True, eq=False)
 class StarDetection(StarInCell):
-    """A star in a cell of the sweep."""
+    """Detection of the flares of a star in a cell of the sweep."""
 
     amplitudes: tuple[float, ...]
     detection: Detection
@@ -53,13 +50,14 @@ class StarDetection(StarInCell):
 
 
 def _detection_columns(answer: DetectAnswer) -> tuple[Column, ...]:
+    """Return the columns of `DetectAnswer.table`, with the ideal probability next to the detection probability."""
     amplitude = amplitude_column(
         lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
         f"relative rise of the photons in the band {answer.study.flare.band}",
     )
-    place = [column.name for column in COLUMNS].index("high") + 1
+    after_interval = [column.name for column in COLUMNS].index("high") + 1
     share = share_column("detection.quiet.target_share")
-    return (share, amplitude, *COLUMNS[1:place], forms.IDEAL, *COLUMNS[place:])
+    return (share, amplitude, *COLUMNS[1:after_interval], forms.IDEAL, *COLUMNS[after_interval:])
 
 
 def _rows_of(star: StarDetection, fap: float) -> QTable:
@@ -88,7 +86,7 @@ def chance_of_flare(study: Study, star: str, amplitude: float, quiet: Expectatio
 
 @dataclass(eq=False)
 class DetectAnswer(Answer):
-    """Answer of `detect`."""
+    """Answer of `detect`: thresholds and probabilities, departures from closed forms, ROC curves and extreme values."""
 
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 
@@ -99,25 +97,25 @@ class DetectAnswer(Answer):
 
     #: One row per star, cell, flare and statistic.
     table = TableOf(
-        "detection", _detection_columns, "stars", place=True, key="rows",
-        of=lambda answer, star: _rows_of(star, answer.study.run.fap),
+        "detection", _detection_columns, "stars", by_star=True, key="rows",
+        row_table=lambda answer, star: _rows_of(star, answer.study.run.fap),
     )  # fmt: skip
     #: One row per star, cell and statistic, and per flare for shaped statistics; see `Departure`. The table is empty if
     #: thresholds are not counted.
     departures = TableOf(
-        "departures", DEPARTURE_COLUMNS, "stars", place=True, key="departures",
-        of=lambda answer, star: departure_table(star.detection, star.amplitudes, answer.study.run.fap),
+        "departures", DEPARTURE_COLUMNS, "stars", by_star=True, key="departures",
+        row_table=lambda answer, star: departure_table(star.detection, star.amplitudes, answer.study.run.fap),
     )  # fmt: skip
     #: All receiver operating characteristics with their areas; see `Roc`. Many flares share `MOST_ROWS` rows, so that
     #: each curve has fewer than its 200.
     roc = TableOf(
-        "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of(itemgetter("roc")) for column in AREA_COLUMNS)), "_curves",
-        place=True, about=("study.run.realisations", "study"),
+        "roc", (*FLARE_COLUMNS, *ROC_COLUMNS, *(column.of_part("roc") for column in AREA_COLUMNS)), "_curves",
+        by_star=True, meta=("study.run.realisations", "study"),
     )  # fmt: skip
     #: The extremes of every null (amplitude 0) and flare, with their realisations. Many flares share `MOST_ROWS` rows,
     #: so that each distribution has fewer than its 1000.
-    tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", of=lambda _, row: row["tail"], place=True,
-                    about=("study.run.seed", "study"))  # fmt: skip
+    tails = TableOf("tails", (*FLARE_COLUMNS, TEMPLATE_COLUMN), "_extremes", row_table=lambda _, row: row["tail"],
+                    by_star=True, meta=("study.run.seed", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -131,8 +129,8 @@ class DetectAnswer(Answer):
             never = f"no threshold has a false-alarm probability of {self.study.run.fap:g}"
             why = never if np.isnan(rows["threshold"]).any() else "every pixel saturates"
             return f"{self.instrument_name} would see none of these flares: {why}."
-        place = int(np.nanargmin(np.abs(chances - 0.5)))
-        row, star = rows[place], self.stars[place // len(self.stars[0].amplitudes)]
+        index = int(np.nanargmin(np.abs(chances - 0.5)))
+        row, star = rows[index], self.stars[index // len(self.stars[0].amplitudes)]
         ideal = f"; {chance_text(row['ideal'])} {IF_KNOWN}" if "ideal" in rows.colnames else ""
         least = f", the least certain of {known} flares" if known > 1 else ""
         chance = f"{chance_text(row['probability'])} ({chance_range(row['low'], row['high'])}{ideal})"
@@ -162,6 +160,7 @@ class DetectAnswer(Answer):
 
     @property
     def _curves(self) -> Iterator[dict[str, Any]]:
+        """Rows of `roc`, each with all points of a curve."""
         n_points = min(ROC_ROWS, self._row_limit(1))
         for star in self.stars:
             for statistic, (flare, amplitude) in product(star.detection.statistics, enumerate(star.amplitudes)):
@@ -170,6 +169,7 @@ class DetectAnswer(Answer):
 
     @property
     def _extremes(self) -> Iterator[dict[str, Any]]:
+        """Rows of `tails`, each with the extremes of a distribution."""
         n_values = self._row_limit(2)
         for star in self.stars:
             detection = star.detection
@@ -202,6 +202,9 @@ class DetectAnswer(Answer):
 @by_keywords("stars")
 def detect(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> DetectAnswer:
     """Simulate the detection of every flare of a study, for every star and sweep value.
+
+    The study's ``run`` gives statistics, false-alarm probability and realisations. Raises InputError if these are too
+    few to count the thresholds, unless ``run.tails`` allows for importance sampling.
 
     Examples
     --------
@@ -299,7 +302,7 @@ def _campaign(case: Case) -> list[str]:
     question, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
     if question.frames is None:
         return []
-    many = campaign(run.fap, question.frames, stack, step=question.step, seed=run.seed)
+    chances = campaign(run.fap, question.frames, stack, step=question.step, seed=run.seed)
 
     def overlap(interval: Interval | None, before: str, after: str = "") -> str:
         if interval is None:
@@ -307,19 +310,18 @@ def _campaign(case: Case) -> list[str]:
         ends = f"[{interval.low:.3g}, {interval.high:.3g}]"
         return f"{before} with the overlap of its stacks {interval.value:.3g} {ends}{after}"
 
-    lines, tests = list[str](), many.tests
-    frames, count = counted(question.frames, "frame"), counted(tests, "test")
-    lines.append(
-        f"A campaign of {frames} makes {count}: at {run.fap:g} per test {tests * run.fap:.3g} "
-        f"false alarms are expected, and the chance of any is {many.independent:.3g} if tests are independent, at most "
-        f"{many.bound:.3g}{overlap(many.overlapping, ';', ' for a linear statistic')}."
-    )
+    tests, count = chances.tests, counted(chances.tests, "test")
+    lines = [
+        f"A campaign of {counted(question.frames, 'frame')} makes {count}: at {run.fap:g} per test "
+        f"{tests * run.fap:.3g} false alarms are expected, and the chance of any is {chances.independent:.3g} if tests "
+        f"are independent, at most {chances.bound:.3g}{overlap(chances.overlapping, ';', ' for a linear statistic')}."
+    ]
     if question.fap is not None:
-        rate = per_test(question.fap, question.frames, stack, step=question.step, seed=run.seed)
+        needed = per_test(question.fap, question.frames, stack, step=question.step, seed=run.seed)
         lines.append(
             f"For a chance of {question.fap:g} of any false alarm in the campaign each of its {count} may have "
-            f"{rate.independent:.4g} if they are independent, {rate.bound:.4g} in any case"
-            f"{overlap(rate.overlapping, ', and')}: `fap={rate.bound:.4g}`."
+            f"{needed.independent:.4g} if they are independent, {needed.bound:.4g} in any case"
+            f"{overlap(needed.overlapping, ', and')}: `fap={needed.bound:.4g}`."
         )
     if question.alarms is not None:
         if not question.alarms < tests:
@@ -363,75 +365,3 @@ def _paper(prepared: Sequence[Case]) -> list[str]:
             f"reconstructed here {middle:.2f} ({low:.2f}-{high:.2f})"
         )
     return [*lines, WHY] if lines else []
-
-
-#: Default unknowns, which include those of the table in METHODS.
-SHOWN: dict[str, NuisanceChoice] = {
-    forms.spoken(choice): choice
-    for choice in (
-        NuisanceChoice(usual=False, dark=0.1),
-        NuisanceChoice(usual=False, light=0.01),
-        NuisanceChoice(usual=False, dark="free", light="free"),
-        NuisanceChoice(usual=False, sky=0.1),
-        NuisanceChoice(usual=False, tilt=0.01),
-    )
-}
-
-UNKNOWN_COLUMNS = (
-    star_column(),
-    amplitude_column(),
-    Column("unknown", description="what is unknown", heading="unknown"),
-    Column("known", "", "", "S/N of the matched statistic with everything known", "S/N, all known", ".3g"),
-    Column("plain", description="the same where it is unknown and the statistic does not know of it",
-           heading="S/N, not looked for", format=".3g"),
-    Column("marginalised", "marginal", "", "the same, marginalised", "S/N, marginalised", ".3g"),
-    Column("detected", description="detection probability of the marginalised statistic at the header's false alarms",
-           heading="then detected", format=percent(".3g")),
-    Column("smallest", description="flare amplitude that is detected, marginalised, at the header's power and false "
-           "alarms", heading="smallest flare", format=percent(".3g")),
-)  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class UnknownAnswer(Answer):
-    """Answer of `unknown_table`."""
-
-    USES = ("instrument", "sky", "flare", "nuisances", "seed")
-
-    study: Study
-    rows: list[dict[str, Any]]  # S/N of each flare under each unknown, by the names of columns
-    messages: list[str]
-    inputs: list[Expectation]  # the stars without a flare
-
-    #: One row per star, flare and unknown.
-    table = TableOf(
-        "unknowns", UNKNOWN_COLUMNS, "rows",
-        title="What unknowns cost: S/N of the matched statistic, by closed forms",
-        about=("study.run.fap", "study.limit.power", "study"),
-    )  # fmt: skip
-
-
-@validated
-def unknown_table(study: Study) -> UnknownAnswer:
-    """Compute the S/N of a study's flares under each of the unknowns of `SHOWN`.
-
-    S/N grows with the amplitude; the photon noise of the smallest flare is left out.
-    """
-    prepared, run, rows = cases(study, swept=False), study.run, list[dict[str, Any]]()
-    needed = special.ndtri(study.limit.power) - special.ndtri(run.fap)
-    for case in prepared:
-        flares = zip(case.amplitudes, case.flares, strict=True)
-        for (amplitude, flare), (unknown, choice) in product(flares, SHOWN.items()):
-            cost = forms.unknown_cost(case.label, case.quiet, flare, choice, run.comparison())
-            rows.append(vars(cost) | {
-                "star": case.label, "amplitude": amplitude, "unknown": unknown,
-                "detected": float(power(cost.marginal, run.fap)),
-                "smallest": float(amplitude * needed / cost.marginal) if cost.marginal > 0 else float("inf"),
-            })  # fmt: skip
-    quiet = [case.quiet for case in prepared]
-    return UnknownAnswer(study, rows, collect_messages(quiet), quiet)
-
-
-def power(snr: float | Float, fap: float) -> Float:
-    """Return the detection probability of a normal statistic with some S/N, shape of the S/N."""
-    return np.asarray(special.ndtr(snr + special.ndtri(fap)))

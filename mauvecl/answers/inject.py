@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -171,7 +170,7 @@ class StarCompleteness(StarInCell):
         for name, power in POWERS.items():
             limit = Column(name, "value", unit, f"{of} at which the completeness is {power:g}", name.upper(), size)
             around = interval_columns(f"{name}_{{}}", "{}", unit, heading=INTERVAL, format=ends, detail=power != 0.5)
-            columns += [column.of(itemgetter(name)) for column in (limit, *around)]
+            columns += [column.of_part(name) for column in (limit, *around)]
         text = "E50 if everything but the noise were known: E50 times the ratio of the S/N of a frame"
         ideal = Column("e50_ideal", lambda row: row["e50"].value * row["share"], unit, text, "ideal E50", size)
         return (
@@ -204,9 +203,9 @@ class StarCompleteness(StarInCell):
             *interval_columns("completeness_{}"),
             Column("injections", "count", "", "number of injected flares"),
         )
-        columns = [column.of(attrgetter("injected")) for column in cell_columns]
+        columns = [column.of_part("injected") for column in cell_columns]
         if self.fitted is not None:
-            columns += [column.of(attrgetter("fitted")) for column in ACCURACY_COLUMNS]
+            columns += [column.of_part("fitted") for column in ACCURACY_COLUMNS]
         return table_of(columns, [self])
 
     @property
@@ -235,7 +234,8 @@ class StarCompleteness(StarInCell):
         return messages
 
 
-def _search(answer: InjectAnswer) -> dict[str, object]:
+def _metadata(answer: InjectAnswer) -> dict[str, object]:
+    """Return the metadata of the tables: what is searched for."""
     choice, flare = answer.study.search, answer.study.flare
     return {
         "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
@@ -246,7 +246,7 @@ def _search(answer: InjectAnswer) -> dict[str, object]:
 
 @dataclass(eq=False)
 class InjectAnswer(Answer):
-    """Answer of `inject`."""
+    """Answer of `inject`: completeness by half-width and size, recovered values, thresholds and false alarms."""
 
     USES = ("instrument", "sky", "flare", "processes", "stare", "seed", "sweep")
 
@@ -255,11 +255,11 @@ class InjectAnswer(Answer):
     messages: list[str]
 
     #: Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each.
-    table = TableOf("limits", (SHARE,), "stars", of=lambda _, star: star.limits, place=True, about=_search)
+    table = TableOf("limits", (SHARE,), "stars", row_table="limits", by_star=True, meta=_metadata)
     #: One row per star, cell of the sweep, half-width and size.
-    completeness = TableOf("completeness", (SHARE,), "stars", of=lambda _, star: star.cells, place=True, about=_search)
+    completeness = TableOf("completeness", (SHARE,), "stars", row_table="cells", by_star=True, meta=_metadata)
     #: One row per star and cell of the sweep: thresholds, false alarms.
-    search = TableOf("search", SEARCH_COLUMNS, "stars", place=True, about=_search)
+    search = TableOf("search", SEARCH_COLUMNS, "stars", by_star=True, meta=_metadata)
 
     @property
     def headline(self) -> str:
@@ -269,13 +269,13 @@ class InjectAnswer(Answer):
         scale, unit = (100, "%") if star.size == "amplitude" else (1, unit)
         of = star.size.replace("_", " ")
         ideal = "" if np.isnan(star.ideal_share) else f"; {scale * half.value * star.ideal_share:.3g} {IF_KNOWN}"
-        least = first_of_several(len(self.stars), "cases")
+        of_several = first_of_several(len(self.stars), "cases")
         if not np.isfinite(half.value):
-            return f"Fewer than half of the injected flares on {star.title} are found at any {of}{least}."
+            return f"Fewer than half of the injected flares on {star.title} are found at any {of}{of_several}."
         return (
             f"A search of {self.instrument_name}'s frames of {star.title} would find half of the flares of "
             f"{of} {scale * half.value:.3g} {unit} ({scale * half.low:.3g} to {scale * half.high:.3g}{ideal}), "
-            f"with {self.study.search.rate_text}{least}."
+            f"with {self.study.search.rate_text}{of_several}."
         )
 
     @property
@@ -294,7 +294,11 @@ class InjectAnswer(Answer):
 
 @by_keywords("injections")
 def inject(study: Study, engine: Stares | Pool | None = None, progress: Progress = None) -> InjectAnswer:
-    """Compute the completeness of a study's search for every star and sweep value."""
+    """Compute the completeness of a study's search for every star and sweep value.
+
+    The study's ``search`` defines templates and false alarms, its ``injections`` the flares. Raises InputError for
+    sweeps of amplitude or exposure, which injections do not have, and if only some stars have a known size.
+    """
     idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
     if idle is not None:
         raise InputError(f"the sweep needs quantities that injections have, but has {idle!r}", key="sweep")
@@ -381,12 +385,13 @@ def _false_alarms(case: Case, survey: Survey, reduced: Reduced) -> dict[str, Any
         nothing = Interval(np.nan, np.nan, np.nan)
         return values | {"simulated": nothing, "sampled": np.nan, "alarmed": 0, "expected": np.nan}
     # Drawn stares may be longer than those of importance sampling.
-    longer = days / tail.days
-    none = (1 - likely) ** longer
-    reach = DIFFERS * np.hypot(np.sqrt(none * (1 - none) / n), longer * none / (1 - likely) * error)
-    p = float(np.mean(maxima >= checked))
+    ratio = days / tail.days
+    p_no_alarm = (1 - likely) ** ratio
+    errors = np.sqrt(p_no_alarm * (1 - p_no_alarm) / n), ratio * p_no_alarm / (1 - likely) * error
+    alarmed_share, half_width = float(np.mean(maxima >= checked)), DIFFERS * np.hypot(*errors)
     with np.errstate(divide="ignore"):
-        ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / days for x in (p, p - reach, p + reach)]
-        sampled = float(-np.log(none) / days)
+        shares = (alarmed_share, alarmed_share - half_width, alarmed_share + half_width)
+        ends = [-np.log1p(-np.clip(share, 0.0, 1.0)) / days for share in shares]
+        sampled = float(-np.log(p_no_alarm) / days)
     alarms = {"alarmed": int(np.sum(maxima >= threshold.value)), "expected": float(n * -np.expm1(-choice.rate * days))}
     return values | {"simulated": Interval(*map(float, ends)), "sampled": sampled} | alarms

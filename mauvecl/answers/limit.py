@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
 
 #: Ends of the search for the root of the closed form, hardest and easiest; the shortest exposure is a frame.
 SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (0.0, 1e6)}
@@ -173,10 +174,9 @@ class LimitSearch:
             values = np.arange(first, easiest - 0.1, -0.5).tolist()
         else:
             values = (first * 2.0 ** np.arange(np.ceil(np.log2(easiest / first)) + 1)).tolist()
-        exceeds = self.theory(first) >= self.power
-        if exceeds and self.of == "exposure":
-            return first
-        if exceeds:
+        if self.theory(first) >= self.power:
+            if self.of == "exposure":
+                return first
             raise self._beyond(first, "already exceeds")
         for before, value in pairwise(values):
             if self.theory(value) < self.power:
@@ -253,7 +253,7 @@ def _settle(question: LimitSearch, start: float) -> Interval:
         clipped = (min(max(q, 0.5 / n), 1 - 0.5 / n) for q in (p.value, p.low, p.high))
         probit, low, high = (float(special.ndtri(q)) for q in clipped)
         move = (goal - probit) / slope
-        # Half the interval's width away the slope's own error no longer counts.
+        # Within half the width of the interval, the error of the slope does not matter.
         if abs(goal - probit) <= max(0.5 * (high - low), 0.02):
             ends = [question.easier(at, (goal - q) / slope) for q in (low, high)]
             return Interval(question.easier(at, move), min(ends), max(ends))
@@ -298,31 +298,32 @@ def what_matters(study: Study) -> QTable:
     """
     rows = list[dict[str, Any]]()
     for case, statistic in product(_single_flares(cases(study, swept=False)), study.run.statistics):
-        payload, nominal, moves = case.instrument, LimitSearch(case, statistic).root(), list[dict[str, Any]]()
-        values, changes = unknown_values_of(payload), dict[str, dict[str, Mapping[str, Any]]]()
-        for name, prior in Unknowns().priors(payload).items():
-            if isinstance(prior, Uniform):
-                ends = (prior.low, prior.high)
-            else:
-                ends = (prior.mean - prior.sd, prior.mean + prior.sd)
-            value = values[name]
-            changes[value.label] = {f"{end:g}": value.changes(payload, float(f"{end:.12g}")) for end in ends}
-        changes["dark counts are Poisson in"] = {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}
-        for label, of_ends in changes.items():
-            changed = (replace(case, study=case.study.with_instrument(change)) for change in of_ends.values())
+        nominal, rows_of_case = LimitSearch(case, statistic).root(), list[dict[str, Any]]()
+        for label, changes in _changes_at_ends(case.instrument).items():
+            changed = (replace(case, study=case.study.with_instrument(change)) for change in changes.values())
             low, high = (LimitSearch(moved, statistic).root(near=nominal) for moved in changed)
-            low_end, high_end = of_ends
-            moves.append({
+            low_end, high_end = changes
+            rows_of_case.append({
                 "star": case.star.library or str(case.star.file), "amplitude": case.amplitudes[0],
                 "statistic": statistic, "assumption": label, "low_end": low_end, "high_end": high_end,
                 "nominal": nominal, "at_low_end": low, "at_high_end": high, "span": abs(high - low),
             })  # fmt: skip
-        rows += sorted(moves, key=lambda row: -row["span"])
+        rows += sorted(rows_of_case, key=lambda row: -row["span"])
     columns = limit_assumption_columns(study.limit.of)
     table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
     for name in (study.limit.of, "at_low_end", "at_high_end", "span"):
         table[name].info.format = LIMIT
     return table
+
+
+def _changes_at_ends(instrument: Instrument) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """Return the changes of an instrument at both ends of each assumption's range, by assumption and by end."""
+    values, changes = unknown_values_of(instrument), dict[str, dict[str, Mapping[str, Any]]]()
+    for name, prior in Unknowns().priors(instrument).items():
+        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
+        value = values[name]
+        changes[value.label] = {f"{end:g}": value.changes(instrument, float(f"{end:.12g}")) for end in ends}
+    return changes | {"dark counts are Poisson in": {unit: {"dark_unit": unit} for unit in ("DN", "electrons")}}
 
 
 def _single_flares(prepared: Sequence[Case]) -> list[Case]:
@@ -419,6 +420,7 @@ STATISTIC_COLUMN = Column("statistic", description="detection statistic", headin
 
 
 def _limit_columns(answer: LimitAnswer) -> tuple[Column, ...]:
+    """Return the columns of `LimitAnswer.table`."""
     of, digits, unit = answer.study.limit.of, DIGITS[answer.study.limit.of], QUANTITIES[answer.study.limit.of].unit
     unknown = _unknown_columns(of) if answer.study.unknowns.draws else ()
     return (
@@ -456,15 +458,16 @@ def _unknown_columns(of: str) -> tuple[Column, ...]:
     )  # fmt: skip
 
 
-def _drawn(answer: LimitAnswer) -> forms.DrawnStudies:
+def _draws(answer: LimitAnswer) -> forms.DrawnStudies:
     """Return the draws of what is unknown of the instrument, which are the same for all limits."""
     return next(limit.unknown.draws for limit in answer.limits if limit.unknown is not None)
 
 
 def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
-    draws = _drawn(answer)
+    """Return the columns of `LimitAnswer.draws`, with one for each unknown value."""
+    draws = _draws(answer)
     values = (
-        Column(name, itemgetter(k), description=f"drawn {label}").of(lambda row: row.unknown.draws.values.T)
+        Column(name, itemgetter(k), description=f"drawn {label}").of_part("unknown.draws.values.T")
         for k, (name, label) in enumerate(zip(draws.names, draws.labels, strict=True))
     )
     of = answer.study.limit.of
@@ -473,7 +476,7 @@ def _draw_columns(answer: LimitAnswer) -> tuple[Column, ...]:
 
 @dataclass(eq=False)
 class LimitAnswer(Answer):
-    """Answer of `limit`."""
+    """Answer of `limit`: limits with their closed forms and simulations, and what unknowns and assumptions change."""
 
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed", "sweep")
 
@@ -483,15 +486,15 @@ class LimitAnswer(Answer):
     assumptions: QTable | None = None  # change of the limits with assumptions about the instrument; see `what_matters`
 
     #: One row per star, flare and statistic.
-    table = TableOf("limit", _limit_columns, "limits", place=True, key="rows",
-                    about=("study.limit.power", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
+    table = TableOf("limit", _limit_columns, "limits", by_star=True, key="rows",
+                    meta=("study.limit.power", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
     #: One row per limit and draw of the unknown: its values and the closed-form limit.
-    draws = TableOf("unknowns", _draw_columns, "limits", place=True, when="study.unknowns.draws")
+    draws = TableOf("unknowns", _draw_columns, "limits", by_star=True, when="study.unknowns.draws")
     _assumptions = TableOf(
         "assumptions", lambda answer: limit_assumption_columns(answer.study.limit.of), "assumptions", key="assumptions",
         title=lambda answer: f"What is assumed, and how far it moves the closed-form limit of {answer.study.limit.of}, "
         "the largest first",
-        when=lambda answer: answer.assumptions is not None,
+        when="assumptions",
     )  # fmt: skip
 
     @property
@@ -508,11 +511,11 @@ class LimitAnswer(Answer):
         flare = "flares" if question.of == "amplitude" else f"a flare of {100 * limit.amplitude:g} %"
         within = "" if question.of == "exposure" else f" in {limit.quiet.exposure_s:g} s"
         ideal = "" if np.isnan(limit.ideal) else f"; {number(limit.ideal)} {IF_KNOWN}"
-        least = first_of_several(len(self.limits), "limits")
+        of_several = first_of_several(len(self.limits), "limits")
         return (
             f"{self.instrument_name} would see {flare} on {limit.subject}{within} with a "
             f"chance of {100 * question.power:g} % {before} {number(limit.value.value)} "
-            f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){least}."
+            f"({number(limit.value.low)} to {number(limit.value.high)}{ideal}){of_several}."
         )
 
     @property
@@ -520,7 +523,7 @@ class LimitAnswer(Answer):
         of, run, draws = self.study.limit.of, self.study.run, self.study.unknowns.draws
         columns = LimitAnswer.table.columns_of(self)
         shown = (*(column for column in columns if column.name != "unknown_low"), Column("verdict", heading="verdict"))
-        run = _drawn(self).studies[0].run if draws else run
+        run = _draws(self).studies[0].run if draws else run
         title = (
             f"Limit of {of} at a detection probability of {self.study.limit.power:g}, false-alarm probability "
             f"{run.fap:g} per test, {run.realisations:,} realisations{' of each draw' if draws else ''}"
@@ -529,7 +532,7 @@ class LimitAnswer(Answer):
         if draws:
             heading = "matters most, share of the variance"
             column = Column("shares", lambda row: forms.describe_shares(row.unknown.shares), heading=heading)
-            shown = (*self.placed(self.flare_columns), *_unknown_columns(of)[:2], column)
+            shown = (*self.with_star(self.flare_columns), *_unknown_columns(of)[:2], column)
             unknown = "what is unknown of the instrument: the limits of each, and what explains their scatter"
             views.append(View(f"Averaged over {draws} draws of {unknown}", shown, table_of(shown, self.limits)))
         return [*views, *super().views]
@@ -557,7 +560,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     """
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    draws = forms.drawn(study) if study.unknowns.draws else None
+    draws = forms.draw_studies(study) if study.unknowns.draws else None
     searches = [LimitSearch(replace(case, study=drawn), statistic, engine) for drawn in draws.studies] if draws else []
     question = LimitSearch(case, statistic, engine, report, searches)
     # The root of the nominal instrument is near and found quickly.
@@ -569,18 +572,18 @@ def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[i
     *points, check = question.points
     quiet, flare = question.pair(value.value)
     is_ideal, ideal = study.nuisances.none, case.with_sections(nuisances=KNOWN)
-    named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
-    rise = value.value if question.of == "amplitude" else case.amplitudes[0]
-    there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
-    where = f"{star_label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
+    star = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
+    label, rise = star_label(star, quiet), value.value if question.of == "amplitude" else case.amplitudes[0]
+    limit_text = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
+    flare_text = f"{label} at {limit_text}, flare of {100 * rise:.4g} %"
     amplitude = float("nan") if question.of == "amplitude" else case.amplitudes[0]
     return Limit(
-        star_label(named, quiet), case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
+        label, case.at, amplitude, question.of, statistic, question.power, value, closed_form=theory,
         ideal=float("nan") if is_ideal else LimitSearch(ideal, statistic).root_or_nan(theory),
         check=check, points=tuple(points), curve=question.curve(value.value),
         unknown=UnknownEffect(draws, roots, forms.shares(draws, roots)) if draws else None,
         messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)), quiet=quiet,
-        cost=forms.unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
+        cost=forms.unknown_cost(flare_text, quiet, flare, study.nuisances, study.run.comparison()),
     )  # fmt: skip
 
 

@@ -47,11 +47,12 @@ COLUMNS = (
     Column("closed_form", description="the same for Gaussian noise"),
     forms.IDEAL,
 )
-#: Arrays of the answer: chances and both ends of their interval, those of the closed form, and with everything known.
+#: Fields of `MapAnswer` with arrays: the probability, the ends of its interval, the closed form, and the ideal one.
 NUMBERS = ("probability", "low", "high", "closed_form", "ideal")
 
 
 def _cell_columns(answer: MapAnswer) -> tuple[Column, ...]:
+    """Return the columns of `MapAnswer.table`, whose values are broadcast to (n_statistic, n_y, n_x)."""
     x, y = (axis.quantity for axis in answer.study.map.axes)
     return (
         quantity_column(x, lambda answer: np.array(answer.x)),
@@ -87,7 +88,7 @@ class MapAnswer(Answer):
 
     #: One row per cell and statistic.
     table = TableOf("map", _cell_columns, lambda answer: answer,
-                    about=("star", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
+                    meta=("star", "study.run.fap", "study.run.realisations", "study"))  # fmt: skip
 
     @property
     def headline(self) -> str:
@@ -142,7 +143,7 @@ def map(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
     if study.map.x is None:
         study = study.model_copy(update={"map": study.map.model_copy(update={"x": magnitudes_of(case)})})
         case = case.with_sections(map=study.map)
-    unknown = forms.drawn(case.study) if study.unknowns.draws else None
+    unknown = forms.draw_studies(case.study) if study.unknowns.draws else None
     draws = [case] if unknown is None else [replace(case, study=draw) for draw in unknown.studies]
     x, y = study.map.axes
     total = len(draws) * len(x.points()) * len(y.points())
@@ -174,15 +175,16 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
         text = f"SATURATED: every pixel that counts saturates in {lost.sum()} of {lost.size} cells: no number there."
         messages.append(Message(text, SATURATED))
     missing = np.isnan(probability) & ~np.isnan(closed_form)
-    for statistic, there in zip(run.statistics, missing, strict=True):
-        if there.any():
+    for statistic, cells_without in zip(run.statistics, missing, strict=True):
+        if cells_without.any():
             messages.append(Message(
-                f"NO THRESHOLD: in {there.sum()} of {there.size} cells no threshold of {statistic} has a false-alarm "
-                f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no "
-                "number there; `mauvecl detect` names the probabilities that thresholds have.", "no threshold",
+                f"NO THRESHOLD: in {cells_without.sum()} of {cells_without.size} cells no threshold of {statistic} has "
+                f"a false-alarm probability of {run.fap:g}, because one value is more probable, as saturated pixels "
+                "give it: no number there; `mauvecl detect` names the probabilities that thresholds have.",
+                "no threshold",
             ))  # fmt: skip
-    for why, there in cells.failed.items():
-        messages.append(Message(f"NO ANSWER in {len(there)} of {number_of_cells} cells: {why}.", "no answer"))
+    for reason, failed in cells.failed.items():
+        messages.append(Message(f"NO ANSWER in {len(failed)} of {number_of_cells} cells: {reason}.", "no answer"))
     marginalised = "" if study.nuisances.none else "marginalised over unknowns, "
     lowered = Counter(statistic for statistic, *_ in cells.lowered)
     for statistic in (name for name in run.statistics if lowered[name]):
@@ -194,10 +196,10 @@ def _messages(case: Case, cells: MapCells, values: Float) -> list[str]:
     messages += worst_first([*collect_messages(cells.quiet, study.processes), *cells.saturated])
     # What unknowns cost in the middle of the map.
     middle = cells.x[len(cells.x) // 2], cells.y[len(cells.y) // 2]
-    there, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
-    at = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
-    comparison = study.run.comparison()
-    cost = forms.unknown_cost(f"the cell of {at}", there.quiet, there.flares[0], study.nuisances, comparison)
+    cell, axes = _cell(case, *middle), zip(study.map.axes, middle, strict=True)
+    values_of_axes = " and ".join(f"{axis.quantity.replace('_', ' ')} {_shown(value)}" for axis, value in axes)
+    name, comparison = f"the cell of {values_of_axes}", study.run.comparison()
+    cost = forms.unknown_cost(name, cell.quiet, cell.flares[0], study.nuisances, comparison)
     return [*messages, *forms.unknown_lines([cost], study.nuisances)]
 
 
@@ -237,6 +239,7 @@ def magnitudes_of(case: Case) -> Axis:
 
 
 def _shown(value: float | str) -> str:
+    """Format a value of an axis."""
     return value if isinstance(value, str) else f"{value:.4g}"
 
 

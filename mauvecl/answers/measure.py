@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, product
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,7 +72,7 @@ def true_values(case: Case, amplitude: float, names: Iterable[str]) -> dict[str,
         hot = scale * photons(at, body.flux(at), band)
         values |= {"temperature": kelvin, "amplitude": hot / photons(at, quiet.flux_flam, band)}
     if kelvin is not None and two is not None:
-        # The first is the cooler one.
+        # The first temperature is the lower one.
         (low, first), (high, second) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
         values |= {"temperature": low, "second temperature": high, "second area": second / first}
     if continuum.surface:
@@ -144,9 +143,10 @@ class ExpectedMeasurement(StarInCell):
         return ahead
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
-        """Return temperatures of the expected confidence region, with the smallest and largest amplitude at each.
+        """Return temperatures (K) of the expected confidence region, with the smallest and largest amplitude at each.
 
-        A `rise` of chi-squared bounds the region; everything else is profiled. Only for models of one temperature.
+        A `rise` of chi-squared bounds the region; everything else is profiled. The arrays have the shape (n,). Only for
+        models of one temperature.
         """
         assert isinstance(self.fitted, FlareModel)
         best, linear = self.perfect.log_k, self.perfect.factor[0] * self.perfect.amplitudes[0]
@@ -245,9 +245,10 @@ def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | Non
 def matched_filter(
     quiet: Expectation, flare: Expectation, unknown: Nuisances | None, added_dn: Float | None, skipped_nm: Ranges
 ) -> tuple[Float, float]:
-    """Return the weights of a matched filter of variance one, and its mean with the flare.
+    """Return the weights of a matched filter of variance one, per DN, shape (n_pixel,), and its mean with the flare.
 
-    The variance is that of the quiescent star, or of one with some light added.
+    The variance is that of the quiescent star, or of one with some light added (DN). The mean is 0 if the used pixels
+    have no light of the flare that unknowns leave.
     """
     variance, used = usable_variance(quiet, added_dn, skipped_nm)
     delta = (flare.recorded_dn - quiet.recorded_dn) * used
@@ -426,7 +427,7 @@ JOINT_COLUMNS = (
 def _bin_columns(stare: MeasuredStare) -> list[Column]:
     """Return the columns of measurements along a stare."""
     assert stare.drawn is not None
-    columns = [column.of(attrgetter("drawn")) for column in stare.drawn.columns]
+    columns = [column.of_part("drawn") for column in stare.drawn.columns]
     exact = Column("temperature_without_noise", lambda row: row.perfect.found.estimates[:, 0], "K",
                    "temperature fitted to the means of these frames", "without noise", ".0f")  # fmt: skip
     place = [column.name for column in columns].index("temperature") + 1
@@ -435,7 +436,7 @@ def _bin_columns(stare: MeasuredStare) -> list[Column]:
 
 @dataclass(eq=False)
 class MeasureAnswer(Answer):
-    """Answer of `measure`."""
+    """Answer of `measure`: forecast errors, simulated fits and their coverage, and measurements along stares."""
 
     USES = ("instrument", "sky", "flare", "processes", "nuisances", "seed", "sweep")
 
@@ -447,7 +448,7 @@ class MeasureAnswer(Answer):
 
     #: Errors, bias and coverage; one row per star, cell, flare, model and quantity.
     table = TableOf(
-        "measure", (amplitude_column(), MODEL_COLUMN, *COLUMNS), "flares", place=True, key="rows",
+        "measure", (amplitude_column(), MODEL_COLUMN, *COLUMNS), "flares", by_star=True, key="rows",
         title=lambda answer: f"Measured in one exposure; {answer.study.measure.fits} simulated fits of each flare",
         shown=lambda table: table[table["unit"] != "erg / s"],
     )  # fmt: skip
@@ -455,19 +456,19 @@ class MeasureAnswer(Answer):
     temperatures = TableOf(
         "temperatures",
         lambda answer: [replace(MODEL_COLUMN, heading=""), *chain(*map(_bin_columns, answer.binned[:1]))],
-        lambda answer: answer.binned or QTable(), place=True, key="temperatures", when="study.measure.snr_per_bin",
-        of=lambda _, stare: table_of(_bin_columns(stare), [stare]),
+        lambda answer: answer.binned or QTable(), by_star=True, key="temperatures", when="study.measure.snr_per_bin",
+        row_table=lambda _, stare: table_of(_bin_columns(stare), [stare]),
         title=lambda answer: answer.binned and f"Measured along the stare, in bins of S/N "
         f"{answer.study.measure.snr_per_bin:g}",
     )  # fmt: skip
     #: Joint fits of shape and spectrum; one row per star, cell and quantity.
     joint = TableOf(
-        "joint", JOINT_COLUMNS, "stares", place=True, key="joint", when="study.measure.joint_fit",
+        "joint", JOINT_COLUMNS, "stares", by_star=True, key="joint", when="study.measure.joint_fit",
         title="One stare: shape and spectrum of the flare, fitted to all frames together",
         shown=lambda table: table[table["unit"] != "erg / cm2"],
     )  # fmt: skip
     #: Goodness of fit and detection; one row per star, cell, flare and model.
-    fits = TableOf("fits", (amplitude_column(), MODEL_COLUMN, *FIT_COLUMNS), "flares", place=True, key="fits",
+    fits = TableOf("fits", (amplitude_column(), MODEL_COLUMN, *FIT_COLUMNS), "flares", by_star=True, key="fits",
                    title="Goodness of fit")  # fmt: skip
 
     @property
@@ -500,7 +501,11 @@ class MeasureAnswer(Answer):
 
 @by_keywords("flares")
 def measure(study: Study, engine: Engine | Pool | None = None, progress: Progress = None) -> MeasureAnswer:
-    """Forecast and simulate the measurement of a study's flares in one exposure."""
+    """Forecast and simulate the measurement of a study's flares in one exposure.
+
+    The study's ``measure`` gives the models, the number of fits, and whether flares of a stare are measured as well.
+    Raises InputError for flares that replace photosphere, and for amplitudes of 0.
+    """
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added', since fits take light for added")
     if study.measure.along_stare:
@@ -549,7 +554,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     batches: list[Arrays] = []
     for start in range(0, study.measure.fits, BATCH):
         count = min(BATCH, study.measure.fits - start)
-        # The number changes with the arrays that a fit keeps.
+        # Another number than 2 is needed if fits keep other arrays, so that older checkpoints are not read.
         depends_on = ("measure", 2, quiet, flare, unknown, models, study.text(), start, count)
         batches.append(checkpointed(checkpoint, depends_on, partial(fitted, start, count)))
     selected = np.concatenate([arrays["detected"] for arrays in batches])

@@ -373,7 +373,7 @@ ENERGY_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
-    """Answer of `plan`."""
+    """Answer of `plan`: hours, recovered flares and false alarms of each target, and everything that is assumed."""
 
     USES = ("instrument", "flare", "orbit", "processes", "stare", "seed")
 
@@ -382,7 +382,7 @@ class PlanAnswer(Answer):
     planned: tuple[PlannedTarget, ...]
 
     #: One row per target.
-    table = TableOf("plan", COLUMNS, "planned", title=lambda answer: answer.heading, about=lambda answer: {
+    table = TableOf("plan", COLUMNS, "planned", title=lambda answer: answer.heading, meta=lambda answer: {
         "start": answer.seen.times.iso(0.0), "days": answer.seen.times.days,
         "false_alarms_per_day": answer.study.search.rate, "study": answer.study.text()})  # fmt: skip
     #: Inputs, one row per target.
@@ -392,7 +392,7 @@ class PlanAnswer(Answer):
     months = TableOf("months", (), "seen.months")
     days = TableOf("days", (), "seen.by_day")
     #: All assumptions with their sources.
-    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", about=())
+    assumptions = TableOf("assumptions", assumption_columns("assumption"), "_assumptions", meta=())
 
     @property
     def headline(self) -> str:
@@ -594,9 +594,9 @@ def plan(
 
 def _planned(visible: VisibleAnswer, completeness: CompletenessOf, target: TargetObservation) -> PlannedTarget:
     """Return the plan of an observed target."""
-    study, k, its = visible.study, target.number, None
+    study, k, share = visible.study, target.number, None
     if target.window_s > 0:
-        its = completeness(target) if target.signal_per_frame > 0 else NOTHING
+        share = completeness(target) if target.signal_per_frame > 0 else NOTHING
     exposed, (names, hours) = float(visible.visibility.hours[k]), visible.by_month
     observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
     days = observed * 3600 / DAY_S
@@ -606,8 +606,8 @@ def _planned(visible: VisibleAnswer, completeness: CompletenessOf, target: Targe
     rates, why = rates_of(target)
     recovered, ideal = None, float("nan")
     if rates is not None:
-        recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
-        if study.nuisances.usual and its not in (None, NOTHING):
+        recovered = Yield.of_expected(0.0, 0.0) if share is None else Yield.of(rates, share, days)
+        if study.nuisances.usual and share not in (None, NOTHING):
             ideal = recovered_per_day(rates, closed_form(target, ideal=True)) * days
     errors = errors_of_throughput(target, rates)
-    return PlannedTarget(target, exposed, observed, its, rates, recovered, best, why, errors, ideal)
+    return PlannedTarget(target, exposed, observed, share, rates, recovered, best, why, errors, ideal)

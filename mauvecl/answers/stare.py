@@ -8,11 +8,12 @@ QUALITY, CADENCENO.
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, product
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     from mauvecl.search.survey import Factor
     from mauvecl.study.observation import SkyLight
 
-#: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
+#: Start of a stare whose study names no time: 2026-01-01, MJD. The choice is arbitrary.
 NO_TIME_MJD = 61_041.0
 
 
@@ -138,7 +139,7 @@ class StareFlare(StarInCell):
 
     event: Event
     band_erg: float  # NaN if the star's size is unknown
-    bolometric_erg: float  # likewise
+    bolometric_erg: float  # NaN if the star's size is unknown
     snr: float  # of the matched filter for this flare
 
 
@@ -217,7 +218,8 @@ def _fitted(
     name: str, key: str, unit: str, text: str, heading: str = "", form: Any = "", *more: str, detail: bool = False
 ) -> list[Column]:
     """Return the columns of a fitted quantity: value, standard error, and ends of its 68 % interval."""
-    error = key.replace("_s", "_error_s").replace("_k", "_error_k") if key[-2:] in ("_s", "_k") else f"{key}_error"
+    # The unit of a value is the end of its name, as in `peak_s` and `peak_error_s`.
+    error = re.sub("(_[sk])?$", r"_error\1", key, count=1)
     return [
         Column(name, lambda row: float(getattr(row.alarm.recovered, key)[0]), unit, text, heading, form, more,
                detail=detail),
@@ -280,7 +282,7 @@ SEED = ("study", "study.run.seed")
 
 @dataclass(eq=False)
 class StareAnswer(Answer):
-    """Answer of `stare`."""
+    """Answer of `stare`: light curves and spectra of each stare, its flares, and those that a search finds."""
 
     USES = ("instrument", "sky", "flare", "processes", "stare", "seed", "sweep")
 
@@ -289,21 +291,21 @@ class StareAnswer(Answer):
     messages: list[str] = field(default_factory=list)
 
     #: One row per star and cell: frames, gaps, light and noise of a frame, flares.
-    table = TableOf("stare", COLUMNS, "stares", place=True, title="One stare each", key="stares", about=SEED)
+    table = TableOf("stare", COLUMNS, "stares", by_star=True, title="One stare each", key="stares", meta=SEED)
     #: One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter.
     events = TableOf(
         "events", EVENT_COLUMNS, lambda answer: chain.from_iterable(stare.flares for stare in answer.stares),
-        place=True, title="Flares in them; S/N if everything but the presence of the flare is known",
-        key="events", about=SEED,
+        by_star=True, title="Flares in them; S/N if everything but the presence of the flare is known",
+        key="events", meta=SEED,
     )  # fmt: skip
     #: One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
     #: Values are NaN where the fit does not measure the flare: `note` says why.
     found = TableOf(
-        "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares), place=True,
-        key="found", when="study.stare.search", about=SEED,
+        "found", FOUND_COLUMNS, lambda answer: chain.from_iterable(stare.found for stare in answer.stares),
+        by_star=True, key="found", when="study.stare.search", meta=SEED,
     )  # fmt: skip
 
-    def placed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+    def with_star(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Return columns after those of the star and of all swept quantities; the amplitude is that of each flare."""
         return (*place_columns(self.study.sweep), *columns)
 
@@ -312,15 +314,15 @@ class StareAnswer(Answer):
         """The number of flares that the search of the first stare finds, or what is drawn."""
         stare = self.stares[0]
         frames, flares = stare.staring.stare.n_frames, len(stare.flares)
-        least = first_of_several(len(self.stares), "stares")
+        of_several = first_of_several(len(self.stares), "stares")
         drawn = f"{counted(flares, 'flare')} in {counted(frames, 'frame')} of {stare.title}"
         if np.isnan(stare.threshold):
-            return f"The stare has {drawn}, which {'is' if flares == 1 else 'are'} not searched for{least}."
+            return f"The stare has {drawn}, which {'is' if flares == 1 else 'are'} not searched for{of_several}."
         events = [flare.event for flare in stare.found]
         number_found, false, unknown = len({*events} - {0, -1}), events.count(0), events.count(-1)
         alarms = counted(false, "false alarm") if false else "no false alarms"
         rest = f"; {counted(unknown, 'alarm')} {'is' if unknown == 1 else 'are'} not measured" if unknown else ""
-        return f"The search finds {number_found} of {drawn} and raises {alarms}{least}{rest}."
+        return f"The search finds {number_found} of {drawn} and raises {alarms}{of_several}{rest}."
 
     @property
     def views(self) -> list[View]:
@@ -338,7 +340,7 @@ class StareAnswer(Answer):
         columns = [*FRAME_COLUMNS, *(() if star.pointing_loss is None else (LOSS_COLUMN,))]
         for (k, band), (kind, (attribute, text)) in product(enumerate(star.light.bands), LIGHT.items()):
             column = Column(kind + band_suffix(band, k), itemgetter(k), "DN / s", f"{band}: {text}")
-            columns.append(column.of(attrgetter(f"light.{attribute}.T")))
+            columns.append(column.of_part(f"light.{attribute}.T"))
         return table_of(columns, [star], star=star.label, **answer_metadata(self, *SEED), **star.at)
 
     @property
@@ -392,7 +394,7 @@ def stare(
             f"a stare with a spectrum for each frame must have at most {MOST_SHOWN} frames, not {frames}",
             key="stare.duration_s",
         )
-    # Bad input is refused before anything is drawn.
+    # Invalid input raises an error before anything is drawn.
     quiet = [case.stare_expectation.quiet for case in prepared]
     engine = engine or Stares()
     drawn = [_draw(case, engine, checkpoint) for case in reported(prepared, len(prepared), progress)]

@@ -29,13 +29,13 @@ FEWER = {"run.realisations": 100_000}
 
 # Keys of a study whose flags verbs take, in the order of `--help`.
 
-#: Those of a star's spectrum, brightness and neighbours.
+#: Keys of a star's spectrum, brightness and neighbours.
 STAR = (
     *("library", "magnitude", "band", "magnitude_system", "ebv", "wavelength_unit", "flux_unit", "extend"),
     *("ignore_checksum", "bin_nm", "neighbours", "neighbours_of", "neighbour_share"),
 )
 INSTRUMENT = ("observation.instrument", "observation.temperature_c")
-#: Those of every verb that observes.
+#: Keys of every verb that observes.
 OBSERVATION = (*(f"star.{key}" for key in STAR), "observation.exposure_s", *INSTRUMENT, "sky")
 WITHOUT_EXPOSURE = tuple(key for key in OBSERVATION if key != "observation.exposure_s")
 SIZE = ("star.distance_pc", "star.radius_rsun", "star.effective_temperature_k")
@@ -52,7 +52,7 @@ FLARE_LIGHT = tuple(
     f"flare.{key}" for key in ("temperature_k", "band", "geometry", "photosphere_temperature_k", "spectrum")
 )
 ALARMS = ("search.false_alarms", "search.per")
-#: Those of verbs that look from the orbit; targets are given in another way.
+#: Keys of the orbit, apart from the targets, which `TARGETS` has.
 ORBIT = (*(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")), "orbit.limits")
 TARGETS = ("orbit.targets", "plan.targets")
 #: Flags that `--help` shows of every verb that has them; `--help-all` shows all.
@@ -74,7 +74,7 @@ class Verb:
     defaults: Mapping[str, Any] | None = None
     # Makes the study from the flags where no file is given; the paper's question by default.
     default: Callable[[dict[str, Any]], Study] | None = None
-    # Whether the page has a tab with this answer; one without a class of its own shows its first view.
+    # Whether the page has a tab for the answer; a tab without a class of its own shows the answer's first view.
     tab: bool = False
 
     def accepts(self, key: str) -> bool:
@@ -129,7 +129,7 @@ def _formula_grid(values: dict[str, Any]) -> Study:
     return Study(sweep=Sweep(axes=(*magnitudes, Axis(quantity="exposure", values=exposures))))
 
 
-#: By name, in the order of `mauvecl --help`: one star, flares, hours and campaigns.
+#: Verbs by name, in the order of `mauvecl --help`: for one star, for flares, for hours and for campaigns.
 VERBS: dict[str, Verb] = {
     verb.name: verb
     for verb in (

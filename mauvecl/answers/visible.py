@@ -107,6 +107,7 @@ def assumption_columns(first: str) -> tuple[Column, ...]:
 
 
 def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
+    """Return the columns of `VisibleAnswer.table`."""
     limits = (
         Column(f"leaves_{name}", itemgetter(f"leaves_{name}"), "",
                f"share of the time that the limit of {name} alone leaves")
@@ -118,7 +119,7 @@ def _target_columns(answer: VisibleAnswer) -> tuple[Column, ...]:
 
 @dataclass(frozen=True, eq=False)
 class VisibleAnswer(Answer):
-    """Answer of `visible`."""
+    """Answer of `visible`: hours, windows and sky of each target, by day and month, and the assumed limits."""
 
     USES = ("orbit",)
 
@@ -130,7 +131,7 @@ class VisibleAnswer(Answer):
     table = TableOf(
         "visible", _target_columns, lambda answer: [answer._row(k) for k in range(len(answer.targets))],
         title=lambda answer: f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
-        about=lambda answer: {"start": answer.times.iso(0.0), **answer_metadata(answer, "times.days", "study")},
+        meta=lambda answer: {"start": answer.times.iso(0.0), **answer_metadata(answer, "times.days", "study")},
     )  # fmt: skip
     #: One row per month, one column of hours per target.
     months = TableOf("months", lambda answer: (
@@ -141,21 +142,22 @@ class VisibleAnswer(Answer):
     by_day = TableOf("days", DAY_COLUMNS, "_day_rows")
     #: One row per window.
     window_table = TableOf("windows", WINDOW_COLUMNS, "_window_rows", when="writes_windows",
-                           about=("study", "times.step_s"))  # fmt: skip
+                           meta=("study", "times.step_s"))  # fmt: skip
     #: Active limits with their values and the sources of their defaults.
-    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions", about=())
+    assumptions = TableOf("assumptions", assumption_columns("limit"), "visibility.limits.assumptions", meta=())
 
     @property
     def headline(self) -> str:
         """The hours in which the first target is seen."""
         row, duty_cycle = self._row(0), self.visibility.limits.duty_cycle
-        least = first_of_several(len(self.targets), "targets")
+        days = f"{self.times.days:g} days from {self.times.iso(0.0)[:10]}"
+        of_several = first_of_several(len(self.targets), "targets")
         if not row["hours"]:
-            return f"{row['target']} is not seen in {self.times.days:g} days from {self.times.iso(0.0)[:10]}{least}."
+            return f"{row['target']} is not seen in {days}{of_several}."
         exposed = "" if duty_cycle == 1 else f" and exposed for {row['hours']:.0f} h"
         return (
-            f"{row['target']} is seen for {row['hours'] / duty_cycle:.0f} h ({100 * row['share']:.1f} % of "
-            f"{self.times.days:g} days from {self.times.iso(0.0)[:10]}){exposed}, most in {row['best_month']}{least}."
+            f"{row['target']} is seen for {row['hours'] / duty_cycle:.0f} h ({100 * row['share']:.1f} % of {days})"
+            f"{exposed}, most in {row['best_month']}{of_several}."
         )
 
     @property
@@ -197,7 +199,7 @@ class VisibleAnswer(Answer):
         """Return the row of a target, by the names of columns."""
         visibility, windows, target = self.visibility, self.windows[k], self.targets[k]
         hours, away, sky = self.by_month[1][:, k], self.elongation_deg(k), self.zodiacal[k]
-        # The least and the largest value of no values is none.
+        # Without a finite value, a NaN stands for all of them.
         sky = sky[np.isfinite(sky)] if np.isfinite(sky).any() else sky[:1]
         length, end_s = windows.length_s, self.times.n * self.times.step_s
         exposed, orbit_min = visibility.share[k] * visibility.limits.duty_cycle, visibility.orbit.elements.period_s / 60
@@ -226,12 +228,14 @@ class VisibleAnswer(Answer):
 
     @property
     def _day_rows(self) -> Iterator[dict[str, Any]]:
+        """Rows of `by_day`, each with all days of a target."""
         for k, target in enumerate(self.targets):
             yield {"target": target.name, "day": self.days, "hours": self.visibility.by_day(k),
                    "elongation": self.elongation_deg(k), "zodiacal_light": self.zodiacal[k]}  # fmt: skip
 
     @property
     def _window_rows(self) -> Iterator[dict[str, Any]]:
+        """Rows of `window_table`, each with all windows of a target."""
         times, z = self.times, self.visibility.track.of_date_km[:, 2]
         nodes = times.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
         for target, windows in zip(self.targets, self.windows, strict=True):
@@ -249,13 +253,13 @@ class VisibleAnswer(Answer):
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Calendar of windows or, if these are not known, of the days on which a target is visible."""
         times, entries = self.times, list[tuple[str, str, str, str]]()
-        single = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
+        by_window = self.study.orbit.orbit().resolved(times) == "tle" and self.writes_windows
         for k, target in enumerate(self.targets):
             windows, hours = self.windows[k], self.visibility.by_day(k)
-            for a, b in zip(windows.start_s, windows.stop_s, strict=True) if single else ():
-                length = f"{(b - a) / 60 * self.visibility.limits.duty_cycle:.0f} min of exposure"
-                entries.append((times.iso(float(a)), times.iso(float(b)), target.name, length))
-            for first, last in true_runs(hours >= SEEN_H) if not single else ():
+            for start_s, stop_s in zip(windows.start_s, windows.stop_s, strict=True) if by_window else ():
+                length = f"{(stop_s - start_s) / 60 * self.visibility.limits.duty_cycle:.0f} min of exposure"
+                entries.append((times.iso(float(start_s)), times.iso(float(stop_s)), target.name, length))
+            for first, last in true_runs(hours >= SEEN_H) if not by_window else ():
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
                 entries.append((self.days[first], self.days[last - 1], target.name, mean))
         return {"visible.ics": partial(calendar_bytes, entries)}

@@ -348,9 +348,16 @@ def analysis_report(answer: AnalyseAnswer) -> tuple[str, list[ReportPart]]:
     return title, parts + [ReportPart(picture=draw, text=name) for name, draw in answer.pictures.items()]
 
 
+#: Functions that return title and parts of the report of an answer, by its class.
+REPORTS: dict[str, Callable[[Any], tuple[str, list[ReportPart]]]] = {
+    "PlanAnswer": plan_report,
+    "AnalyseAnswer": analysis_report,
+}
+
+
 def report(answer: Any, form: str) -> bytes:
     """Return the report of a plan or an analysis as "html", with pictures if matplotlib is installed, or as "pdf"."""
-    title, parts = plan_report(answer) if hasattr(answer, "planned") else analysis_report(answer)
+    title, parts = REPORTS[type(answer).__name__](answer)
     if form == "html":
         from mako.template import Template
 

@@ -191,7 +191,8 @@ class Chart:
     sets: str = ""  # fields that a click on the page sets, with the axis that gives each, as in "magnitude=x"
     pins: str = ""  # series that pinned scenarios have, too; empty if they are not drawn
     alike: tuple[str, ...] = ()  # fields in which a pinned scenario must agree with the question
-    fill: Callable[[Any, Any], ChartData] = lambda closed, answers: ChartData("")  # see `data`, as for what follows
+    # Set by `data`: the function that returns the data, the answer that it takes, and the text without that answer.
+    fill: Callable[[Any, Any], ChartData] = lambda closed, answers: ChartData("")
     of: str = ""
     before: str = ""
 

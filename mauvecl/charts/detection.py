@@ -13,23 +13,23 @@ from numpy.typing import NDArray
 
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, cell_edges, in_rows, picture_of, written
+from mauvecl.charts.matplotlib import COLOURS, COLUMN, MAX_COLUMNS, UNBROKEN, cell_edges, in_rows, numeral, picture_of
 from mauvecl.detection import NoThresholdError
 from mauvecl.detection.nuisances import join_names
 from mauvecl.detection.requests import statistic_label
 from mauvecl.detection.statistics import LinearStatistic
-from mauvecl.schema.columns import FirstItems, note_of, part_note
+from mauvecl.schema.columns import first_items, part_note
 from mauvecl.study.cases import full_label
 from mauvecl.study.questions import QUANTITIES
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.answers.detect import DetectAnswer, UnknownAnswer
-    from mauvecl.answers.gaussian import GaussianAnswer
+    from mauvecl.answers.closed_forms import UnknownAnswer
+    from mauvecl.answers.detect import DetectAnswer
     from mauvecl.answers.limit import LimitAnswer
     from mauvecl.answers.map import MapAnswer
-    from mauvecl.answers.signal import ExposureAnswer, SnrAnswer
+    from mauvecl.answers.signal import ExposureAnswer, GaussianAnswer, SnrAnswer
     from mauvecl.detection.detection import Detection, Roc
     from mauvecl.detection.snr import SnrResult
     from mauvecl.host.exposure.expectation import Expectation
@@ -46,27 +46,27 @@ COMPONENTS = {
     "raw": "raw spectrum", "source": "star", "sky": "zodiacal light", "photon_noise": "photon noise",
     "dark": "dark current", "bias": "bias", "read_noise": "read noise",
 }  # fmt: skip
-#: A star: title, findings, and its flares' names.
-Shown = tuple[str, "Detection", Sequence[str]]
+#: Title of a star, its detection, and the names of its flares.
+DetectedStar = tuple[str, "Detection", Sequence[str]]
 
 
-def _few(answer: DetectAnswer) -> FirstItems[Shown]:
-    """Limit the number of stars so that each panel stays readable."""
-    stars = [
+def _detected_stars(answer: DetectAnswer) -> list[DetectedStar]:
+    """Return the stars of an answer as pictures need them."""
+    return [
         (star.title, star.detection, [f"flare {100 * amplitude:g} %" for amplitude in star.amplitudes])
         for star in answer.stars
     ]
-    return FirstItems(stars, MOST_STARS, "stars")
 
 
-@picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
+@picture_of("DetectAnswer", "detection", given=lambda answer: (_detected_stars(answer), answer.study.run.fap))
 @picture_of(
     "Detection",
     "detection",
     given=lambda outcome: ([(outcome.quiet.name, outcome, [f"flare {k + 1}" for k in range(len(outcome.flares))])],),
 )
-def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
-    """Plot null and flare distributions, with a row per star and a column per statistic."""
+def detection(all_stars: Sequence[DetectedStar], fap: float = 1e-3) -> Picture:
+    """Plot null and flare distributions, with a row for each of the first stars and a column per statistic."""
+    stars, note = first_items(all_stars, MOST_STARS, "stars")
     first, rows = stars[0][1], list[Sequence[Panel]]()
     columns = min(len(first.statistics), MAX_COLUMNS)
     for star in stars:
@@ -76,7 +76,7 @@ def detection(stars: Sequence[Shown], fap: float = 1e-3) -> Picture:
         f"Detection statistics without and with a flare, {exposures}, {first.realisations:,} realisations each; "
         f"thresholds at a false-alarm probability of {fap:g} per test"
     )
-    return Picture(rows, (COLUMN * columns, 2.6 * len(rows) + 0.4), title, _notes(stars), below=True)
+    return Picture(rows, (COLUMN * columns, 2.6 * len(rows) + 0.4), title, _notes(stars, note), below=True)
 
 
 def _exposures(expectations: Iterable[Expectation]) -> str:
@@ -89,11 +89,11 @@ def _drawn_flares(names: Sequence[str]) -> list[int]:
     return [round(k) for k in np.linspace(0, len(names) - 1, min(len(names), MOST_FLARES))]
 
 
-def _notes(stars: Sequence[Shown]) -> tuple[str, ...]:
-    """Return the notes on the throughput and on the numbers of drawn stars and flares, empty if all are drawn."""
+def _notes(stars: Sequence[DetectedStar], note: str) -> tuple[str, ...]:
+    """Return the notes on the throughput and on the numbers of drawn stars and flares; `note` is that on the stars."""
     most = max(len(names) for *_, names in stars)
     throughput = chart.throughput_of(outcome.quiet for _, outcome, _ in stars)
-    return throughput, note_of(stars), part_note(min(MOST_FLARES, most), most, "flares")
+    return throughput, note, part_note(min(MOST_FLARES, most), most, "flares")
 
 
 def _distributions(title: str, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> Panel:
@@ -120,7 +120,7 @@ def _distributions(title: str, outcome: Detection, flares: Sequence[str], statis
         series.append(Rule("threshold", colour, listed=len(thresholded) == 1, at=cut))
     above = f"{title}: a threshold per flare" if len(thresholded) > 1 else title
     if len(thresholded) == len(cuts) == 1:
-        above = f"{title}: threshold {written(float(f'{cuts[0]:.3g}'))}"
+        above = f"{title}: threshold {numeral(cuts[0], 3)}"
     low, high = min(ends + cuts), max(ends + cuts)
     x, y = PlotAxis(statistic_label(statistic)), PlotAxis("realisations / peak", limits=(0, 1.05))
     if linear:
@@ -140,7 +140,7 @@ def _asinh(axis: Any, ends: tuple[float, float]) -> None:
     few = range(-10, 10, 2) if high - low < WIDE else (-10, -4, 0, 4)
     axis.xaxis.set_major_locator(FixedLocator([*few, 10, 30, *decades[1:]]))
     axis.xaxis.set_minor_locator(FixedLocator([*range(-10, 10), *np.outer(decades, range(1, 10)).ravel()]))
-    axis.xaxis.set_major_formatter(lambda value, _: written(value))
+    axis.xaxis.set_major_formatter(lambda value, _: numeral(value))
 
 
 def roc_columns(curve: Roc) -> tuple[Any, ...]:
@@ -165,13 +165,14 @@ def roc(curves: Roc | Sequence[tuple[str, Roc]], *, name: str = "") -> Panel:
     return Panel(x, y, series)
 
 
-@picture_of("DetectAnswer", "spectra", given=lambda answer: (_few(answer),))
-def spectra(stars: Sequence[Shown]) -> Picture:
+@picture_of("DetectAnswer", "spectra")
+def spectra(answer: DetectAnswer) -> Picture:
     """Plot mean spectra per second with pixel noise and, below, the flares in sigma of an element's noise."""
 
     def finish(axis: Any) -> None:
         axis.set_ylim(bottom=max(axis.get_ylim()[0], 0.03))
 
+    stars, note = first_items(_detected_stars(answer), MOST_STARS, "stars")
     above, below = list[Panel](), list[Panel]()
     for title, outcome, names in stars:
         quiet, complete, nm = outcome.quiet, _complete_elements(outcome.quiet), outcome.quiet.wavelength_nm
@@ -188,7 +189,7 @@ def spectra(stars: Sequence[Shown]) -> Picture:
         y = PlotAxis("flare less quiet\n(sigma per element)", log=True)
         below.append(Panel(WAVELENGTH, y, [*lines, Rule(along="y", at=1.0)], finish=finish))
     size = COLUMN * len(stars), 5.0
-    return Picture([above, below], size, "Mean spectra", _notes(stars), below=True, share_x=True, heights=(3, 2))
+    return Picture([above, below], size, "Mean spectra", _notes(stars, note), below=True, share_x=True, heights=(3, 2))
 
 
 def _complete_elements(x: Expectation) -> NDArray[np.bool_]:
@@ -208,22 +209,18 @@ def observation(title: str, expectation: Expectation, table: QTable) -> Picture:
     return Picture(rows, (7.2, 9.5), title, (chart.throughput_of([expectation]),), share_x=True)
 
 
-@picture_of(
-    "SnrAnswer",
-    "snr",
-    given=lambda answer: (FirstItems([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
-)
+@picture_of("SnrAnswer", "snr", given=lambda answer: ([(star.title, star.result) for star in answer.stars],))
 @picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
-def signal_to_noise(stars: Sequence[tuple[str, SnrResult]]) -> Picture:
+def signal_to_noise(all_stars: Sequence[tuple[str, SnrResult]]) -> Picture:
     """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations."""
-    rows = list[list[Panel]]()
+    (stars, note), rows = first_items(all_stars, MOST_STARS, "stars"), list[list[Panel]]()
     for title, result in stars:
         x, complete = result.expectation, _complete_elements(result.expectation)
         title = title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s"
         nm, snr = x.element_wavelength_nm[complete], x.snr_per_element()[complete]
         rows.append([_snr_panel(title, "per pixel", x.wavelength_nm, x.snr(), result.pixel),
                      _snr_panel(title, "per resolution element", nm, snr, result.element[complete])])  # fmt: skip
-    notes = chart.throughput_of(result.expectation for _, result in stars), note_of(stars)
+    notes = chart.throughput_of(result.expectation for _, result in stars), note
     return Picture(rows, (7.6, 2.6 * len(rows) + 0.4), "S/N of one exposure", notes, below=True, share_x=True)
 
 
@@ -242,12 +239,12 @@ def unknowns(answer: UnknownAnswer) -> Picture:
     """Plot closed-form power per star (dashed plain, solid marginalised), and the smallest amplitudes."""
     from scipy.special import ndtri
 
-    from mauvecl.answers.detect import power
+    from mauvecl.answers.closed_forms import power
 
     stars, fap = list(dict.fromkeys(row["star"] for row in answer.rows)), answer.study.run.fap
     needed, above, below = ndtri(answer.study.limit.power) - ndtri(fap), list[Panel](), list[Panel]()
     for star in stars:
-        # Those of its first flare.
+        # The curves are those of the star's first flare.
         of_star = [row for row in answer.rows if row["star"] == star]
         snr, amplitude = of_star[0]["known"], of_star[0]["amplitude"]
         least = amplitude * needed / snr if snr > 0 else float("inf")
@@ -317,7 +314,7 @@ def limits(answer: LimitAnswer) -> Picture:
         p, low, high = np.array([(q.value, q.low, q.high) for q in (point.probability for point in points)]).T
         flare = "" if np.isnan(limit.amplitude) else f", flare {100 * limit.amplitude:g} %"
         statistic = f", {limit.statistic}" if several else ""
-        value = f"{limit.value.value:.2f}" if of == "magnitude" else written(float(f"{limit.value.value:.3g}"))
+        value = f"{limit.value.value:.2f}" if of == "magnitude" else numeral(limit.value.value, 3)
         text = f"{limit.title}{flare}{statistic}: {value}{QUANTITIES[of].suffix}"
         at = [point.value for point in points], p, (p - low, high - p)
         series += [
@@ -370,20 +367,20 @@ def noise_budgets(answer: SnrAnswer) -> Picture:
         # Zodiacal light can be far below everything else.
         axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
 
-    shown = FirstItems(observed, MOST_BUDGETS, "observations")
+    shown, note = first_items(observed, MOST_BUDGETS, "observations")
     panels = [replace(BUDGET.panel(budget_series(x), title), finish=finish) for title, x in shown]
     # A column for each cell, unless these are too many.
     across = len(observed) // number_of_cells if number_of_cells <= MAX_COLUMNS and len(shown) == len(observed) else 0
     rows = [panels[k::across] for k in range(across)] or in_rows(panels, MAX_COLUMNS)
     size = COLUMN * max(len(row) for row in rows), 2.3 * len(rows) + 0.7
-    notes = chart.throughput_of(answer.inputs), shown.note
+    notes = chart.throughput_of(answer.inputs), note
     return Picture(rows, size, "Noise budgets", notes, below=True, share_x=True, share_y="col" if across else True)
 
 
 @picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
 def snr_sweep(answer: SnrAnswer) -> Picture:
     """Plot the S/N of some elements against the first swept quantity, a line per value of the others."""
-    from mauvecl.answers.signal import place_of
+    from mauvecl.answers.signal import index_at
 
     first, row = answer.study.sweep.axes[0].quantity, []
     # The axis names the band, unless stars have different ones.
@@ -394,7 +391,7 @@ def snr_sweep(answer: SnrAnswer) -> Picture:
         for star in answer.stars:
             name = star.label.replace(f"{band} = {star.at[first]:g}", "") if first == "magnitude" else star.label
             name_of_line = full_label(name, {k: v for k, v in star.at.items() if k != first})
-            element = star.result.element[place_of(star.result.expectation, wavelength, "element")]
+            element = star.result.element[index_at(star.result.expectation, wavelength, "element")]
             ends = (max(element[q], 1e-3) for q in ("q2.5", "q97.5"))
             lines.setdefault(name_of_line, []).append((star.at[first], element["expected"], *ends))
         series: list[Series] = []
@@ -451,7 +448,7 @@ def exposures(answer: ExposureAnswer) -> Picture:
     first, series = answer.exposures[0], list[Series]()
     for e, colour in zip(answer.exposures, cycle(COLOURS), strict=False):
         x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
-        text = f"{e.star}: {written(float(f'{e.exposure_s:.4g}'))} s"
+        text = f"{e.star}: {numeral(e.exposure_s, 4)} s"
         series.append(Line(text, colour, at=(x, e.snr * np.sqrt(x / e.exposure_s))))
         series.append(Dots("", colour, size=8, at=([e.exposure_s], [e.snr])))
     series.append(Rule(f"wanted S/N of {first.wanted:g}", along="y", at=first.wanted))

@@ -16,7 +16,7 @@ from mauvecl.charts import matplotlib as figures
 from mauvecl.charts.chart import Area, Chart, Dots, Levels, Line, Mesh, Panel, Picture, PlotAxis, Rule, Series, Strips
 from mauvecl.charts.matplotlib import COLOURS, cell_edges, picture_of
 from mauvecl.host.arrays import Bool, Float
-from mauvecl.schema.columns import FirstItems, part_note
+from mauvecl.schema.columns import first_items, part_note
 
 if TYPE_CHECKING:
     from mauvecl.answers.analyse import AnalyseAnswer
@@ -36,20 +36,20 @@ MOST_CURVES, MOST_MAPS = 6, 6
 MOST_POINTS, MOST_ROWS = 4000, 600
 LONG_GAP = 0.005  # shortest gap in which the level is not drawn, as a share of the whole time
 BRIGHT = 30.0  # flux, in standard deviations, above which the light curve has a second panel near the level
-#: Units of time: longest duration that is shown in it, its length, s, and its name.
+#: Units of time: the longest duration that is shown in the unit (s), its length (s), and its name.
 TIME_UNITS = ((600.0, 1.0, "s"), (4 * 3600.0, 60.0, "min"), (3 * 86_400.0, 3600.0, "h"), (np.inf, 86_400.0, "d"))
 HALF_WIDTH = PlotAxis("half-width (s)", log=True)
 
 
 def _stars(answer: InjectAnswer, panel: Callable[[Any], Panel], *notes: str, below: bool = False) -> Picture:
     """Return a picture with a panel per star, the first ones if there are many."""
-    stars, study = FirstItems(answer.stars, MOST_MAPS, "stars"), answer.study
+    (stars, note), study = first_items(answer.stars, MOST_MAPS, "stars"), answer.study
     columns = min(len(stars), figures.MAX_COLUMNS)
     rows = figures.in_rows([panel(star) for star in stars], columns)
     light = "swept temperature" if "flare_temperature" in stars[0].at else study.flare.light().describe()
     title = f"Flares of {light}, {study.search.rate_text}"
-    notes = chart.throughput_of(answer.inputs), stars.note, *notes
-    return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, notes, below)
+    all_notes = chart.throughput_of(answer.inputs), note, *notes
+    return Picture(rows, (3.6 * columns + 0.8, 3.2 * len(rows)), title, all_notes, below)
 
 
 @picture_of("InjectAnswer", "completeness")

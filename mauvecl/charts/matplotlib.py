@@ -32,10 +32,10 @@ MAX_COLUMNS = 3  # largest number of panels side by side
 COLUMN = 3.5  # width of one column of a journal, inches
 UNBROKEN, MINUS = "\N{NO-BREAK SPACE}", "\N{MINUS SIGN}"
 SMALL = 8  # size of the labels of ticks that are names
-#: Largest fractions of a figure's width for legends, and for titles, of whose letters the mean width is known.
+#: Largest fractions of a figure's width that legends and titles take.
 INSIDE, TITLE = 0.97, 0.93
-#: The same for titles of panels, of the width that matplotlib gives a panel before the layout, which leaves less room
-#: between panels.
+#: Largest width of a panel's title, as a fraction of the width that matplotlib gives the panel before the layout, which
+#: leaves less room between panels.
 PANEL_TITLE = 1.2
 
 STYLE = {
@@ -109,13 +109,14 @@ def _legend_below(figure: Any, axes: Sequence[Any]) -> None:
         legend.remove()
 
 
-def written(value: float) -> str:
-    """Return a number as people write it: 0.1, 500, or 2 times a power of ten."""
-    digits, _, power = f"{value:.5e}".partition("e")
-    if value == 0 or -4 <= int(power) < 5:
-        return f"{value:g}".replace("-", MINUS)
-    digits = f"{float(digits):g}"
-    return rf"$10^{{{int(power)}}}$" if digits == "1" else rf"${digits}\times10^{{{int(power)}}}$"
+def numeral(value: float, digits: int = 6) -> str:
+    """Return a number, rounded to some significant digits, as people write it: 0.1, 500, or 2 times a power of ten."""
+    rounded = float(f"{value:.{digits}g}")
+    factor, _, power = f"{rounded:.5e}".partition("e")
+    if rounded == 0 or -4 <= int(power) < 5:
+        return f"{rounded:g}".replace("-", MINUS)
+    factor = f"{float(factor):g}"
+    return rf"$10^{{{int(power)}}}$" if factor == "1" else rf"${factor}\times10^{{{int(power)}}}$"
 
 
 def in_rows(panels: Sequence[Panel], columns: int) -> list[Sequence[Panel]]:
@@ -131,8 +132,8 @@ def cell_edges(middles: Any, *, log: bool = False) -> Any:
     return np.exp(edges) if log else edges
 
 
-def in_figure(unit: str) -> str:
-    """Return a unit, as astropy spells it, as the label of an axis has it."""
+def unit_label(unit: str) -> str:
+    """Return a unit in astropy's notation as labels of axes show it."""
     from astropy.units import Unit
 
     return str(Unit(unit).to_string("latex_inline"))
@@ -185,10 +186,10 @@ def pictures_of(instance: Any) -> dict[str, Callable[..., Any]]:
             numbered.append((1, entry.name, partial(entry.draw, *entry.given(instance))))
         for number, arguments in enumerate(entry.each(instance) if entry.each else (), 1):
             numbered.append((number, f"{entry.name}-{number}", partial(entry.draw, *arguments)))
-    return {name: partial(drawn, draw) for _, name, draw in sorted(numbered, key=itemgetter(0))}
+    return {name: partial(draw_and_save, draw) for _, name, draw in sorted(numbered, key=itemgetter(0))}
 
 
-def drawn(
+def draw_and_save(
     draw: Callable[..., Picture | Panel], path: str | Path | None = None, *, ax: Any = None, **options: Any
 ) -> Any:
     """Draw a function's picture in the common style; return its figure, the path if it is saved, or the axes `ax`."""
@@ -271,7 +272,7 @@ def _finish(axis: Any, panel: Panel) -> None:
             most = 1 if name == "x" and (low < 1e-4 or high > 1e5) else 2
             side.set_major_locator(LogLocator(subs=(1.0,) if decades > most else (1.0, 2.0, 5.0)))
         if decades < 4:
-            side.set_major_formatter(lambda value, _: written(value))
+            side.set_major_formatter(lambda value, _: numeral(value))
         side.set_minor_formatter(NullFormatter())
     if panel.finish is not None:
         panel.finish(axis)

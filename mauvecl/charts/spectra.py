@@ -10,8 +10,8 @@ import numpy as np
 
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Chart, Dots, Line, Panel, Picture, PlotAxis, Rule, Series, Strips
-from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, in_figure, picture_of
-from mauvecl.schema.columns import FirstItems, with_error
+from mauvecl.charts.matplotlib import COLOURS, RANGE_NM, picture_of, unit_label
+from mauvecl.schema.columns import first_items, with_error
 
 if TYPE_CHECKING:
     from mauvecl.answers.calibrate import CalibrateAnswer
@@ -186,8 +186,8 @@ def shown_name(change: str) -> str:
 @picture_of("ChangeAnswer", "change", when=lambda answer: bool(answer.along))
 def change_against_magnitude(answer: ChangeAnswer) -> Picture:
     """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
-    titles = FirstItems(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
-    (title,), magnitude, row = titles, answer.changes[0].magnitude, []
+    (title,), note = first_items(dict.fromkeys(row.title for row in answer.changes), 1, "stars")
+    magnitude, row = answer.changes[0].magnitude, []
     for unit in dict.fromkeys(row.change.unit for row in answer.along):
         lines = [line for line in along_magnitude(answer, {unit: 1 if unit else 100}) if line[1].size]
         rules = [] if magnitude is None else [Rule("this star", dash="dotted", at=magnitude)]
@@ -196,26 +196,26 @@ def change_against_magnitude(answer: ChangeAnswer) -> Picture:
         if lines:
             # A decade at least, since errors beyond a few per cent do not matter, and room for the legend.
             limits = min(*values, max(values) / 5) / 1.2, 2 * max(*values, 5 * min(values))
-        y = PlotAxis(f"smallest change ({in_figure(unit) if unit else '%'})", log=bool(lines), limits=limits)
+        y = PlotAxis(f"smallest change ({unit_label(unit) if unit else '%'})", log=bool(lines), limits=limits)
         row.append(Panel(PlotAxis(f"magnitude ({answer.study.star[0].band})"), y, [chart.Targets(at=lines), *rules]))
     title = f"{title}: smallest change between {answer.visits}"
-    return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (titles.note,))
+    return Picture([row], (1.0 + 3.3 * len(row), 3.6), title, (note,))
 
 
 @picture_of("ChangeAnswer", "periods", when=lambda answer: bool(answer.periods))
 def recovered_periods(answer: ChangeAnswer) -> Picture:
     """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
-    first, row = FirstItems(answer.periods, MOST_CHANGES, "changes"), []
+    (first, note), row = first_items(answer.periods, MOST_CHANGES, "changes"), []
     for row_of_change in first:
         r, scale = row_of_change.recovery, row_of_change.error * (1 if row_of_change.change.unit else 100)
         shares = 100 * row_of_change.shares("value")
         mesh = chart.Mesh("recovered (%)", high=100, at=(r.periods_d, scale * r.amplitudes, shares))
         unit = row_of_change.change.unit
-        y = PlotAxis(f"semi-amplitude ({in_figure(unit) if unit else '%'})", log=True)
+        y = PlotAxis(f"semi-amplitude ({unit_label(unit) if unit else '%'})", log=True)
         row.append(Panel(PlotAxis("period (d)", log=True), y, [mesh], shown_name(row_of_change.change.name)))
     time = first[0].recovery.time_d
     title = f"{first[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
-    return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (first.note,))
+    return Picture([row], (1.0 + 2.9 * len(row), 3.2), title, (note,))
 
 
 @picture_of("ChangeAnswer", "indices", when=lambda answer: bool(answer.indices))
@@ -230,7 +230,7 @@ def line_indices(answer: ChangeAnswer) -> Picture:
         line = Line("mean spectrum", "star", at=(nm[near], index_row.flux[near]))
         band, continua = np.array([index.band_nm]).T, np.array(index.continuum_nm).T
         series = [line, Strips("band", "read", at=band), Strips("continuum", alpha=0.2, at=continua)]
-        y = PlotAxis(f"flux ({in_figure('erg / (s cm2 nm)')})")
+        y = PlotAxis(f"flux ({unit_label('erg / (s cm2 nm)')})")
         row.append(Panel(PlotAxis("wavelength (nm)"), y, series, index.name))
     title = f"{title}: bands and continua of the line indices in the mean spectrum"
     return Picture([row], (1.0 + 2.3 * len(row), 3.1), title, below=True)
@@ -241,7 +241,7 @@ def fits(answer: MeasureAnswer) -> Picture:
     """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     from mauvecl.fits.flare_model import usable_variance
 
-    flares, above, below = FirstItems(answer.flares, MOST_FLARES, "flares"), list[Panel](), list[Panel]()
+    (flares, note), above, below = first_items(answer.flares, MOST_FLARES, "flares"), list[Panel](), list[Panel]()
     for flare in flares:
         quiet, measurement = flare.quiet, flare.found
         mean, unknown = flare.fitted_dn()
@@ -254,21 +254,21 @@ def fits(answer: MeasureAnswer) -> Picture:
         data, fit, variance = (np.where(complete, values, np.nan) for values in sums)
         nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
         x = PlotAxis("wavelength (nm)")
-        # Elements differ in their number of pixels, means hardly.
+        # Means are shown, since elements differ in their number of pixels.
         dots = Dots("exposure less star and fitted unknowns", size=4, at=(nm, data / pixels, noise / pixels))
         line = Line(f"fit: {kelvin}", "star", at=(nm, fit / pixels))
         above.append(Panel(x, PlotAxis("mean of an element (DN per pixel)"), [dots, line], flare.name))
         residuals = Dots("", "star", size=4, at=(nm, (data - fit) / noise))
         below.append(Panel(x, PlotAxis("residual / noise"), [residuals, Rule(along="y", dash="-", at=0.0)]))
     size = 3.6 * len(flares), 4.6
-    return Picture([above, below], size, notes=(flares.note,), share_x=True, heights=(2, 1))
+    return Picture([above, below], size, notes=(note,), share_x=True, heights=(2, 1))
 
 
 def _panel_per_flare(flares: Sequence[MeasuredFlare], panel: Callable[[MeasuredFlare], Panel]) -> Picture:
     """Return a picture with a panel for each of the first flares."""
-    first = FirstItems(flares, MOST_FLARES, "flares")
+    first, note = first_items(flares, MOST_FLARES, "flares")
     row = [panel(flare) for flare in first]
-    return Picture([row], (3.4 * len(first), 3.6), notes=(first.note,), below=True)
+    return Picture([row], (3.4 * len(first), 3.6), notes=(note,), below=True)
 
 
 def _of_single_temperature(answer: MeasureAnswer) -> list[MeasuredFlare]:
@@ -360,7 +360,7 @@ def temperatures(star: MeasuredStare) -> Picture:
         if limits.any():
             series.append(Dots("lower limit", "star", size=10, marker="^", at=(middle[limits], low[limits])))
         positive = [value for value in (*estimate, *true) if value > 0]
-        unit = f" ({in_figure(measurement.units[q])})" if measurement.units[q] else ""
+        unit = f" ({unit_label(measurement.units[q])})" if measurement.units[q] else ""
         label = " ".join(name.split(" ")[::-1]) + unit
         y = PlotAxis(label, log=True, limits=(0.5 * min(positive), 2 * max(positive)))
         rows.append([Panel(PlotAxis("time from the start of the stare (s)"), y, series)])

@@ -10,7 +10,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from itertools import islice
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -43,19 +43,21 @@ class Column:
 
     def value(self, row: object) -> Any:
         """Return the value or values of a row."""
-        if callable(self.get):
-            return self.get(row)
-        key = self.get or self.name
-        return row[key] if isinstance(row, Mapping) else attrgetter(key)(row)
+        return self.get(row) if callable(self.get) else _part(row, self.get or self.name)
 
-    def of(self, part: Callable[[Any], Any]) -> Column:
-        """Return the column for rows of which only a part has its value."""
-        return replace(self, get=lambda row: self.value(part(row)))
+    def of_part(self, name: str) -> Column:
+        """Return the column for rows whose part of a name, an attribute or a key, has the value."""
+        return replace(self, get=lambda row: self.value(_part(row, name)))
 
     def text(self, record: Mapping[str, Any]) -> str:
         """Return a cell as people read it, from the values of its row by column."""
         values = [record[name] for name in (self.name, *self.others) if name]
         return self.format(*values) if callable(self.format) else formatted(values[0], self.format)
+
+
+def _part(row: object, name: str) -> Any:
+    """Return the value of a key of a row, or an attribute by its path."""
+    return row[name] if isinstance(row, Mapping) else attrgetter(name)(row)
 
 
 def interval_columns(
@@ -85,14 +87,11 @@ def interval_columns(
 
 @dataclass(frozen=True)
 class View:
-    """A table as people read it: a title and some of its columns. Without a table, the title is a sentence.
+    """Table as people read it, with a title and some of its columns, or a sentence alone."""
 
-    The table may also be a list of records: values by the columns' names.
-    """
-
-    title: str
+    title: str  # the sentence if there is no table
     columns: Sequence[Column] = ()
-    table: Table | Sequence[Mapping[str, Any]] | None = None
+    table: Table | Sequence[Mapping[str, Any]] | None = None  # a table, or its rows: values by the columns' names
 
     def texts(self, hidden: Collection[str] = (), *, empty: bool = True) -> tuple[list[str], list[list[str]]]:
         """Return headings and cells, without `hidden` columns and, unless `empty`, those whose cells are all empty."""
@@ -128,7 +127,10 @@ class View:
 
 
 def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) -> QTable:
-    """Return the table of rows for files and JSON, with units and descriptions; missing quantities are NaN."""
+    """Return the table of rows for files and JSON, with units, descriptions and `meta` as metadata.
+
+    Values of None are missing: NaN in columns with a unit, and masked in others.
+    """
     import astropy.units as u
     import numpy as np
     from astropy.table import QTable
@@ -156,35 +158,30 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
 def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **meta: object) -> QTable:
     """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`.
 
-    Columns that a table lacks are masked, or NaN if they have a unit.
+    A first column has one value for its table, or one for each of the table's rows. Columns that a table lacks are
+    masked, or NaN if they have a unit.
     """
     import numpy as np
 
-    pairs = list(parts)
-    tables = [table for _, table in pairs]
+    rows, tables = zip(*parts, strict=True)
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
-
-    def values(pair: tuple[object, Table], name: str) -> Any:
-        if name not in pair[1].colnames:
-            return None
-        cells = getattr(pair[1][name], "value", pair[1][name])
-        return np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
-
-    def column_of(name: str) -> Column:
-        columns = [table[name] for table in tables if name in table.colnames]
-        (unit,) = {str(column.unit or "") for column in columns}
-        kind = np.result_type(*(column.dtype for column in columns)).type
-        text = columns[0].info.description or ""
-        return Column(name, lambda pair: values(pair, name), unit, text, kind=kind)
-
-    # A first column may have one value for each row of its table, with which it is broadcast.
-    names = dict.fromkeys(name for table in tables for name in table.colnames)
-    columns = [*(column.of(itemgetter(0)) for column in first), *map(column_of, names)]
-    return table_of(columns, pairs, **shared | meta)
+    # The row of a table is kept under the empty name, which no column of a table has.
+    blocks: list[dict[str, Any]] = [{"": row} for row in rows]
+    columns = [column.of_part("") for column in first]
+    for name in dict.fromkeys(name for table in tables for name in table.colnames):
+        present = [table[name] if name in table.colnames else None for table in tables]
+        values = [column for column in present if column is not None]
+        (unit,) = {str(column.unit or "") for column in values}
+        kind = np.result_type(*(column.dtype for column in values)).type
+        columns.append(Column(name, "", unit, values[0].info.description or "", kind=kind))
+        for block, column in zip(blocks, present, strict=True):
+            cells: Any = getattr(column, "value", column)
+            block[name] = np.array(cells.tolist(), object) if np.any(getattr(cells, "mask", False)) else cells
+    return table_of(columns, blocks, **shared | meta)
 
 
 def records(table: Table) -> list[dict[str, Any]]:
-    """Return the rows of a table as plain values by column, None where a value is missing."""
+    """Return the rows of a table as Python values by column, without units; None where a value is missing."""
     columns = [getattr(table[name], "value", table[name]).tolist() for name in table.colnames]
     return [dict(zip(table.colnames, values, strict=True)) for values in zip(*columns, strict=True)]
 
@@ -243,22 +240,15 @@ def with_error(value: float, error: float) -> str:
 T = TypeVar("T")
 
 
-class FirstItems(list[T]):
-    """The first items of a list, with a `note` such as "6 of 9 stars shown" if it has more."""
-
-    def __init__(self, items: Collection[T], most: int, name: str) -> None:
-        super().__init__(islice(items, most))
-        self.note = part_note(len(self), len(items), name)
+def first_items(items: Collection[T], most: int, name: str) -> tuple[list[T], str]:
+    """Return the first items of a collection, with a note such as "6 of 9 stars shown", empty if these are all."""
+    first = list(islice(items, most))
+    return first, part_note(len(first), len(items), name)
 
 
 def part_note(shown: int, total: int, name: str) -> str:
-    """Return the note on a part of a list, as in "6 of 9 stars shown", or nothing for all of it."""
+    """Return the note on a part of a collection, as in "6 of 9 stars shown", or nothing for all of it."""
     return f"{shown} of {total} {name} shown" if shown < total else ""
-
-
-def note_of(items: Iterable[object]) -> str:
-    """Return the note of items that are a part of a list, or nothing."""
-    return items.note if isinstance(items, FirstItems) else ""
 
 
 class Drawable:

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.closed_forms import Cost, spoken, unknown_cost
-from mauvecl.answers.detect import UNKNOWN_COLUMNS as COLUMNS
-from mauvecl.answers.detect import power
+from mauvecl.answers.closed_forms import UNKNOWN_COLUMNS as COLUMNS
+from mauvecl.answers.closed_forms import Cost, power, spoken, unknown_cost
 from mauvecl.answers.signal import simulate
 from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Bars, Chart, ChartData, Dots, Line, OwnMarker, PlotAxis, Rule
