@@ -35,17 +35,19 @@ STAR_KEYS = (
 )  # fmt: skip
 
 
-def unit_of_file(of: Literal["wavelength", "flux"], prefix: str, whose: str, label: str, group: str) -> Any:
-    """Return the field of a unit of spectra next to a star's; `prefix` begins its flag, `whose` ends its help."""
-    noun, examples, units = UNITS[of]
+def unit_of_file(quantity: Literal["wavelength", "flux"], prefix: str, whose: str, label: str, group: str) -> Any:
+    """Return the field of the unit of a spectrum other than the star's.
+
+    Its flag begins with `prefix` and its label on the page with `label`; `whose` names the spectrum in its help.
+    """
+    noun, examples, units = UNITS[quantity]
     return setting(
         None,
         f"Unit of the {noun} of {whose}",
-        flag=f"--{prefix}-{of}-unit",
+        flag=f"--{prefix}-{quantity}-unit",
         label=f"{label}: unit of {noun}",
         hint=f"Such as {examples}. Nothing: what the file says.",
         group=group,
-        name=f"{prefix}_{of}_unit",
         suggestions=units,
     )
 
@@ -83,7 +85,6 @@ class Star(Section):
         "Band of the magnitude",
         flag="--band",
         choices=tuple(ALIASES),
-        label="Band",
         hint="The band of the magnitude. In V, Vega has 0.03, as in catalogues.",
     )
     magnitude_system: Literal["catalogue", "vega", "ab"] = setting(
@@ -136,7 +137,6 @@ class Star(Section):
         None,
         "Distance of the star; for energies",
         flag="--distance",
-        label="Distance",
         hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
         group="Measurement",
     )
@@ -148,7 +148,6 @@ class Star(Section):
         None,
         "Table of other stars near the star; with separation, magnitude and spectral type, or of a Gaia query",
         flag="--neighbours",
-        label="Neighbours",
         hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
         "columns of a Gaia query. The light of those within 47 arcsec enters.",
         group="Neighbours",
@@ -193,8 +192,9 @@ class Star(Section):
         changed = super().with_value(path, value)
         if path[0] != "library":
             return changed
-        here, listed = (_listed(name, self.band, self.magnitude_system) for name in (self.library or "", str(value)))
-        if self.magnitude not in (None, here.get("magnitude")):
+        before = _listed(self.library or "", self.band, self.magnitude_system)
+        listed = _listed(str(value), self.band, self.magnitude_system)
+        if self.magnitude not in (None, before.get("magnitude")):
             # A magnitude that is not from the list was set by the user, for every star.
             listed.pop("magnitude", None)
         return changed.model_copy(update=dict.fromkeys(STAR_KEYS) | listed)
@@ -250,7 +250,6 @@ class FlareLight(Section):
         "Ratio of the flare's flux just below the Balmer edge to that just above",
         flag="--balmer-jump",
         usual="1",
-        label="Balmer jump",
         hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
         "Nothing: a plain blackbody.",
         quantity=(
@@ -264,7 +263,6 @@ class FlareLight(Section):
         None,
         "Temperature of a second blackbody of the flare; needs its area",
         flag="--second-temperature",
-        label="Second temperature",
         hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
         quantity=("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     )
@@ -272,7 +270,6 @@ class FlareLight(Section):
         None,
         "Area of the second blackbody over that of the first",
         flag="--second-area",
-        label="Second area",
         hint="Area at the second temperature over that at the first, if there is one.",
         first="0.05",
         quantity=("second_area", "area of the flare's second blackbody over that of the first", "second area"),
@@ -299,7 +296,6 @@ class FlareLight(Section):
         label="Own flare spectrum",
         hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
         "scales it.",
-        name="flare_file",
         place=2,
         kind="file",
     )
@@ -311,7 +307,6 @@ class FlareLight(Section):
         hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
         "subtracted. Nothing: the file holds the flare alone.",
         group="Own flare",
-        name="flare_quiescent",
         place=1,
         kind="file",
     )
@@ -321,7 +316,6 @@ class FlareLight(Section):
         None,
         "Temperature of a blackbody that continues the flare's file beyond its ends",
         flag="--continue-at",
-        label="Continue at",
         hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
         "cover what the instrument sees.",
         group="Own flare",
@@ -399,6 +393,7 @@ class Flare(Section):
             ),
             Flag("--amplitude", "-a"),
         ),
+        label="Flare amplitude",
         hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
         "ultraviolet the rise is many times as large.",
         name="amplitude_percent",
@@ -413,7 +408,6 @@ class Flare(Section):
         flag="--flare-temperature",
         hint="The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.",
         group="Flare's spectrum",
-        name="flare_temperature_k",
         slider=Slider(5000, 30_000, 500),
         quantity=("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
     )

@@ -183,7 +183,6 @@ class SearchChoice(Section):
         1.0,
         "False alarms of the search per star-day, star-month or star-year",
         flag="--false-alarms",
-        label="False alarms",
         hint="Expected number of detections that are only noise, in the time that the next field states.",
     )
     per: Per = setting(

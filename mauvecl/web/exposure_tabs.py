@@ -20,14 +20,13 @@ from mauvecl.schema.columns import View, chance_text, stacked, with_error
 from mauvecl.study.cases import star_column, star_label
 from mauvecl.study.observation import NuisanceChoice
 from mauvecl.web.closed_forms import Answers, short
-from mauvecl.web.figures import SATURATED, strips
-from mauvecl.web.tab import Tab
+from mauvecl.web.tab import SATURATED, Tab, strips
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
     from mauvecl.web.closed_forms import ClosedForms
-    from mauvecl.web.figures import Canvas
+    from mauvecl.web.tab import Canvas
 
 
 @BUDGET.data()

@@ -19,7 +19,6 @@ from mauvecl.host.tables.text_tables import columns, text_table
 from mauvecl.schema.errors import REMEDY, SUBJECT, InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
-    Help,
     LineFraction,
     Range,
     Unit,
@@ -227,13 +226,20 @@ class Field(Widget):
         return self.own_keys or (".".join(self.path),)
 
 
+def _name(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> str:
+    """Return the name of the field of a key, such as "exposure_s", or "change_band" as in the flag --change-band."""
+    key, in_section = path[-1], f"{path[0]}_{path[-1]}"
+    has_section = any(in_section.startswith(flag.parameter) for flag in metadata_of(field, Flag))
+    return widget.name or (in_section if has_section else key)
+
+
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
-    default, unit = field.get_default(), first(field, Unit) or Unit("")
+    default, unit, flag = field.get_default(), first(field, Unit) or Unit(""), first(field, Flag) or Flag("")
     text = as_typed(default * widget.scale if isinstance(default, float) else default, truth=("no", "yes"))
     optional = text == "" if widget.first is None else not widget.first
     texts = {
-        "label": widget.label or getattr(first(field, Help), "text", ""),
+        "label": widget.label or flag.label,
         "group": widget.group or HEADINGS.get(".".join(path[:-1]), ""),
         "first": text if widget.first is None else widget.first,
         "unit": unit.written if widget.unit is None else widget.unit,
@@ -324,7 +330,7 @@ _OWN_FIELDS = {
     ),
 }  # fmt: skip
 _KEYS = {
-    widget.name or key.rpartition(".")[2]: _field(tuple(key.split(".")), field, widget)
+    _name(tuple(key.split(".")), field, widget): _field(tuple(key.split(".")), field, widget)
     for key, field in study_keys().items()
     for widget in metadata_of(field, Widget)
 }

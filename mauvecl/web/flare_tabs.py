@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.measure import ExpectedMeasurement
     from mauvecl.fits.spectrum import Forecast
     from mauvecl.web.closed_forms import ClosedForms
-    from mauvecl.web.figures import Canvas
+    from mauvecl.web.tab import Canvas
 
 
 T = TypeVar("T")

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.frames import Frames
     from mauvecl.web.closed_forms import ClosedForms, FieldValues
-    from mauvecl.web.figures import Canvas
+    from mauvecl.web.tab import Canvas
     from mauvecl.web.uploads import Observations
 
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.

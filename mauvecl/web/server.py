@@ -39,8 +39,8 @@ from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.study.plan import TARGET_COLUMNS
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
-from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
+from mauvecl.web.tab import INKS, PINS, Canvas
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
 from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, content_of, release_memory
 

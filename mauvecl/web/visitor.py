@@ -35,9 +35,19 @@ from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError, shortened
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
-from mauvecl.web.page import SIMULATIONS, TABS, State, card, known_values, reads_of
+from mauvecl.web.page import (
+    SIMULATIONS,
+    TABS,
+    State,
+    as_file,
+    card,
+    commands_and_programs,
+    known_values,
+    reads_of,
+    study_file,
+)
 from mauvecl.web.sandboxed_reader import EXPECTED_FRAMES, read_limited
-from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, as_file, commands_and_programs, simulate, study_file
+from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, simulate
 from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
 
 if TYPE_CHECKING:
