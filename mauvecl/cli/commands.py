@@ -350,7 +350,7 @@ class Command:
                     raise InputError(fault, key=key)
                 flag_values[key] = [str(study_file)] if applies is flags.is_star else study_file
                 study_file = None
-        options = {name: values.pop(name, default) for name, (_, default) in self._options().items()}
+        options = {name: values.pop(name) for name in self._options()}
         read = None if study_file is None else Study.read(study_file)
         study, messages = self.verb.study_of(flag_values, keywords, read, "command line")
         detects = {"fap", "realisations"} <= keywords.keys()

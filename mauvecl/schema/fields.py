@@ -405,7 +405,6 @@ class Widget:
 
     label: str = field(default="", kw_only=False)  # words of the key's flag by default
     hint: str = field(default="", kw_only=False)  # explanation for visitors, in sentences
-    group: str = ""  # heading of the field's group; by default that of its section, if fields do not show at once
     place: int = 0  # order within the group; fields of the same place follow the order of the study
     name: str = ""  # name in links; by default that of the key, with its section before it if its flag has it there
     first: str | None = None  # text of a new page; the default of the key by default

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, create_model, model_validator
 
-from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
+from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES, Tails
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, FORMERLY_MAUVE, current_name, shipped_names
 from mauvecl.noise.disturbances import Prior, PriorField
@@ -64,7 +64,6 @@ class Observation(Section):
         usual="the instrument's",
         label="Detector temperature",
         hint="The dark current doubles every few degrees.",
-        group="Detector",
         placeholder="21, or along the orbit in plans",
         slider=Slider(-10, 40, 1),
         quantity=("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
@@ -78,7 +77,6 @@ class Observation(Section):
         label="Counted as signal",
         hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
         "moves no detection.",
-        group="Sky",
         place=2,
     )
     mode: Literal["auto", "frames", "stacked"] = setting("auto", "How the frames of an exposure are drawn")
@@ -195,7 +193,7 @@ class Run(Section):
         unit="per test",
         slider=Slider(1e-6, 0.1, 10**0.1, log=True),
     )
-    tails: Literal["counted", "sampled"] = setting(
+    tails: Tails = setting(
         "counted",
         "Thresholds with fewer than 100 draws beyond them",
         flag="--tails",

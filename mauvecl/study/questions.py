@@ -122,7 +122,6 @@ class LimitQuestion(Section):
         flag="--power",
         label="Wanted probability",
         hint="With which a flare is to be detected at the limit.",
-        group="Detection",
         slider=Slider(0.5, 0.99, 0.01),
     )
 
@@ -374,10 +373,9 @@ class ChangeQuestion(Section):
         choices=tuple(ALIASES),
         label="Band of the added light",
         hint="The smallest change is the light of the added spectrum in this band over that of the star.",
-        group="Added spectrum",
     )
-    wavelength_unit: str | None = unit_of_file("wavelength", "change", "that spectrum", "Added", "Added spectrum")
-    flux_unit: str | None = unit_of_file("flux", "change", "that spectrum", "Added", "Added spectrum")
+    wavelength_unit: str | None = unit_of_file("wavelength", "change", "that spectrum", "Added")
+    flux_unit: str | None = unit_of_file("flux", "change", "that spectrum", "Added")
     extend: str | None = setting(
         None,
         "Library spectrum that continues that spectrum beyond its end",
@@ -385,7 +383,6 @@ class ChangeQuestion(Section):
         label="Added: continue with",
         hint="Library spectrum that continues the added one beyond its end, such as M3V, scaled to match at the "
         "join. Nothing: it must cover what the instrument sees.",
-        group="Added spectrum",
         kind="library",
     )
     visits: Annotated[int, Range(2, 10_000)] = setting(

@@ -35,7 +35,7 @@ STAR_KEYS = (
 )  # fmt: skip
 
 
-def unit_of_file(quantity: Literal["wavelength", "flux"], prefix: str, whose: str, label: str, group: str) -> Any:
+def unit_of_file(quantity: Literal["wavelength", "flux"], prefix: str, whose: str, label: str) -> Any:
     """Return the field of the unit of a spectrum other than the star's.
 
     Its flag begins with `prefix` and its label on the page with `label`; `whose` names the spectrum in its help.
@@ -47,7 +47,6 @@ def unit_of_file(quantity: Literal["wavelength", "flux"], prefix: str, whose: st
         flag=f"--{prefix}-{quantity}-unit",
         label=f"{label}: unit of {noun}",
         hint=f"Such as {examples}. Nothing: what the file says.",
-        group=group,
         suggestions=units,
     )
 
@@ -100,7 +99,6 @@ class Star(Section):
         label="Reddening",
         hint="Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
         "Nothing: no dust.",
-        group="Star",
     )
     wavelength_unit: str | None = setting(
         None,
@@ -108,7 +106,6 @@ class Star(Section):
         flag="--wavelength-unit",
         label="Unit of wavelengths",
         hint="That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
-        group="Own spectrum",
         suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air", "Hz", "eV"),
     )
     flux_unit: str | None = setting(
@@ -117,7 +114,6 @@ class Star(Section):
         flag="--flux-unit",
         label="Unit of fluxes",
         hint="That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
-        group="Own spectrum",
         suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "W m-2 um-1", "Jy", "photon s-1 cm-2 Angstrom-1"),
     )
     extend: str | None = setting(
@@ -126,7 +122,6 @@ class Star(Section):
         flag="--extend",
         label="Continue with",
         hint="Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
-        group="Own spectrum",
         kind="library",
     )
     ignore_checksum: bool | None = setting(
@@ -138,7 +133,6 @@ class Star(Section):
         "Distance of the star; for energies",
         flag="--distance",
         hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
-        group="Measurement",
     )
     radius_rsun: fields.Radius | None = setting(None, "Radius of the star; for energies", flag="--radius")
     effective_temperature_k: fields.Temperature | None = setting(
@@ -150,7 +144,6 @@ class Star(Section):
         flag="--neighbours",
         hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
         "columns of a Gaia query. The light of those within 47 arcsec enters.",
-        group="Neighbours",
         kind="table",
         placeholder="name,separation,magnitude,spectral_type",
     )
@@ -161,7 +154,6 @@ class Star(Section):
         label="The star itself",
         hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
         "has positions but no separations.",
-        group="Neighbours",
     )
     neighbour_share: fields.Share = setting(
         1.0,
@@ -170,7 +162,6 @@ class Star(Section):
         label="Share that enters",
         hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
         "not published.",
-        group="Neighbours",
     )
 
     @model_validator(mode="before")
@@ -306,19 +297,17 @@ class FlareLight(Section):
         label="Star without the flare",
         hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
         "subtracted. Nothing: the file holds the flare alone.",
-        group="Own flare",
         place=1,
         kind="file",
     )
-    wavelength_unit: str | None = unit_of_file("wavelength", "flare", "the flare's files", "Flare", "Own flare")
-    flux_unit: str | None = unit_of_file("flux", "flare", "the flare's files", "Flare", "Own flare")
+    wavelength_unit: str | None = unit_of_file("wavelength", "flare", "the flare's files", "Flare")
+    flux_unit: str | None = unit_of_file("flux", "flare", "the flare's files", "Flare")
     continue_at_k: fields.Temperature | None = setting(
         None,
         "Temperature of a blackbody that continues the flare's file beyond its ends",
         flag="--continue-at",
         hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
         "cover what the instrument sees.",
-        group="Own flare",
     )
     as_observed: bool = setting(
         False,
@@ -326,7 +315,6 @@ class FlareLight(Section):
         flag="--as-observed",
         label="As bright as observed",
         hint="Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
-        group="Own flare",
         place=2,
     )
 
@@ -407,7 +395,6 @@ class Flare(Section):
         "Flare temperature",
         flag="--flare-temperature",
         hint="The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.",
-        group="Flare's spectrum",
         slider=Slider(5000, 30_000, 500),
         quantity=("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
     )

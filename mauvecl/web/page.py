@@ -34,10 +34,18 @@ from mauvecl.study.plan import PlanTarget
 from mauvecl.study.star import Star
 from mauvecl.study.study import Study, keys_of, set_key, with_paths
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, ClosedForms, FieldValues, chances, short
-from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
+from mauvecl.web.exposure_tabs import DETECTION, LIMIT, NOISE, SIGNAL, SPECTRUM, UNKNOWN
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
-from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
-from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PLAN, VISIBILITY
+from mauvecl.web.observation_tabs import (
+    ANALYSE,
+    CALIBRATE,
+    CHANGE,
+    COMPLETENESS,
+    MEASUREMENT,
+    PERIODS,
+    PLAN,
+    VISIBILITY,
+)
 from mauvecl.web.tab import QUESTIONS, Tab
 from mauvecl.web.uploads import UPLOADS
 
