@@ -78,7 +78,7 @@ def measure_of_size(case: Case) -> tuple[Size, float]:
     """
     measure, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
     kind: Kind = "band" if measure == "band_energy" else "bolometric"
-    scale = case.study.flare.energy_scale(case.star, case.source, kind)
+    scale = case.energy_scale(kind)
     if measure == "amplitude" or (measure is None and scale is None):
         return "amplitude", 1.0
     if measure == "duration":

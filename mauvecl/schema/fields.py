@@ -16,7 +16,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
@@ -403,8 +403,8 @@ class Slider:
 class Widget:
     """Field of the page that sets a key."""
 
-    label: str = field(default="", kw_only=False)  # words of the key's flag by default
-    hint: str = field(default="", kw_only=False)  # explanation for visitors, in sentences
+    label: str = ""  # words of the key's flag by default
+    hint: str = ""  # explanation for visitors, in sentences
     place: int = 0  # order within the group; fields of the same place follow the order of the study
     name: str = ""  # name in links; by default that of the key, with its section before it if its flag has it there
     first: str | None = None  # text of a new page; the default of the key by default

@@ -437,9 +437,27 @@ class Case:
                 events[n] = replace(event, amplitude=choice.energy_erg / energy)
         return events
 
+    def energy_scale(self, kind: Kind, temperature_k: float | None = None) -> EnergyScale | None:
+        """Return the energy of flares per second of equivalent duration, by default at the study's temperature.
+
+        It follows from the star's distance or else from its radius and temperature; None if neither is known.
+        """
+        from mauvecl.flares.energies import EnergyScale
+
+        star, flare = self.star, self.study.flare
+        options: dict[str, Any] = {
+            "band": flare.band, "flare": flare.light(temperature_k), "kind": kind, "geometry": flare.geometry,
+            "photosphere_k": flare.photosphere_temperature_k,
+        }  # fmt: skip
+        if star.distance_pc is not None:
+            return EnergyScale.of_star(self.source, star.distance_pc, **options)
+        if star.radius_rsun is not None and star.effective_temperature_k is not None:
+            return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **options)
+        return None
+
     def energy(self, event: Event, kind: Kind, temperatures_k: NDArray[np.float64] | None = None) -> float:
         """Return the energy of a flare, erg, as `Event.total_energy`; NaN if the star's size is unknown."""
-        scale_of = partial(self.study.flare.energy_scale, self.star, self.source, kind)
+        scale_of = partial(self.energy_scale, kind)
         if scale_of(event.hottest_k) is None:
             return float("nan")
         return event.total_energy(cast("Callable[[float], EnergyScale]", scale_of), temperatures_k)
@@ -496,7 +514,7 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
 
 
 def _star_of(x: Expectation) -> tuple[tuple[object, ...], bool]:
-    """Return what tells an expectation's star and exposure from others, and whether it has a flare."""
+    """Return a key of an expectation's star and exposure, the same with and without a flare, and whether it has one."""
     steps = [step for step in x.provenance.get("source history", "").split("; ") if step]
     quiet = tuple(step for step in steps if not step.startswith("flare"))
     return (x.name, quiet, x.frame_s, x.n_frames), len(quiet) < len(steps)

@@ -174,13 +174,14 @@ class Axis(Section):
         if self.values is not None:
             return self.values
         start, stop, steps = cast("tuple[float, float, int]", (self.start, self.stop, self.steps))
-        share = [i / (steps - 1) for i in range(steps)]
+        # The last value is exact, since rounding could put it out of the quantity's range.
+        shares = [i / (steps - 1) for i in range(steps - 1)]
         if not self.log:
-            return tuple(start + (stop - start) * s for s in share)
+            return (*(start + (stop - start) * share for share in shares), stop)
         if min(start, stop) <= 0:
             fault = f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from {start:g} to {stop:g}"
             raise InputError(fault, key="start")
-        return tuple(start * (stop / start) ** s for s in share)
+        return (*(start * (stop / start) ** share for share in shares), stop)
 
 
 class MapQuestion(Section):

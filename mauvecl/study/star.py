@@ -17,7 +17,6 @@ from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
 from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
 
 if TYPE_CHECKING:
-    from mauvecl.flares.energies import EnergyScale, Kind
     from mauvecl.host.exposure.background import Neighbours
     from mauvecl.host.stars.flare import FlareSpectrum
     from mauvecl.host.stars.source import Source
@@ -420,25 +419,6 @@ class Flare(Section):
     def light(self, temperature_k: float | None = None) -> FlareSpectrum:
         """Return the spectrum of a flare, by default at the study's temperature."""
         return self.spectrum.at_temperature(self.temperature_k if temperature_k is None else temperature_k)
-
-    def energy_scale(
-        self, star: Star, source: Source, kind: Kind, temperature_k: float | None = None
-    ) -> EnergyScale | None:
-        """Return the energy of flares per second of equivalent duration, by default at the study's temperature.
-
-        It follows from the star's distance or else from its radius and temperature; None if neither is known.
-        """
-        from mauvecl.flares.energies import EnergyScale
-
-        flare: dict[str, Any] = {
-            "band": self.band, "flare": self.light(temperature_k), "kind": kind, "geometry": self.geometry,
-            "photosphere_k": self.photosphere_temperature_k,
-        }  # fmt: skip
-        if star.distance_pc is not None:
-            return EnergyScale.of_star(source, star.distance_pc, **flare)
-        if star.radius_rsun is not None and star.effective_temperature_k is not None:
-            return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **flare)
-        return None
 
     @property
     def is_blackbody(self) -> bool:

@@ -23,7 +23,7 @@ from mauvecl.detection.requests import statistic_label
 from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.columns import View, chance_text, stacked, with_error
-from mauvecl.study.cases import star_column, star_label
+from mauvecl.study.cases import star_column
 from mauvecl.study.observation import NuisanceChoice
 from mauvecl.web.closed_forms import LIMITS, Answers, short
 from mauvecl.web.tab import SATURATED, Tab, strips
@@ -58,9 +58,9 @@ NOISE = Tab(
     # The closed-form table of `mauvecl snr`.
     own_table=lambda closed, answers: stacked(
         [star_column()],
-        [({"star": star_label(closed.case.study.star[0], closed.quiet)}, closed.quiet.noise_budget())],
-        realisations=closed.case.study.run.realisations,
-        study=closed.case.study.ideal().text(),
+        [({"star": closed.case.label}, closed.quiet.noise_budget())],
+        realisations=closed.study.run.realisations,
+        study=closed.study.ideal().text(),
     ),
 )
 
@@ -178,7 +178,7 @@ SPECTRUM = Tab(
     questions=("simulate",),
     files={"observation": None},
     # One observation with the flare and its components.
-    own_table=lambda closed, answers: simulate(closed.case.study, flaring=True).observations[1][2],
+    own_table=lambda closed, answers: simulate(closed.study, flaring=True).observations[1][2],
 )
 
 
@@ -317,9 +317,9 @@ def costs(closed: ClosedForms) -> list[Cost]:
             choice = NuisanceChoice.model_validate({"usual": False, name: spread})
             choices[spoken(choice).removeprefix("the ")] = choice
     choices["all the usual together"] = NuisanceChoice()
-    if closed.case.study.nuisances.own:
-        choices["your own spectrum"] = NuisanceChoice(usual=False, own=closed.case.study.nuisances.own)
-    flare, comparison = closed.flare, closed.case.study.run.comparison()
+    if closed.study.nuisances.own:
+        choices["your own spectrum"] = NuisanceChoice(usual=False, own=closed.study.nuisances.own)
+    flare, comparison = closed.flare, closed.study.run.comparison()
     return [unknown_cost(name, closed.quiet, flare, choice, comparison) for name, choice in choices.items()]
 
 
@@ -396,7 +396,10 @@ def _cached(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float)
 
 
 def _curve(closed: ClosedForms) -> tuple[Float, Float]:
-    """Return magnitudes and probabilities, with more points where these change."""
+    """Return magnitudes and probabilities of detection, shape (241,), interpolated between points of the closed form.
+
+    There are more of these points where the probability changes.
+    """
 
     def exact(magnitudes: Float) -> list[float]:
         lights = 10 ** (-0.4 * (magnitudes - closed.question.magnitude))
@@ -454,14 +457,14 @@ def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
 ).data()  # fmt: skip
 def curve(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the detection probability against the star's magnitude."""
-    q, power = closed.question, closed.case.study.limit.power
+    q, power = closed.question, closed.study.limit.power
     series: dict[str, Any] = {"own": ([q.magnitude], [closed.chance]), "power": power}
     text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
     if not closed.slow:
         x, y = series["closed form"] = _cached(_curve, closed, q.amplitude_percent)
         text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
     if "limit" in answers:
-        before, in_words, *_ = LIMITS[closed.case.study.limit.of]
+        before, in_words, *_ = LIMITS[closed.study.limit.of]
         for limit in answers["limit"].limits:
             if limit.statistic != q.statistic:
                 continue

@@ -81,7 +81,7 @@ def forecast(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
 def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the relative error of the temperature against the amplitude of the flare."""
     # Fewer amplitudes than in files suffice.
-    percent, factors, series = 100 * closed.case.study.flare.amplitudes[0], FACTORS[::3], dict[str, Any]()
+    percent, factors, series = 100 * closed.case.amplitudes[0], FACTORS[::3], dict[str, Any]()
     for name, measurement in zip(NAMES, forecast(closed).values(), strict=True):
         ahead = measurement.forecasts(factors, measurement.unknown)
         series[name] = percent * factors, [100 * f.errors[0] / f.values[0] for f in ahead]
@@ -406,7 +406,10 @@ CALIBRATE = Tab(
 
 
 def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, float]) -> Chart:
-    """Return the chart of the smallest changes of some units, with the factor from each to that of the axis."""
+    """Return the chart of the smallest detected changes against the star's magnitude.
+
+    It shows the changes in one of `units`, which hold the factor from each unit to that of the axis.
+    """
 
     def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
         rows = [row for row in answer.changes if row.change.unit in units]

@@ -130,7 +130,7 @@ def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[s
     if not headline and chosen.value == chosen.value:
         ideal = q.unknown == REALISTIC and all(chance.value == chance.value for chance in of_choices)
         text = shown[q.unknown] + (f" ({shown[IDEAL]} {IF_KNOWN})" if ideal else "")
-        text = chance_of_flare(closed.case.study, closed.case.label, closed.case.amplitudes[0], x, text)
+        text = chance_of_flare(closed.study, closed.case.label, closed.case.amplitudes[0], x, text)
         headline = f"{text}, by the estimate before a simulation."
     messages = [message for name in WITH_MESSAGES if name in answers for message in answers[name].messages]
     facts = []
@@ -179,8 +179,8 @@ def _simulation_names(text: str) -> tuple[str, ...]:
 
 #: Entries of a link in addition to the question.
 SEEN = {
-    "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
-    "simulated": Field(label="Simulated", hint="", first="", read=_simulation_names),
+    "tab": Field(label="Tab", first=next(iter(TABS)), read=Choice(tuple(TABS))),
+    "simulated": Field(label="Simulated", first="", read=_simulation_names),
 }
 #: All entries of a link, and their values on a new page.
 ENTRIES = FIELDS | SEEN
@@ -410,7 +410,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
             return name, answers[tab.documents[name]].documents[name]()
     if ending == "study":
         needed = tab.files[name]
-        return study_file(closed.case.study if needed is None else answers[needed].study, f"mauvecl-{name}")
+        return study_file(closed.study if needed is None else answers[needed].study, f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:
         path, make = Path(folder) / f"mauvecl-{name}.{ending}", tab.own_table
         write_table(make(closed, answers) if make else answers[str(tab.files[name])].tables[name], path)

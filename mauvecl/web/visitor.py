@@ -378,7 +378,7 @@ class Visitor(WebSocketHandler):
             return
         if self._drawing is not None:
             self._drawing.cancel()
-        options = closed.case.draw_options | {"seed": closed.case.study.run.seed}
+        options = closed.case.draw_options | {"seed": closed.study.run.seed}
         job = self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **options)[0])
         try:
             spectrum = await asyncio.wrap_future(job.future)
@@ -401,7 +401,7 @@ class Visitor(WebSocketHandler):
             raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
         unit = VERBS[main].counts
-        ask = partial(simulate, kind, closed.case.study, inputs=closed.inputs)
+        ask = partial(simulate, kind, closed.study, inputs=closed.inputs)
         # Several verbs count the realisations of all in the pool.
         job = self.job = Job(ask, unit in DRAWN_UNITS, "" if more else unit)
         answers = asyncio.wrap_future(job.future)
