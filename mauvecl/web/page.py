@@ -195,36 +195,44 @@ class State:
 
     def __init__(self, link: str = "", uploads: Mapping[str, Any] | None = None) -> None:
         self.uploads, self.stray = dict(uploads or {}), ""
+        self.entered = {name: field.first for name, field in ENTRIES.items()}
+        self._values, self._invalid = dict(FIRST), dict[str, str]()  # by entry: values, and errors of invalid texts
+        texts = self._parse(link)
+        for name, field in ENTRIES.items():
+            if name in texts:
+                self.entered[name] = texts[name][: field.characters]
+                try:
+                    self._values[name] = self._read(name, texts[name])
+                except InputError as error:
+                    self._invalid[name] = sentence(error)
+        for name, field in SEEN.items():
+            if name in self._invalid:
+                self.entered[name] = field.first
+                self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
+
+    def _parse(self, link: str) -> dict[str, str]:
+        """Return the texts of a link by entry, those of version 1 in today's words, and report entries in `stray`."""
         query = link.removeprefix("?")
         if len(query) > MOST_LINKED:
-            query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
+            self.stray = f"The link has more than {MOST_LINKED} characters and was left out."
+            return {}
         texts = dict(parse_qsl(query, keep_blank_values=True, errors="replace"))
         if unknown := sorted(texts.keys() - ENTRIES.keys()):
             self.stray = f"The link holds {shortened(', '.join(unknown))}, which is no field here; it was left out."
         if texts.get("unknown") in FORMER_VALUES["unknown"]:
             self.stray += " The link is of version 1: its payload and unknowns have other names today."
-            for name, values in FORMER_VALUES.items():
-                if name in texts:
-                    texts[name] = values.get(texts[name], texts[name])
-        self.entered = {name: field.first for name, field in ENTRIES.items()}
-        self._values, self._invalid = dict(FIRST), dict[str, str]()  # by entry: values, and errors of invalid texts
-        for name, field in ENTRIES.items():
-            if name not in texts:
-                continue
-            text = texts[name]
-            self.entered[name] = text[: field.characters]
-            try:
-                if len(text) > field.characters:
-                    raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
-                self._values[name] = field.read(text)
-                if name in UPLOADS and text == UPLOADS[name].entered and name not in self.uploads:
-                    raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
-            except InputError as error:
-                self._invalid[name] = sentence(error)
-        for name, field in SEEN.items():
-            if name in self._invalid:
-                self.entered[name] = field.first
-                self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
+            for name in FORMER_VALUES.keys() & texts.keys():
+                texts[name] = FORMER_VALUES[name].get(texts[name], texts[name])
+        return texts
+
+    def _read(self, name: str, text: str) -> Any:
+        """Return the value of an entry; raises InputError for an invalid text, or one of a file that is not here."""
+        field = ENTRIES[name]
+        if len(text) > field.characters:
+            raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
+        if name in UPLOADS and text == UPLOADS[name].entered and name not in self.uploads:
+            raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
+        return field.read(text)
 
     def faults_of(self, names: Collection[str]) -> dict[str, str]:
         """Return the error messages of some fields, with those of values that cannot be together."""
