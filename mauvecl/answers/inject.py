@@ -60,7 +60,7 @@ def survey_star(case: Case) -> Survey:
     variance, gain = np.where(used, quiet.variance_dn2, 0.0), quiet.gain_dn_per_electron
     signal = electrons * gain * used
     templates = Templates.of(variance, signal, gain, TEMPERATURES_K, nuisances=nuisances, rank=choice.sums)
-    level = choice.level(stare, case.study.stare.orbit_s)
+    level = choice.baseline(stare, case.study.stare.orbit_s)
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )

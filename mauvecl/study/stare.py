@@ -220,11 +220,11 @@ class SearchChoice(Section):
         from mauvecl.flares.shapes import shape_of
         from mauvecl.search.templates import Baseline, white_bank
 
-        level = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
-        return white_bank(self.half_widths_s, shape_of(self.shape), frame_s, level)
+        baseline = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
+        return white_bank(self.half_widths_s, shape_of(self.shape), frame_s, baseline)
 
-    def level(self, stare: Stare, orbit_s: float) -> Baseline:
-        """Return the baseline model for a stare."""
+    def baseline(self, stare: Stare, orbit_s: float) -> Baseline:
+        """Return the baseline of flares in a stare; a cycle is in it by default if the stare has an unknown one."""
         from mauvecl.search.templates import Baseline
 
         cycle = self.cycle if self.cycle is not None else any("cosine" in u.name for u in stare.unknowns)
